@@ -26,7 +26,7 @@ from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.masks import apply, color, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
-from pano_mvs.stages.patchmatch import patchmatch
+from pano_mvs.stages.patchmatch import exchange, patchmatch
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
@@ -49,6 +49,7 @@ __all__ = [
     "color",
     "confidence",
     "consistency",
+    "exchange",
     "exhaustive",
     "extend",
     "fill",

@@ -1,7 +1,8 @@
-"""Refinement of swept ranges by slanted planes."""
+"""Slanted planes: refinement of swept ranges, and exchange of ranges between views."""
 
 from __future__ import annotations
 
+from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.scene.pose_groups import require_one_group
@@ -36,3 +37,35 @@ def patchmatch(
     ctx.metric("completeness", float(refined.valid.mean()))
     ctx.metric("sources", len(sources))
     return refined
+
+
+@params_from(exchange_ranges)
+class ExchangeParams(Params):
+    """Settings of depth.exchange."""
+
+
+@stage("depth.exchange", memory=bytes_per_pixel(200, each_source=60))
+def exchange(
+    range_map: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[RangeMap],
+    source_images: Near[Panorama],
+    source_poses: Near[Pose],
+    params: ExchangeParams,
+    ctx: Context,
+) -> RangeMap:
+    """Give unconfirmed pixels the nearer ranges that other views found, where the images match better.
+
+    Follow it with filters.consistency that compares with the ranges before the exchange (`in: {sources: ...}`):
+    otherwise, exchanged ranges confirm each other.
+    """
+    require_one_group(pose, source_poses)
+    views = [
+        SourceView(image.load(), source, other.cam_from_world @ pose.cam_from_world.inverse(), image.load_mask())
+        for source, image, other in zip(sources, source_images, source_poses, strict=True)
+    ]
+    exchanged, share = exchange_ranges(range_map, ref.load(), views, **arguments_from(exchange_ranges, params))
+    ctx.metric("exchanged", share)
+    ctx.metric("sources", len(sources))
+    return exchanged

@@ -29,6 +29,7 @@ __all__ = [
     "Scene",
     "corridor",
     "courtyard",
+    "desk",
     "large_plain_room",
     "poles",
     "white_room",
@@ -198,6 +199,34 @@ def corridor(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: fl
     return _scene("corridor", room, views=views, turned=turned, centers=centers, exposure=exposure)
 
 
+def desk(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
+    """Return a room of 6 × 2.9 × 5 with cameras 0.42 above a large desk: the baselines are longer than that.
+
+    Straight below the cameras, most sources see the desk at 45–80° from the reference's direction.
+
+    Args:
+        seed: seed of textures, cameras and exposures.
+        views: number of cameras, about 0.9 apart.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
+    """
+    surfaces: list[Painted] = [
+        (Cuboid((-3.0, -1.7, -2.5), (3.0, 1.2, 2.5), STONE), "strong"),
+        (Cuboid((-1.8, 0.42, -1.1), (1.8, 0.46, 1.1), OAK), "strong"),
+        (Cuboid((-1.2, 0.36, 0.3), (-0.9, 0.42, 0.7), BLUE), "strong"),
+        (Cuboid((0.5, 0.37, -0.6), (0.75, 0.42, -0.2), BRICK), "strong"),
+        (Ball((0.2, 0.39, 0.75), 0.03, LEAVES), "strong"),
+        (Rod((1.3, 0.42, 0.5), (1.3, -0.1, 0.5), 0.015, STEEL), "strong"),
+        (Ball((1.3, -0.15, 0.5), 0.09, RED), "strong"),
+        (Cuboid((2.0, 0.3, -2.4), (2.8, 1.2, -1.0), BLUE), "strong"),
+    ]
+    surfaces += [
+        (Rod((x, 0.46, z), (x, 1.2, z), 0.04, OAK), "strong") for x, z in ((-1.6, -0.9), (1.6, -0.9), (1.6, 0.9))
+    ]
+    room = _painted("desk", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
+    return _scene("desk", room, views=views, turned=turned, spread=(0.9, 0.06, 0.6), exposure=exposure)
+
+
 def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
     """Return the furnished room of `pano_mvs.testing.room` with its nearly plain texture.
 
@@ -246,7 +275,7 @@ def large_plain_room(*, seed: int = 0, views: int = 4, turned: bool = True, expo
 
 
 SCENES: dict[str, Callable[..., Scene]] = {
-    scene.__name__: scene for scene in (courtyard, white_room, poles, corridor, weak_room)
+    scene.__name__: scene for scene in (courtyard, white_room, poles, corridor, weak_room, desk)
 }
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine
 from pano_mvs.algorithms.patchmatch.refine import (
     _range_map_from_planes,
-    _reference_arrays,
-    _source_arrays,
+    reference_arrays,
     refine_range,
+    source_arrays,
 )
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
@@ -119,7 +119,7 @@ def test_compiled_steps_equal_normal_equations() -> None:
     kernels_planes.fit_planes(inverse, 0, 16, column_offsets(size, 3, spherical=True), stretches, 0.2, planes)
     found = np.empty(size, np.float32)
     numbers = (np.float32(1 / 25), np.float32(SETTINGS[0]), *SETTINGS[1:4], np.float32(SETTINGS[4]))
-    arrays = (_reference_arrays(reference, offsets, stretches), _source_arrays(sources, poses, [None, mask], reach=0.0))
+    arrays = (reference_arrays(reference, offsets, stretches), source_arrays(sources, poses, [None, mask], reach=0.0))
     kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, found)
     grey = [np.rint(256 * (picture @ LUMA)) / 256 for picture in sources]
     rows, off = (-4, -2, 0, 2, 4), []

@@ -40,7 +40,7 @@ from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import FusionParams, vote
-from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
+from pano_mvs.stages.patchmatch import ExchangeParams, PatchMatchParams, exchange, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
 from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
@@ -380,6 +380,7 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
     [
         (sweep, {"ref": None, "params": SweepParams()}),
         (patchmatch, {"ref": None, "range_map": None, "params": PatchMatchParams()}),
+        (exchange, {"ref": None, "range_map": None, "source_images": [None], "params": ExchangeParams()}),
         (consistency, {"range_map": None, "params": ConsistencyParams()}),
     ],
 )

@@ -117,9 +117,13 @@ def checked_with_agreement(
     if len(sources) != len(source_poses):
         raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
-    max_angle = max(max_reprojection_px / px_per_rad, np.radians(max_reprojection_deg))
-    limits = np.array([max_relative_error, max_angle, _MAX_SURFACE_STEP])
-    comparison = _compare_with_sources(reference, reference_pose, sources, source_poses, limits)
+    comparison = compare_with_sources(
+        reference.range,
+        sources,
+        [pose @ reference_pose.inverse() for pose in source_poses],
+        max_relative_error=max_relative_error,
+        max_angle=max(max_reprojection_px / px_per_rad, np.radians(max_reprojection_deg)),
+    )
     motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
     consistent = (comparison.agreeing >= min_views) & (comparison.support >= min_support) & (motion >= min_motion_px)
     step = _step_around(reference.range)
@@ -150,7 +154,7 @@ def checked_with_agreement(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Comparison:
+class Comparison:
     """Agreement of all sources with each pixel, (H, W) each.
 
     Attributes:
@@ -170,28 +174,38 @@ class _Comparison:
     squared_error: NDArray[np.float64]
 
 
-def _compare_with_sources(
-    reference: RangeMap,
-    reference_pose: Rigid3,
+def compare_with_sources(
+    ranges: NDArray[np.float32],
     sources: Sequence[RangeMap],
-    source_poses: Sequence[Rigid3],
-    limits: NDArray[np.float64],
-) -> _Comparison:
+    source_from_reference: Sequence[Rigid3],
+    *,
+    max_relative_error: float,
+    max_angle: float,
+) -> Comparison:
+    """Return the agreement of the sources with ranges of the reference, as in `checked_with_agreement`.
+
+    Args:
+        ranges: (H, W) float32, NaN is left out.
+        sources: range maps; filled pixels are left out.
+        source_from_reference: pose of each.
+        max_relative_error: largest relative difference of ranges that agree.
+        max_angle: largest angle between pixel and reprojection, in radians.
+    """
     import numba  # slow to import
 
     from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
-    shape = reference.range.shape
-    comparison = _Comparison(
+    shape = ranges.shape
+    limits = np.array([max_relative_error, max_angle, _MAX_SURFACE_STEP])
+    comparison = Comparison(
         np.zeros(shape, np.int64),
         np.zeros(shape, np.int64),
         np.zeros(shape, np.uint16),
         *(np.zeros(shape) for _ in range(3)),
     )
-    ranges, rays = np.ascontiguousarray(reference.range), ray_grid((shape[0], shape[1]))
+    ranges, rays = np.ascontiguousarray(ranges), ray_grid((shape[0], shape[1]))
     verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
-    for source, pose in zip(sources, source_poses, strict=True):
-        moved = pose @ reference_pose.inverse()
+    for source, moved in zip(sources, source_from_reference, strict=True):
         view = np.ascontiguousarray(moved.rotation), np.ascontiguousarray(moved.translation)
         known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
         arguments = ranges, rays, view, known, limits, verdicts, supports, motions
@@ -208,7 +222,7 @@ def _compare_with_sources(
     return comparison
 
 
-def _agreement(comparison: _Comparison, seen: NDArray[np.bool_]) -> Agreement:
+def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
     """Return the agreement of the sources with all pixels that were seen, (H, W)."""
     judges = comparison.agreeing + comparison.contradicting + comparison.hiding
     row_weights = pixel_solid_angle(seen.shape) * seen.shape[1] / (4 * np.pi)

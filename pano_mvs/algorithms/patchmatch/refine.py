@@ -49,7 +49,7 @@ _MAX_SLOPE = 1.6
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
 # A window extends two pixels per sample from its centre, and one and a half times as far in a source that is nearer.
-_SOURCE_REACH = 3.0
+SOURCE_REACH = 3.0
 
 
 @checks_settings
@@ -117,8 +117,8 @@ def refine_range(
     stretches = column_stretch(height, spherical=True)
     near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)
     views = (
-        _reference_arrays(reference, offsets, stretches),
-        _source_arrays(sources, source_from_reference, source_masks, reach=_SOURCE_REACH * (window // 2) / height),
+        reference_arrays(reference, offsets, stretches),
+        source_arrays(sources, source_from_reference, source_masks, reach=SOURCE_REACH * (window // 2) / height),
     )
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
@@ -158,7 +158,7 @@ def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> 
     return RangeMap(ranges.astype(np.float32), before.confidence, normals, sky=before.sky)
 
 
-def _reference_arrays(
+def reference_arrays(
     reference: Picture, offsets: NDArray[np.int64], stretches: NDArray[np.float64]
 ) -> tuple[object, ...]:
     """Return the kernels' arguments for the reference image, see `refine_rows`."""
@@ -170,7 +170,7 @@ def _reference_arrays(
     return grey, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), pad, stretches, rows, offsets
 
 
-def _source_arrays(
+def source_arrays(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
 ) -> tuple[object, ...]:
     """Return the kernels' arguments for the sources, see `sum_windows`; `reach`: window size in image heights."""

@@ -9,7 +9,15 @@ import pytest
 
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.session.session import open_session
 from tests.cli.conftest import SMALL, Command, run_json
+
+
+def test_exchanged_ranges_are_checked_against_those_before_the_exchange() -> None:
+    """Otherwise the view that a range comes from confirms it."""
+    edges = open_session("quality").graph.edges["checked"]
+    assert edges["range_map"].producer == "exchanged"
+    assert edges["sources"].producer == "slanted"
 
 
 @pytest.mark.slow

@@ -1,0 +1,209 @@
+"""Exchange of ranges: the compiled correlations equal the definition, and only what is right is taken over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges, projected, surface_planes
+from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows, next_run
+from pano_mvs.algorithms.patchmatch.kernels_refine import STRETCH
+from pano_mvs.algorithms.patchmatch.refine import reference_arrays, source_arrays
+from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import capture_poses, default_room, render
+from tests.known import known
+from tests.oracles import patchmatch as oracle
+
+SIZE = (64, 128)
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+Scene = tuple[NDArray[np.uint8], NDArray[np.float32], list[SourceView]]
+
+
+def seen(ranges: NDArray[np.float32], normals: NDArray[np.float16] | None = None) -> RangeMap:
+    return RangeMap(ranges, np.full(ranges.shape, 100, np.uint8), normals)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A picture of the room, its true ranges, and three sources with theirs."""
+    poses = capture_poses(4, seed=2, spread=0.4)
+    views = [render(default_room(), pose, SIZE) for pose in poses]
+    sources = [
+        SourceView(picture, seen(ranges), pose @ poses[0].inverse())
+        for (picture, ranges), pose in zip(views[1:], poses[1:], strict=True)
+    ]
+    return *views[0], sources
+
+
+def exchanged(scene: Scene, range_map: RangeMap, **settings: Any) -> tuple[RangeMap, float]:
+    # Pixels are wide here, and truth is sampled at their centres.
+    return exchange_ranges(range_map, scene[0], scene[2], **{"max_relative_error": 0.05} | settings)
+
+
+def on_a_surface(truth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The pixels of whose surroundings all have about the same range."""
+    shifts = [np.roll(truth, (v, u), (0, 1)) for v in range(-2, 3) for u in range(-4, 5)]
+    smooth: NDArray[np.bool_] = np.ptp(np.log(shifts), axis=0) < 0.2
+    smooth[:12] = smooth[-12:] = False
+    return smooth
+
+
+@given(st.lists(st.booleans(), max_size=60), st.integers(0, 3))
+def test_runs_cover_what_is_wanted_once(bits: list[bool], spread: int) -> None:
+    wanted = np.repeat(np.array(bits, np.bool_), 1 + 9 * spread)
+    covered, start = np.zeros(len(wanted), np.int64), 0
+    while True:
+        first, stop = next_run(wanted, start)
+        assert start <= first <= stop <= first + STRETCH
+        if first >= len(wanted):
+            break
+        assert wanted[first]
+        assert wanted[stop - 1]
+        covered[first:stop] += 1
+        start = stop
+    assert covered.max(initial=0) <= 1
+    assert np.all(covered[wanted] == 1)
+    assert covered.sum() <= 9 * wanted.sum()
+
+
+@pytest.mark.kernel("patchmatch.kernels_exchange", "patchmatch.kernels_match", "patchmatch.kernels_refine")
+def test_compiled_correlations_equal_the_definition(scene: Scene) -> None:
+    picture, truth, sources = scene
+    offsets, stretches = column_offsets(SIZE, 4, spherical=True)[:, ::2].copy(), column_stretch(SIZE[0], spherical=True)
+    wanted = np.zeros(SIZE, np.bool_)
+    wanted[::9, 5::31] = True
+    planes = surface_planes(truth, None, ray_grid(SIZE), np.ones(SIZE, np.bool_))
+    found = np.full((1, *SIZE), -2, np.float32)
+    arrays = (
+        reference_arrays(picture, offsets, stretches),
+        source_arrays([sources[0].picture], [sources[0].from_reference], None, reach=0.0),
+    )
+    correlate_rows(0, SIZE[0], planes, wanted, *arrays, (np.float32(1 / 25), np.float32(0.16)), found)
+    pose, grey = sources[0].from_reference, (sources[0].picture @ LUMA)[..., None]
+    for row, column in np.argwhere(wanted):
+        places, values, weights = oracle.window(
+            picture @ LUMA, row, column, (-4, -2, 0, 2, 4), offsets[row], sigma_color=25
+        )
+        rays = ray_from_pixel(places, SIZE)
+        directions = rays @ pose.rotation.T + (rays @ planes[:, row, column].astype(float))[:, None] * pose.translation
+        other = sample_panorama(grey, pixel_from_ray(directions, SIZE))[:, 0]
+        a, b = values - weights @ values, other - weights @ other
+        expected = weights @ (a * b) / np.sqrt((weights @ a**2 + 0.16) * (weights @ b**2 + 0.16))
+        assert found[0, row, column] == pytest.approx(expected, abs=5e-3)
+    assert np.ptp(found[0, wanted]) > 0.2
+
+
+def test_true_ranges_of_a_source_land_on_true_ranges(scene: Scene) -> None:
+    _, truth, sources = scene
+    landed, normals = projected(sources[0], SIZE)
+    assert normals is None
+    ratio = (landed / truth)[np.isfinite(landed) & on_a_surface(truth)]
+    assert len(ratio) > 1500
+    assert np.mean(np.abs(ratio - 1) < 0.05) > 0.9
+
+
+def test_the_nearest_of_those_that_land_in_a_pixel_counts() -> None:
+    """A large source, of alternating ranges, at the place of a small reference: every second pixel is a spot."""
+    ranges = np.where(np.add.outer(np.arange(32), np.arange(64)) % 2, 3.0, 2.0).astype(np.float32)
+    source = SourceView(np.zeros((32, 64, 3), np.uint8), seen(ranges), Rigid3.identity())
+    np.testing.assert_allclose(projected(source, (16, 32))[0], 2.0, rtol=1e-6)
+    faint = replace(source, range_map=RangeMap(ranges, np.where(ranges < 2.5, 63, 64).astype(np.uint8)))
+    np.testing.assert_allclose(projected(faint, (16, 32))[0], 3.0, rtol=1e-6)
+
+
+def test_normals_turn_with_the_camera() -> None:
+    turn = Rigid3(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
+    normals = -ray_grid((16, 32)).astype(np.float16)
+    source = SourceView(np.zeros((16, 32, 3), np.uint8), seen(np.full((16, 32), 2, np.float32), normals), turn)
+    landed, turned = projected(source, (16, 32))
+    assert np.isfinite(landed).all()
+    np.testing.assert_allclose(known(turned), -ray_grid((16, 32)), atol=2e-3)
+
+
+def test_planes_go_through_their_points_with_their_normals() -> None:
+    size = (16, 32)
+    rays, ranges = ray_grid(size), np.linspace(1, 4, 512, dtype=np.float32).reshape(size)
+    normals = np.broadcast_to(np.array([0, -1, 0], np.float16), (*size, 3)).copy()
+    normals[0] = np.nan
+    planes = surface_planes(ranges, normals, rays, np.ones(size, np.bool_)).astype(np.float64)
+    np.testing.assert_allclose(np.einsum("ahw,hwa->hw", planes, rays * ranges[..., None]), 1, rtol=1e-5)
+    direction = planes / np.linalg.norm(planes, axis=0)
+    np.testing.assert_allclose(np.abs(direction[1, 1:6]), 1, rtol=1e-5)
+    for row in (0, 7, 8):  # unknown, and grazing
+        np.testing.assert_allclose(direction[:, row].T, rays[row], atol=1e-5)
+
+
+def test_what_is_too_far_comes_back_from_the_sources(scene: Scene) -> None:
+    _, truth, _ = scene
+    lost = np.zeros(SIZE, np.bool_)
+    lost[24:44, 10:40] = True
+    wrong = np.where(lost, truth * 1.6, truth).astype(np.float32)
+    found, share = exchanged(scene, seen(wrong))
+    judged = lost & on_a_surface(truth)
+    good = np.abs(found.range / truth - 1) < 0.06
+    assert judged.sum() > 100
+    assert good[judged].mean() > 0.6
+    assert share > 0.5 * lost.mean()
+    np.testing.assert_array_equal(found.confidence, 100)
+    assert np.all(found.range <= wrong)
+
+
+def test_what_is_nearer_than_the_sources_say_stays(scene: Scene) -> None:
+    """The sources may have missed it."""
+    _, truth, _ = scene
+    near = (0.5 * truth).astype(np.float32)
+    found, share = exchanged(scene, seen(near))
+    changed = found.range != near
+    assert share == changed.mean()
+    assert changed[on_a_surface(truth)].mean() < 0.01
+
+
+@pytest.mark.parametrize("settings", [{"min_agreeing": 4}, {"min_support": 0.0, "max_relative_error": 1.0}])
+def test_nothing_is_taken_over_without_enough_agreement_or_where_all_agree(
+    scene: Scene, settings: dict[str, Any]
+) -> None:
+    wrong = (1.3 * scene[1]).astype(np.float32)
+    found, share = exchanged(scene, seen(wrong), **settings)
+    assert share == 0
+    np.testing.assert_array_equal(found.range, wrong)
+
+
+def test_normals_come_along(scene: Scene) -> None:
+    truth = scene[1]
+    wrong = (1.4 * truth).astype(np.float32)
+    up = np.broadcast_to(np.array([0, -1, 0], np.float16), (*SIZE, 3)).copy()
+    found, _ = exchanged(scene, seen(wrong, up))
+    changed = found.range != wrong
+    assert changed.mean() > 0.2
+    assert np.isnan(known(found.normals_in_cam)[changed]).all()  # those of the sources are unknown
+    np.testing.assert_array_equal(known(found.normals_in_cam)[~changed], up[~changed])
+    found.check()
+
+
+def test_pixels_without_a_range_stay_so(scene: Scene) -> None:
+    wrong = seen((1.4 * scene[1]).astype(np.float32))
+    wrong.range[20:30], wrong.confidence[20:30] = np.nan, 0
+    found, _ = exchanged(scene, wrong)
+    assert np.isnan(found.range[20:30]).all()
+    found.check()
+
+
+def test_inputs_that_do_not_fit_are_refused(scene: Scene) -> None:
+    picture, truth, sources = scene
+    with pytest.raises(UsageError, match="at least one source"):
+        exchange_ranges(seen(truth), picture, [])
+    with pytest.raises(UsageError, match="must have the size of its range map"):
+        exchange_ranges(seen(truth), picture[:, :64], sources)
+    with pytest.raises(UsageError, match="source 1: image, mask and range map differ in size"):
+        exchange_ranges(seen(truth), picture, [sources[0], replace(sources[1], picture=picture[:, :64])])
+    with pytest.raises(UsageError, match="min_agreeing"):
+        exchange_ranges(seen(truth), picture, sources, min_agreeing=0)
