@@ -31,7 +31,7 @@ OTHER, _ = render(default_room(), ASIDE, SIZE_HW, supersample=1)
 
 
 def known(sky: NDArray[np.bool_] | None) -> RangeMap:
-    return RangeMap(np.where(SKY, np.nan, RANGES).astype(np.float32), np.where(SKY, 0, 200).astype(np.uint8), None, sky)
+    return RangeMap(np.where(SKY, np.nan, RANGES).astype(np.float32), np.where(SKY, 0, 200).astype(np.uint8), sky=sky)
 
 
 FILTERS: dict[str, Callable[[RangeMap], RangeMap]] = {
@@ -63,7 +63,7 @@ def test_without_it_the_same_pixels_are_filled(name: str) -> None:
 
 
 def test_a_range_map_without_a_sky_is_stored_as_before() -> None:
-    assert known(None).to_parts()["meta"] == {"normals_in_cam": None}
+    assert known(None).to_parts()["meta"] == {"normals_in_cam": None, "uncertainty": None}
     again = RangeMap.from_parts(known(SKY).to_parts())
     assert again.sky is not None
     assert np.array_equal(again.sky, SKY)
@@ -72,4 +72,4 @@ def test_a_range_map_without_a_sky_is_stored_as_before() -> None:
 
 def test_a_sky_with_a_range_is_refused() -> None:
     with pytest.raises(ContractError, match="sky has a range"):
-        RangeMap(RANGES, np.full(SIZE_HW, 200, np.uint8), None, SKY).check()
+        RangeMap(RANGES, np.full(SIZE_HW, 200, np.uint8), sky=SKY).check()
