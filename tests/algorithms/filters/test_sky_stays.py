@@ -63,7 +63,7 @@ def test_without_it_the_same_pixels_are_filled(name: str) -> None:
 
 
 def test_a_range_map_without_a_sky_is_stored_as_before() -> None:
-    assert known(None).to_parts()["meta"] == {"normals_in_cam": None}
+    assert known(None).to_parts()["meta"] == {"normals_in_cam": None, "uncertainty": None}
     again = RangeMap.from_parts(known(SKY).to_parts())
     assert again.sky is not None
     assert np.array_equal(again.sky, SKY)
