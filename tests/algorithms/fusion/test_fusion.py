@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -397,3 +398,51 @@ class TestVoxels:
         assert len(thin_by_voxels(join_clouds([]), 0.1)) == 0
         with pytest.raises(UsageError, match="voxel_size"):
             thin_by_voxels(join_clouds([]), 0)
+
+
+class TestUncertainty:
+    @staticmethod
+    def with_uncertainty(view: FusionView, sigma: float, *, factor: float = 1.0) -> FusionView:
+        ranges = (view.range_map.range * np.float32(factor)).astype(np.float32)
+        known = replace(view.range_map, range=ranges, uncertainty=np.full(ranges.shape, sigma, np.float16))
+        return replace(view, range_map=known)
+
+    @staticmethod
+    def error(cloud: PointCloud) -> float:
+        """Return the median distance of the points from the room's walls along the rays of the first camera."""
+        in_cam = POSES[0].apply(cloud.points_in_world.astype(float))
+        distance = np.linalg.norm(in_cam, axis=1)
+        rays = (in_cam / distance[:, None]) @ POSES[0].rotation
+        true = range_along(default_room(), np.asarray(POSES[0].center), rays)
+        return float(np.median(np.abs(distance / true - 1)))
+
+    def test_precise_views_count_more(self, views: list[FusionView]) -> None:
+        settings = FusionSettings(smooth=False)
+        sigmas, factors = (0.03, 0.003, 0.003), (1.006, 1.0, 1.0)
+        equal, weighted = (
+            fuse_views(
+                [
+                    self.with_uncertainty(view, 0.01 if same else sigma, factor=factor)
+                    for view, sigma, factor in zip(views, sigmas, factors, strict=True)
+                ],
+                settings,
+            )
+            for same in (True, False)
+        )
+        assert self.error(weighted) < 0.5 * self.error(equal)
+
+    def test_points_above_the_limit_are_left_out(self, views: list[FusionView]) -> None:
+        sure = [self.with_uncertainty(view, 0.01) for view in views]
+        unsure = [self.with_uncertainty(view, 0.3) for view in views]
+        cloud = fuse_views(sure)
+        assert cloud.uncertainty is not None
+        assert len(cloud.uncertainty) == len(cloud)
+        assert len(fuse_views(unsure)) == 0
+        assert len(fuse_views(unsure, FusionSettings(max_uncertainty=None))) == len(cloud)
+
+    def test_views_of_unknown_uncertainty_are_fused_as_before(self, views: list[FusionView]) -> None:
+        plain, limited = (
+            fuse_views(views, FusionSettings(smooth=s, max_uncertainty=m)) for s, m in ((False, None), (True, 0.001))
+        )
+        assert plain.uncertainty is None
+        np.testing.assert_array_equal(plain.points_in_world, limited.points_in_world)
