@@ -100,6 +100,7 @@ def test_scores_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     again = Search("known_poses", [place], scratch=tmp_path, results=results, label="after")
     assert again.scores(setting) == again.labelled(setting, "before") == table
     assert again.labelled("", "before") == {}
+    assert Search("fast", [place], scratch=tmp_path, results=results, label="").labelled(setting, "before") == {}
 
 
 def test_the_table_shows_gains() -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, sharp_halvings
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -46,6 +47,10 @@ class SweepParams(Params):
     )
     far: float | None = Field(default=None, gt=0, description="farthest depth hypothesis; null: estimated")
 
+    scale: Literal["sharp", "nominal"] = Field(
+        default="sharp", description="resolution of the sweep: that at which the panorama is sharp, or its own"
+    )
+
     @model_validator(mode="after")
     def _fit_together(self) -> SweepParams:
         backend_for(self.backend, settings_from(SweepSettings, self))
@@ -74,7 +79,8 @@ def sweep(
     """Sphere sweep: select, for each pixel of the reference, the depth hypothesis at which the sources match best.
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
-    must agree with each other.
+    must agree with each other. A blurred panorama is swept at the resolution at which
+    it is sharp.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
@@ -82,9 +88,11 @@ def sweep(
     poses = [pose.cam_from_world, *(other.cam_from_world for other in source_poses)]
     near, far = params.near, params.far
     if near is None or far is None:
-        found = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend, device=params.device)
-        near, far = near or found[0], far or found[1]
-    range_map = sweep_range(
+        limits = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend, device=params.device)
+        near, far = near or limits[0], far or limits[1]
+    halvings = sharp_halvings(pictures[0]) if params.scale == "sharp" else 0
+    pictures, masks = reduced(pictures, masks, halvings=halvings)
+    found = sweep_range(
         pictures[0],
         pictures[1:],
         [other @ poses[0].inverse() for other in poses[1:]],
@@ -96,6 +104,7 @@ def sweep(
         reference_mask=masks[0],
         source_masks=masks[1:],
     )
+    range_map = enlarged_range_map(found, ref.size_hw)
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("sources", len(sources))
     ctx.metric("near", near)

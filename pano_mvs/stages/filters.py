@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.confidence import require_confidence
@@ -17,6 +19,7 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.sharp_scale import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group
@@ -88,6 +91,11 @@ def speckle(range_map: Each[RangeMap], params: SpeckleParams, ctx: Context) -> R
 class ConsistencyParams(Params):
     """Settings of filters.consistency."""
 
+    scale: Literal["sharp", "nominal"] = Field(
+        default="sharp",
+        description="pixels of max_reprojection_px: of the resolution at which the panorama is sharp, or of its own",
+    )
+
 
 @stage("filters.consistency", memory=bytes_per_pixel(160, each_source=8))
 def consistency(
@@ -95,17 +103,21 @@ def consistency(
     pose: Each[Pose],
     sources: Near[RangeMap],
     source_poses: Near[Pose],
+    image: Each[Panorama] | None,
     params: ConsistencyParams,
     ctx: Context,
 ) -> RangeMap:
     """Compare ranges with those of neighbouring views, forward and backward; confirmed ones get confidence 128–255."""
     require_one_group(pose, source_poses)
+    settings = arguments_from(checked_with_agreement, params)
+    if image is not None and params.scale == "sharp":
+        settings["max_reprojection_px"] *= 1 << sharp_halvings(image.load())
     checked, agreement = checked_with_agreement(
         range_map,
         pose.cam_from_world,
         sources,
         [other.cam_from_world for other in source_poses],
-        **arguments_from(checked_with_agreement, params),
+        **settings,
     )
     for name, value in asdict(agreement).items():
         ctx.metric(name, value)

@@ -381,7 +381,7 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
         (sweep, {"ref": None, "params": SweepParams()}),
         (patchmatch, {"ref": None, "range_map": None, "params": PatchMatchParams()}),
         (exchange, {"ref": None, "range_map": None, "source_images": [None], "params": ExchangeParams()}),
-        (consistency, {"range_map": None, "params": ConsistencyParams()}),
+        (consistency, {"range_map": None, "image": None, "params": ConsistencyParams()}),
     ],
 )
 def test_sources_of_another_room_are_refused(

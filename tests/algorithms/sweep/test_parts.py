@@ -197,9 +197,9 @@ def test_a_source_whose_epipole_lies_in_the_pixel_does_not_decide() -> None:
 
 def test_sources_turned_first_give_the_same_but_for_resampling(capture: Capture) -> None:
     plain, turned = swept(capture), swept(capture, derotate=True)
-    assert good_share(turned, plain.range) > 0.85
+    assert good_share(turned, plain.range) > 0.8
     assert good_share(turned, capture[2]) > good_share(plain, capture[2]) - 0.05
-    assert np.median(np.abs(turned.range / plain.range - 1)) < 0.01
+    assert np.median(np.abs(turned.range / plain.range - 1)) < 0.015
 
 
 def test_sources_that_are_not_turned_give_the_very_same_either_way(capture: Capture) -> None:

@@ -100,7 +100,11 @@ class Search:
             key = f"{place.key} {code}"
             if key not in self.known:
                 scores = measure(chain, place, self.scratch)
-                self._add(key, {"place": place.name, "setting": setting, "label": self.label}, scores)
+                self._add(
+                    key,
+                    {"place": place.name, "setting": setting, "label": self.label, "workflow": self.workflow},
+                    scores,
+                )
             stored = {name: self.known[key][name] for name in _FIELDS}
             table[place.name] = PlaceScores(**stored)  # type: ignore[arg-type]
         return table
@@ -111,7 +115,8 @@ class Search:
         return {
             str(entry["place"]): PlaceScores(**{name: entry[name] for name in _FIELDS})  # type: ignore[arg-type]
             for entry in self.known.values()
-            if (entry["setting"], entry["label"]) == (setting, label) and entry["place"] in wanted
+            if (entry["setting"], entry["label"], entry.get("workflow")) == (setting, label, self.workflow)
+            and entry["place"] in wanted
         }
 
     def _add(self, key: str, what: Mapping[str, str], scores: PlaceScores) -> None:
