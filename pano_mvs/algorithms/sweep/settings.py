@@ -52,8 +52,8 @@ class SweepSettings:
     support: int = setting(
         5, ge=1, le=15, odd=True, doc="side of the box over which census costs, and costs of plugins, are averaged, odd"
     )
-    p1: int = setting(20, ge=0, le=4000, doc="SGM's penalty for a step of one plane, for 512 rows")
-    p2: int = setting(300, ge=0, le=4000, doc="SGM's penalty for a larger step, for 512 rows")
+    p1: int = setting(40, ge=0, le=4000, doc="SGM's penalty for a step of one plane, for 512 rows")
+    p2: int = setting(600, ge=0, le=4000, doc="SGM's penalty for a larger step, for 512 rows")
     p2_contrast: float = setting(15.0, ge=0, doc="contrast in grey levels at which p2 is halved; 0: p2 is constant")
     selection: Literal["winner", "parabola", "vfit"] = setting(
         "vfit", doc="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
