@@ -198,7 +198,7 @@ def test_what_all_sources_agree_on_must_match_better(scene: Scene) -> None:
 def test_confirmed_pixels_stay_whatever_other_sources_agree_on(scene: Scene) -> None:
     picture, truth, sources = scene
     views = [sources[0], *(shell_around_reference(source, 0.8) for source in sources[1:])]
-    settings = {"min_agreeing": 2, "agreement": 10, "max_relative_error": 0.05}
+    settings: dict[str, Any] = {"min_agreeing": 2, "agreement": 10, "max_relative_error": 0.05}
     judged = on_a_surface(truth) & np.isfinite(projected(sources[0], SIZE)[0])
     kept, lost = (
         (exchange_ranges(seen(truth), picture, views, min_support=least, **settings)[0].range == truth)[judged].mean()
