@@ -56,7 +56,7 @@ class ExchangeParams(Params):
     """Settings of depth.exchange."""
 
 
-@stage("depth.exchange", memory=bytes_per_pixel(200, each_source=60))
+@stage("depth.exchange", memory=bytes_per_pixel(205, each_source=40))
 def exchange(
     range_map: Each[RangeMap],
     ref: Each[Panorama],

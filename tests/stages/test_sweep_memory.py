@@ -13,7 +13,7 @@ from pano_mvs.engine.stages.stage import spec_of
 from pano_mvs.scene import FilePart, Panorama, RangeMap
 from pano_mvs.stages.depth import SweepParams, sweep, sweep_memory_bytes
 from pano_mvs.stages.filters import bilateral_solver, consistency, fill, planes
-from pano_mvs.stages.patchmatch import patchmatch
+from pano_mvs.stages.patchmatch import exchange, patchmatch
 
 PIXELS = 512 * 1024
 
@@ -50,7 +50,8 @@ def test_volumes_end_at_their_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("function", "least"), [(patchmatch, 163), (consistency, 150), (bilateral_solver, 166), (fill, 83), (planes, 149)]
+    ("function", "least"),
+    [(patchmatch, 163), (exchange, 269), (consistency, 150), (bilateral_solver, 166), (fill, 83), (planes, 149)],
 )
 def test_other_dense_stages_say_more_than_was_measured_with_three_sources(
     function: Callable[..., Any], least: int
@@ -59,5 +60,7 @@ def test_other_dense_stages_say_more_than_was_measured_with_three_sources(
     assert spec is not None
     assert spec.memory_needed is not None
     ranges = RangeMap(np.ones((64, 128), np.float32), np.full((64, 128), 255, np.uint8))
-    inputs = {"range_map": ranges} | ({"sources": [ranges] * 3} if function in (patchmatch, consistency) else {})
+    inputs = {"range_map": ranges} | (
+        {"sources": [ranges] * 3} if function in (patchmatch, exchange, consistency) else {}
+    )
     assert 1.1 * least < spec.memory_needed(spec.params_type(), inputs) / (64 * 128) < 1.3 * least

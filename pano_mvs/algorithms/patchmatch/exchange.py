@@ -64,7 +64,9 @@ def exchange_ranges(
     *,
     max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
     max_reprojection_px: Annotated[float, Setting("maximum forward-backward reprojection error", gt=0)] = 1.0,
-    min_agreeing: Annotated[int, Setting("minimum number of sources that agree on a range to take it over", ge=1)] = 2,
+    min_agreeing: Annotated[
+        int, Setting("sources, or all if there are fewer, that must agree on a range to take it over", ge=1)
+    ] = 3,
     min_support: Annotated[float, Setting("support by sources from which on a pixel keeps its range", ge=0)] = 0.7,
     agreement: Annotated[
         float, Setting("correlation that one more agreeing source is worth, up to three", ge=0)
@@ -85,7 +87,8 @@ def exchange_ranges(
         sources: one or more.
         max_relative_error: largest relative difference of ranges that agree; another range is nearer by more.
         max_reprojection_px: largest reprojection error of ranges that agree, in pixels of the reference.
-        min_agreeing: smallest number of sources that agree on a range, including the one that it comes from.
+        min_agreeing: smallest number of sources that agree on a range, including the one that it comes from; all of
+            them if there are fewer sources, but one source alone is not enough.
         min_support: support from which on a pixel is confirmed and keeps its range.
         agreement: correlation that each source that agrees is worth.
 
@@ -113,13 +116,14 @@ def exchange_ranges(
     unsure = seen & ((own.agreeing < 1) | (own.support < min_support))
     best = _Best.of(range_map, own.agreeing, agreement)
     match = _Matcher(reference, sources)
+    least = min(min_agreeing, max(len(sources), 2))
     offers = []
     for source in sources:
         ranges, normals = projected(source, (reference.shape[0], reference.shape[1]))
         with np.errstate(invalid="ignore"):
             other = unsure & (ranges < range_map.range * (1 - max_relative_error))
         agreeing = compared(np.where(other, ranges, np.float32(np.nan))).agreeing
-        offers.append((ranges, normals, agreeing, other & (agreeing >= min_agreeing)))
+        offers.append((ranges, normals, agreeing, other & (agreeing >= least)))
     wanted = np.any([offer[-1] for offer in offers], axis=0)
     best.score[wanted] += match.correlation(range_map.range, range_map.normals_in_cam, wanted)[wanted]
     for ranges, normals, agreeing, other in offers:
@@ -167,7 +171,7 @@ class _Best:
     def of(range_map: RangeMap, agreeing: NDArray[np.int64], agreement: float) -> _Best:
         """Return a pixel's own range, without the correlation in its score."""
         normals = None if range_map.normals_in_cam is None else range_map.normals_in_cam.copy()
-        score = agreement * np.minimum(agreeing, _MOST_AGREEING)
+        score = float(agreement) * np.minimum(agreeing, _MOST_AGREEING)
         return _Best(score, range_map.range.copy(), normals, np.zeros(score.shape, np.bool_))
 
     def take(
