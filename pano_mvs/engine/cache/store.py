@@ -79,7 +79,10 @@ class ItemRef:
         """Return whether two references are the same in every part."""
         if not isinstance(other, ItemRef):
             return NotImplemented
-        return (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form)
+        if (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form):
+            return True
+        same = (self._kind, self.digest) == (other._kind, other.digest)
+        return same and self.parts == other.parts  # in any order
 
     __hash__ = None  # type: ignore[assignment]  # as that of the mapping of its parts
 

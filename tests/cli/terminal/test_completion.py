@@ -55,7 +55,7 @@ def test_settings_of_the_workflow_and_their_values_are_offered() -> None:
 
 
 def test_stages_of_the_workflow_and_registered_ones_are_offered() -> None:
-    assert offered("run", "quickstart", "--until", "p") == ["pairs", "poses", "ply", "previews"]
+    assert offered("run", "quickstart", "--until", "p") == ["pairs", "poses", "planes", "ply", "previews"]
     assert offered("plan", "quickstart", "--refresh", "de") == ["depth"]
     assert "depth.sweep" in offered("stage", "show", "depth.")
     assert offered("plugin", "new", "sweep") == ["sweep_cost", "sweep_backend"]
