@@ -55,7 +55,7 @@ def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, t
     assert "metres, as the file has it" in first.words
     assert "Comparison with ground truth" in first.words
     summary = run_json(out)
-    assert set(summary["results"]) == {"images", "pairs", "poses", "ranges", "cloud"}
+    assert set(summary["results"]) == {"images", "pairs", "poses", "ranges", "cloud", "static"}
     assert summary["machine"]["cores"] >= 1
     assert all(len(link) == 5 for link in summary["poses"]["links"])
 
