@@ -26,7 +26,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def test_a_chain_runs_the_dense_stages_with_true_poses(capture: Capture) -> None:
     run = DenseChain("known_poses", overrides=SMALL).run(capture)
-    assert list(run.range_maps) == ["depth", "checked", "smooth"]
+    assert list(run.range_maps) == ["depth", "checked", "sky", "smooth"]
     assert all(list(step) == list(capture.panoramas) for step in run.range_maps.values())
     name = next(iter(capture.panoramas))
     raw, final = (score_view(run.range_maps[step][name], capture.ranges[name]) for step in ("depth", "smooth"))

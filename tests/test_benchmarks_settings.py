@@ -80,6 +80,7 @@ def test_a_stored_chain_gives_the_maps_of_the_chain(tmp_path: Path) -> None:
         assert {stage: list(maps) for stage, maps in run.range_maps.items()} == {
             "depth": names,
             "checked": names[:1],
+            "sky": names[:1],
             "smooth": names[:1],
         }
         np.testing.assert_array_equal(run.range_maps["smooth"][names[0]].range, plain[names[0]].range)

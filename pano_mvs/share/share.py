@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.paths import is_file
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput, RunView
 from pano_mvs.scene import PointCloud
@@ -108,7 +108,7 @@ def share_run(
             f"{len(missing)} of {len(described)} panoramas could not be read, such as {missing[0]}; give their folder "
             "with --images DIR"
         )
-    title = options.title or run.out.resolve().name
+    title = options.title or resolved(run.out).name
     metric = run.summary.poses.by_group()[0].metric
     page.put(
         "scene",

@@ -48,6 +48,7 @@ def test_a_reference_has_what_it_was_made_of() -> None:
     ref = ItemRef("Kind", "0f" * 16, PARTS)
     assert (ref.kind, ref.digest, dict(ref.parts)) == ("Kind", "0f" * 16, PARTS)
     assert ref == ItemRef.from_json(ref.to_json())
+    assert ref == ItemRef("Kind", "0f" * 16, dict(reversed(PARTS.items())))
     others = ItemRef("Other", "0f" * 16, PARTS), ItemRef("Kind", "00" * 16, PARTS), ItemRef("Kind", "0f" * 16, {})
     assert all(ref != other for other in (*others, "Kind"))
     assert repr(ref).startswith("ItemRef(kind='Kind', digest='0f0f")
