@@ -22,7 +22,7 @@ from pano_mvs.share.encoding import encode_jpeg, encode_points, encode_ranges
 from pano_mvs.share.frame import page_from_world
 from pano_mvs.share.octree import octree
 from pano_mvs.share.options import ShareOptions
-from pano_mvs.share.page import PageFolder
+from pano_mvs.share.page_folder import PageFolder
 from pano_mvs.share.tiles import level_count, panorama_tiles
 
 RANGES_HW = (256, 512)
