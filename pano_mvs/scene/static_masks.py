@@ -50,5 +50,5 @@ class StaticMasks(Record):
 
 
 def camera_of(panorama: Panorama) -> Camera:
-    """Return what identifies the camera of a panorama: the size of the sphere in its file, and the part covered."""
-    return (*panorama.source_size_hw, *panorama.covers_ltwh)
+    """Return what identifies the camera of a panorama: the sizes of the sphere in its file and here, the part covered."""
+    return (*panorama.source_size_hw, *panorama.covers_ltwh, *panorama.size_hw)
