@@ -93,7 +93,7 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
     centers = centers @ rotation_from_two_vectors(up_of(poses), (0, -1, 0)).T
     unit = "m" if poses.metric else "scene units"
     labels = short_names(names)
-    links = _chosen(poses.links, names, labels, reasons or {})
+    links = _chosen(poses.links, names, labels, reasons=reasons or {})
     north = bool(_ALONG_NORTH.search(poses.frame))
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
@@ -101,8 +101,8 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
             title,
             np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1),
             labels,
-            links,
-            doubts,
+            links=links,
+            doubts=doubts,
             unit=unit,
             tallest=tallest,
             north=north and title == "From above",
@@ -141,7 +141,7 @@ class _Joined:
 
 
 def _chosen(
-    links: Sequence[PairLink], names: list[str], labels: list[str], reasons: Mapping[tuple[str, str], str]
+    links: Sequence[PairLink], names: list[str], labels: list[str], *, reasons: Mapping[tuple[str, str], str]
 ) -> list[_Joined]:
     """Return links between registered cameras: some rejected ones, then the strongest, in ascending order."""
     position = {name: idx for idx, name in enumerate(names)}
@@ -178,9 +178,9 @@ def _drawn(
     title: str,
     flat: FloatArray,
     labels: list[str],
+    *,
     links: list[_Joined],
     doubts: Mapping[int, str],
-    *,
     unit: str,
     tallest: int,
     north: bool,

@@ -29,7 +29,7 @@ def thumbnails(
     """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]
     with ThreadPoolExecutor(_THREADS) as pool:
-        found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept), chosen)
+        found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept=kept), chosen)
         return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
 
 
@@ -38,7 +38,7 @@ def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: E
     found: dict[str, Shares] = {}
     for idx in _evenly(len(views), MAX_MEASURED):
         name = views[idx].name
-        key = key_of(results, name, "s", _VERSION)
+        key = key_of(results, name, "s", version=_VERSION)
         shares = shares_from_fact(kept.fact(key)) if key else None
         if shares is None and key:
             confidence = results.confidence(name)
@@ -55,8 +55,8 @@ def _evenly(count: int, most: int) -> list[int]:
     return sorted({round(at) for at in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
-def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, kept: EarlierPage) -> Picture | None:
-    key = key_of(results, view.name, "t", _VERSION)
+def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept: EarlierPage) -> Picture | None:
+    key = key_of(results, view.name, "t", version=_VERSION)
     known = kept.picture(key) if key else None
     if known is not None:
         return known

@@ -86,7 +86,7 @@ def view_cards(
 
     def card(view: ViewSummary) -> ViewCard:
         name = view.name
-        return _kept_card(results, kept, name) or _new_card(results, kept, name, out_dir, view.preview)
+        return _kept_card(results, kept, name) or _new_card(results, kept, name, out_dir=out_dir, preview=view.preview)
 
     with ThreadPoolExecutor(_DECODERS) as pool:
         return tuple(pool.map(card, views))
@@ -113,7 +113,7 @@ def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
     return rgb
 
 
-def key_of(results: StoredValues, name: str, what: str, version: int) -> str:
+def key_of(results: StoredValues, name: str, what: str, *, version: int) -> str:
     """Return the key of an image derived from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
     return f"{digest[:24]}.{results.digest('images', name)[:16]}.{what}{version}" if digest else ""
@@ -124,7 +124,7 @@ def _quality(view: ViewSummary) -> float:
 
 
 def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard | None:
-    stem = key_of(results, name, "v", VERSION)
+    stem = key_of(results, name, "v", version=VERSION)
     fact = kept.fact(stem) if stem else None
     parts = fact.get("parts") if isinstance(fact, dict) else None
     if not isinstance(fact, dict) or not isinstance(parts, list):
@@ -139,9 +139,9 @@ def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard 
     return ViewCard(name, found, shares_from_fact(fact.get("shares")), ticks)
 
 
-def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path, preview: str) -> ViewCard:
+def _new_card(results: StoredValues, kept: EarlierPage, name: str, *, out_dir: Path, preview: str) -> ViewCard:
     range_map, panorama = results.range_map(name), results.panorama(name)
-    stem = key_of(results, name, "v", VERSION)
+    stem = key_of(results, name, "v", version=VERSION)
     pictures: dict[str, Picture] = {}
     shares, mask = None, None
     ticks: tuple[tuple[float, float], ...] = ()

@@ -91,7 +91,7 @@ def share_run(
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
     frame = page_from_world(cameras)
     page = PageFolder(folder)
-    nodes, bounds = _put_cloud(page, cloud, frame, options.max_points)
+    nodes, bounds = _put_cloud(page, cloud, frame, max_points=options.max_points)
     described = []
     for idx, camera in enumerate(cameras):
         name = poses.names[idx] if poses is not None else ""
@@ -133,7 +133,7 @@ def share_run(
 
 
 def _put_cloud(
-    page: PageFolder, cloud: PointCloud | None, frame: Rigid3, max_points: int
+    page: PageFolder, cloud: PointCloud | None, frame: Rigid3, *, max_points: int
 ) -> tuple[list[dict[str, Any]], list[list[float]]]:
     """Write the octree; return its nodes and the box that holds all but the outermost percent of the points."""
     if cloud is None or not len(cloud):

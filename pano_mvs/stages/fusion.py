@@ -29,7 +29,7 @@ def vote(
     clouds = []
     for number in range(max(groups.values(), default=0) + 1):
         names = [name for name in ranges if groups.get(name) == number and name in images]
-        clouds.append(_fused(names, ranges, poses, images, settings, ctx.threads))
+        clouds.append(_fused(names, ranges, poses, images=images, settings=settings, threads=ctx.threads))
         if not len(clouds[-1]):
             which = f"group {number}: " if len(set(groups.values())) > 1 else ""
             ctx.note(
@@ -48,6 +48,7 @@ def _fused(
     names: list[str],
     ranges: All[RangeMap],
     poses: All[Pose],
+    *,
     images: All[Panorama],
     settings: FusionSettings,
     threads: int,

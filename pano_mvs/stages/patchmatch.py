@@ -41,7 +41,7 @@ def patchmatch(
         range_map,
         reference,
         [source.load() for source in sources],
-        [other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
+        source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
         source_masks=[source.load_mask() for source in sources],
         halvings=sharp_halvings(reference) if params.scale == "sharp" else 0,
         **arguments_from(refine_range, params),

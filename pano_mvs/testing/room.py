@@ -99,8 +99,8 @@ def render(
     colors = np.zeros((height * width, 3))
     for offset_y in steps:
         for offset_x in steps:
-            colors += _traced(room, cam_from_world, size_hw, (float(offset_x), float(offset_y)))[1]
-    distances, _ = _traced(room, cam_from_world, size_hw, (0.5, 0.5), shaded=False)
+            colors += _traced(room, cam_from_world, size_hw, offset_px=(float(offset_x), float(offset_y)))[1]
+    distances, _ = _traced(room, cam_from_world, size_hw, offset_px=(0.5, 0.5), shaded=False)
     image = np.rint(colors * (255 / supersample**2)).astype(np.uint8).reshape(height, width, 3)
     ranges = np.where(np.isfinite(distances), distances, np.nan).astype(np.float32)
     return image, ranges.reshape(height, width)
@@ -144,7 +144,7 @@ def write_views(
 
 
 def _traced(
-    room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], offset_px: tuple[float, float], *, shaded: bool = True
+    room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], *, offset_px: tuple[float, float], shaded: bool = True
 ) -> tuple[FloatArray, FloatArray]:
     """Return distance (H W,) and colour (H W, 3) along the rays through one position within each pixel."""
     height, width = size_hw
@@ -157,7 +157,9 @@ def _traced(
         rays = ray_from_pixel(pixels, size_hw) @ cam_from_world.rotation
         distances[block], surface_idx, normals = _first_hit(room, origin, rays)
         if shaded:
-            colors[block] = _shaded(room, origin, rays, (distances[block], surface_idx, normals), np.pi / height)
+            colors[block] = _shaded(
+                room, origin, rays, hits=(distances[block], surface_idx, normals), pixel_rad=np.pi / height
+            )
     return distances, colors
 
 
@@ -181,6 +183,7 @@ def _shaded(
     room: Room,
     origin: FloatArray,
     rays: FloatArray,
+    *,
     hits: tuple[FloatArray, NDArray[np.int64], FloatArray],
     pixel_rad: float,
 ) -> FloatArray:

@@ -304,7 +304,7 @@ def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
         poses.append(Rigid3(turn, np.zeros(3)) @ straight)
         pictures.append(picture)
         ranges.append(np.roll(true_range, columns, axis=1))
-        _write_picture(folder, variant, idx, picture)
+        _write_picture(folder, variant, idx, picture=picture)
     views = [
         {"image": f"images/{name}", "R": pose.rotation.tolist(), "t": pose.translation.tolist()}
         for name, pose in zip(names, poses, strict=True)
@@ -316,7 +316,7 @@ def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
     return TinyCapture(folder, variant, tuple(names), tuple(poses), tuple(pictures), tuple(ranges))
 
 
-def _write_picture(folder: Path, variant: Variant, idx: int, picture: NDArray[np.uint8]) -> None:
+def _write_picture(folder: Path, variant: Variant, idx: int, *, picture: NDArray[np.uint8]) -> None:
     height, width = picture.shape[:2]
     edge = height // 8 if variant.cropped else 0
     keep = np.full((height, width), 0 if variant.blank else 255, np.uint8)

@@ -61,7 +61,15 @@ def _trees(rng: np.random.Generator) -> list[Surface]:
     for x, z, height in ((3.2, -2.6, 2.6), (-5.2, 1.5, 3.2), (7.5, 5.0, 4.5), (1.0, -7.5, 4.0)):
         foot, head = np.array([x, _GROUND, z]), np.array([x + 0.1, _GROUND - 0.55 * height, z])
         surfaces.append(Rod(_vector(foot), _vector(head), 0.035 * height, OAK))
-        _grow(surfaces, rng, head, np.array([0.0, -1.0, 0.0]), 0.55 * height, 0.02 * height, 3)
+        _grow(
+            surfaces,
+            rng,
+            head,
+            along=np.array([0.0, -1.0, 0.0]),
+            length=0.55 * height,
+            radius=0.02 * height,
+            generations=3,
+        )
     return surfaces
 
 
@@ -69,6 +77,7 @@ def _grow(
     surfaces: list[Surface],
     rng: np.random.Generator,
     start: np.ndarray,
+    *,
     along: np.ndarray,
     length: float,
     radius: float,
@@ -82,7 +91,9 @@ def _grow(
         branch = Rod(_vector(start), _vector(end), radius, OAK)
         reach = float(np.linalg.norm(end - start)) / 2 + radius
         surfaces.append(Bounded(branch, _vector((start + end) / 2), reach))
-        _grow(surfaces, rng, end, direction, 0.7 * length, 0.55 * radius, generations - 1)
+        _grow(
+            surfaces, rng, end, along=direction, length=0.7 * length, radius=0.55 * radius, generations=generations - 1
+        )
 
 
 def _vector(point: np.ndarray) -> Vector:

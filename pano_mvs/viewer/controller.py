@@ -94,7 +94,7 @@ class Tour:
         """Return the view called "overview", "top" or "front"."""
         # Perspective leaves a margin; a plan or an elevation has to include the ends of the cloud.
         box = self.box if name == "overview" else self._outer_box
-        return outside_view(name, box, self.scene.up, self.scene.ahead, aspect=self.aspect)
+        return outside_view(name, box, self.scene.up, ahead=self.scene.ahead, aspect=self.aspect)
 
     def see(self, view: str) -> None:
         """Go to a view by name: "overview", "top", "front" or "inside:NAME".
@@ -236,7 +236,7 @@ class Tour:
     def _camera_at(self, start: FloatArray, direction: FloatArray) -> int | None:
         if not self.state.cameras or not len(self.centers):
             return None
-        found = camera_under(start, direction, self.centers, self.radius)
+        found = camera_under(start, direction, self.centers, radius=self.radius)
         return found if found != self.state.inside else None
 
     def _pick(self, start: FloatArray, direction: FloatArray) -> None:

@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 _REACH_RAD = np.deg2rad(0.4)
 
 
-def camera_under(start: FloatArray, direction: FloatArray, centers: FloatArray, radius: float) -> int | None:
+def camera_under(start: FloatArray, direction: FloatArray, centers: FloatArray, *, radius: float) -> int | None:
     """Return the nearest camera whose sphere a ray intersects, or None.
 
     Args:

@@ -104,10 +104,10 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _summary(path)
     notes: list[str] = []
-    chosen = _group_of(run, group, path, notes)
+    chosen = _group_of(run, group, path, notes=notes)
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
     mesh_file = _written(path, run, mesh_name)
-    cameras = _cameras(path, model, run, images, notes)
+    cameras = _cameras(path, model, run, images=images, notes=notes)
     if doubtful := [camera.name for camera in cameras if camera.doubtful]:
         shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
         notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
@@ -135,7 +135,7 @@ def _scene_of_ply(path: Path) -> ShownScene:
     return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
 
 
-def _group_of(run: RunSummary, group: int, path: Path, notes: list[str]) -> PosesSummary:
+def _group_of(run: RunSummary, group: int, path: Path, *, notes: list[str]) -> PosesSummary:
     """Return the poses of a group; if there are several groups, a note names the others."""
     groups = run.poses.by_group()
     if group >= len(groups):
@@ -192,7 +192,7 @@ def _written(folder: Path, run: RunSummary, name: str) -> Path | None:
 
 
 def _cameras(
-    folder: Path, model_name: str, run: RunSummary, images: Path | None, notes: list[str]
+    folder: Path, model_name: str, run: RunSummary, *, images: Path | None, notes: list[str]
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
     if not is_folder(model):
@@ -211,8 +211,8 @@ def _cameras(
                 cam_from_world=poses.cam_from_world(idx),
                 picture=picture if picture is not None and is_file(picture) else None,
                 preview=preview if is_file(preview) else None,
-                range_file=_map_of(folder, "range", name, ".tiff"),
-                confidence_file=_map_of(folder, "confidence", name, ".png"),
+                range_file=_map_of(folder, "range", name, suffix=".tiff"),
+                confidence_file=_map_of(folder, "confidence", name, suffix=".png"),
                 doubtful=name in run.poses.doubts,
             )
         )
@@ -222,7 +222,7 @@ def _cameras(
     return tuple(cameras)
 
 
-def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
+def _map_of(folder: Path, kind: str, name: str, *, suffix: str) -> Path | None:
     """Return the file of an image in range/ or confidence/, named with or without the image's extension."""
     candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
     return next((path for path in candidates if is_file(path)), None)

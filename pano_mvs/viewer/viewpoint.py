@@ -98,7 +98,7 @@ def looking_along(eye: ArrayLike, direction: ArrayLike, up: ArrayLike) -> Viewpo
     return Viewpoint(place, place + along / np.linalg.norm(along), np.asarray(up, np.float64), INSIDE_ANGLE_DEG)
 
 
-def outside_view(name: str, box: FloatArray, up: FloatArray, ahead: FloatArray, *, aspect: float) -> Viewpoint:
+def outside_view(name: str, box: FloatArray, up: FloatArray, *, ahead: FloatArray, aspect: float) -> Viewpoint:
     """Return a view of a box from outside.
 
     Args:

@@ -81,7 +81,7 @@ def test_compiled_correlations_equal_the_definition(scene: Scene) -> None:
     offsets, stretches = column_offsets(SIZE, 4, spherical=True)[:, ::2].copy(), column_stretch(SIZE[0], spherical=True)
     wanted = np.zeros(SIZE, np.bool_)
     wanted[::9, 5::31] = True
-    planes = surface_planes(truth, None, ray_grid(SIZE), np.ones(SIZE, np.bool_))
+    planes = surface_planes(truth, None, ray_grid(SIZE), wanted=np.ones(SIZE, np.bool_))
     found = np.full((1, *SIZE), -2, np.float32)
     arrays = (
         reference_arrays(picture, offsets, stretches),
@@ -134,7 +134,7 @@ def test_planes_go_through_their_points_with_their_normals() -> None:
     rays, ranges = ray_grid(size), np.linspace(1, 4, 512, dtype=np.float32).reshape(size)
     normals = np.broadcast_to(np.array([0, -1, 0], np.float16), (*size, 3)).copy()
     normals[0] = np.nan
-    planes = surface_planes(ranges, normals, rays, np.ones(size, np.bool_)).astype(np.float64)
+    planes = surface_planes(ranges, normals, rays, wanted=np.ones(size, np.bool_)).astype(np.float64)
     np.testing.assert_allclose(np.einsum("ahw,hwa->hw", planes, rays * ranges[..., None]), 1, rtol=1e-5)
     direction = planes / np.linalg.norm(planes, axis=0)
     np.testing.assert_allclose(np.abs(direction[1, 1:6]), 1, rtol=1e-5)

@@ -105,7 +105,9 @@ def test_refinement_begins_at_the_reduced_size_and_keeps_what_has_no_range() -> 
     confidence[40:44, 30:40] = 5
     given = RangeMap(ranges, confidence)
     found = [
-        refine_at_scale(given, pictures[0], pictures[1:], poses, halvings=count, source_masks=masks, rounds=2)
+        refine_at_scale(
+            given, pictures[0], pictures[1:], source_from_reference=poses, halvings=count, source_masks=masks, rounds=2
+        )
         for count in (0, 1)
     ]
     plain = refine_range(given, pictures[0], pictures[1:], poses, source_masks=masks, rounds=2)

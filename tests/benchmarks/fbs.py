@@ -50,7 +50,7 @@ def main(height: int) -> None:
         "cells": lambda: sphere_cells(truth.shape, 8.0),
         "colours": lambda: solver._color_bins(image, 8.0, 8.0),
         "blind guess": lambda: solver._blind_guess(target, weight, cells),
-        "system": lambda: solver.build_system(target, weight, colors, cells),
+        "system": lambda: solver.build_system(target, weight, colors, cells=cells),
         "guess, system, solve, slice": lambda: solver.solve_bilateral(
             target, weight, colors, cells=cells, smoothness=1.0, iterations=60
         ),
@@ -63,7 +63,7 @@ def main(height: int) -> None:
             work()
             if run:  # the first one compiles
                 seconds[name].append(time.perf_counter() - start)
-    system = solver.build_system(target, weight, colors, cells)
+    system = solver.build_system(target, weight, colors, cells=cells)
     print(f"{height} × {2 * height}: {len(system.mass)} vertices, {len(system.vertices)} elements")
     for name, values in seconds.items():
         print(f"  {name:32s} {statistics.median(values):.3f} s")

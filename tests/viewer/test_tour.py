@@ -234,9 +234,9 @@ def test_a_tour_without_cloud_or_without_cameras_goes_on(tmp_path: Path) -> None
 def test_the_nearest_of_several_things_under_the_pointer_is_taken() -> None:
     start, ahead = np.zeros(3), np.array([0.0, 0, 1])
     centers = np.array([[0.0, 0, 9], [0, 0.05, 5], [0, 0, -3], [2, 0, 4]])
-    assert camera_under(start, ahead, centers, 0.1) == 1
-    assert camera_under(start, -ahead, centers, 0.1) == 2
-    assert camera_under(start, np.array([0, 1.0, 0]), centers, 0.1) is None
+    assert camera_under(start, ahead, centers, radius=0.1) == 1
+    assert camera_under(start, -ahead, centers, radius=0.1) == 2
+    assert camera_under(start, np.array([0, 1.0, 0]), centers, radius=0.1) is None
     points = np.array([[0, 0, 8], [0.001, 0, 6], [0.02, 0, 6.01], [0, 0.5, 2], [0, 0, -1]], np.float32)
     assert point_under(start, ahead, points) == 1
     away = np.tile(np.array([0, 0, 1], np.float32), (5, 1))

@@ -62,7 +62,7 @@ def test_zooming_keeps_within_reason() -> None:
 def test_all_of_the_scene_is_in_the_window(name: str, aspect: float) -> None:
     rng = np.random.default_rng(3)
     box = np.sort(rng.normal(size=(2, 3)) * [4, 1, 9], axis=0)
-    view = outside_view(name, box, UP, AHEAD, aspect=aspect)
+    view = outside_view(name, box, UP, ahead=AHEAD, aspect=aspect)
     right, down, forward = view.axes
     for corner in np.array(np.meshgrid(*box.T)).reshape(3, -1).T - view.eye:
         depth = view.height / 2 if view.height else (corner @ forward) * np.tan(np.deg2rad(view.angle_deg) / 2)

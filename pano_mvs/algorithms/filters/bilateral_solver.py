@@ -171,7 +171,7 @@ def solve_bilateral(
     prior = _blind_guess(target, weight, cells)
     known = weight > 0
     pull = np.where(known, weight, _PRIOR_WEIGHT)
-    system = build_system(np.where(known, target, prior), pull, colors, cells)
+    system = build_system(np.where(known, target, prior), pull, colors, cells=cells)
     count = len(system.mass)
     diagonal_gram = np.ascontiguousarray(np.einsum("eaa->ea", system.gram))
     data = kernels.sum_at_vertices(diagonal_gram, system.vertices, count)
@@ -191,7 +191,7 @@ def solve_bilateral(
 
 
 def build_system(
-    target: FloatArray, weight: FloatArray, colors: NDArray[np.int64], cells: SphereCells
+    target: FloatArray, weight: FloatArray, colors: NDArray[np.int64], *, cells: SphereCells
 ) -> BilateralSystem:
     """Return the linear system for values (H, W), weights (H, W) and colour bins (H, W)."""
     from pano_mvs.algorithms.filters import kernels_bilateral as kernels  # compiles on import

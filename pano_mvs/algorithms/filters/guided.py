@@ -105,7 +105,9 @@ def guided_values(
     covariance = (
         share[..., None] * box_sum((weight * target)[..., None] * colors, radius) - mean[..., None] * mean_color
     )
-    slope = _solve_symmetric(_color_covariance(colors, weight, mean_color, share, radius), epsilon**2, covariance)
+    slope = _solve_symmetric(
+        _color_covariance(colors, weight, mean_color, share=share, radius=radius), epsilon**2, covariance
+    )
     offset = mean - np.sum(slope * mean_color, axis=-1)
     lines = np.concatenate([slope, offset[..., None]], axis=-1)
     counted = np.where(sure, total / area, 0)
@@ -118,7 +120,7 @@ def guided_values(
 
 
 def _color_covariance(
-    colors: FloatArray, weight: FloatArray, mean: FloatArray, share: FloatArray, radius: int
+    colors: FloatArray, weight: FloatArray, mean: FloatArray, *, share: FloatArray, radius: int
 ) -> FloatArray:
     """Return the weighted covariance of the colours in each window, (H, W, 6): rr, rg, rb, gg, gb, bb."""
     first, second = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)

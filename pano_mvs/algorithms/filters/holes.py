@@ -35,12 +35,12 @@ def large_holes(valid: Mask, max_hole_deg: float) -> Mask:
     rays = ray_grid((valid.shape[0], valid.shape[1]))
     reach = 2 * np.sin(np.radians(min(max_hole_deg, 359.0)) / 4)  # the chord of half the diameter
     core = np.zeros_like(valid)
-    core[~valid] = _distances(rays, rim(valid), ~valid, reach) > reach
+    core[~valid] = _distances(rays, rim(valid), ~valid, reach=reach) > reach
     if not core.any():
         return core
     large = core.copy()
     near = ~valid & ~core
-    large[near] = _distances(rays, rim(core), near, reach) <= reach
+    large[near] = _distances(rays, rim(core), near, reach=reach) <= reach
     return large
 
 
@@ -62,7 +62,7 @@ def rim(inside: Mask) -> Mask:
     return edge
 
 
-def _distances(rays: NDArray[np.float64], goals: Mask, starts: Mask, reach: float) -> NDArray[np.float64]:
+def _distances(rays: NDArray[np.float64], goals: Mask, starts: Mask, *, reach: float) -> NDArray[np.float64]:
     """Return the chord from each start to the nearest goal, (N,); inf if it is longer than `reach`."""
     tree = KDTree(rays[goals], balanced_tree=False, compact_nodes=False)
     return np.asarray(tree.query(rays[starts], distance_upper_bound=reach * (1 + 1e-12))[0], np.float64)

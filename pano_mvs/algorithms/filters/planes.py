@@ -99,7 +99,7 @@ def lay_planes(
             rays[support][points], inverse[support][points], max_relative_error=max_relative_error, rng=rng
         )
         if on_plane.mean() < min_share or not _is_valid(
-            plane, rays[surface], rays[support][points][on_plane], inverse[support][points][on_plane]
+            plane, rays[surface], rays[support][points][on_plane], inverse=inverse[support][points][on_plane]
         ):
             continue
         laid = np.zeros_like(inverse)
@@ -178,7 +178,7 @@ def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArr
     return rng.choice(len(weights), _MAX_POINTS, p=weights / weights.sum())
 
 
-def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, inverse: FloatArray) -> bool:
+def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, *, inverse: FloatArray) -> bool:
     """Return whether a plane stays within its points' ranges on the whole surface, and is seen on most sides of it."""
     laid = surface @ plane
     low, high = _STEPS_BEYOND

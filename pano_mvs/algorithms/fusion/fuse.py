@@ -80,7 +80,7 @@ def fuse_stream(
     clouds: list[PointCloud] = []
     for idx, neighbours in enumerate(nearest_views(poses, chosen.neighbours)):
         sources = [(window, other, _tie(is_earlier=other < idx)) for other in neighbours]
-        cloud = _points_of(window[idx], sources, chosen, threads)
+        cloud = _points_of(window[idx], sources, chosen, threads=threads)
         if grid is None:
             clouds.append(cloud)
         else:
@@ -127,7 +127,7 @@ def fuse_reference(
     views = [*earlier, *later]
     window = ViewWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
     sources = [(window, idx, _tie(is_earlier=idx < len(earlier))) for idx in range(len(views))]
-    return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads)
+    return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads=threads)
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -170,16 +170,22 @@ class _Tallies:
 
 
 def _points_of(
-    reference: ConfidentView, sources: Sequence[tuple[ViewWindow, int, float]], settings: FusionSettings, threads: int
+    reference: ConfidentView,
+    sources: Sequence[tuple[ViewWindow, int, float]],
+    settings: FusionSettings,
+    *,
+    threads: int,
 ) -> PointCloud:
     """Return the points of one view; sources are (window of views, position in it, `_tie`)."""
     height, width = reference.ranges.shape
     rays = held_rays((height, width))
     written = _chosen_pixels((height, width), settings)
-    normals = _normals_or_views(reference, rays, written, threads)
+    normals = _normals_or_views(reference, rays, written, threads=threads)
     tallies = _own_tallies(reference, rays, normals)
     for window, idx, tie in sources:
-        _compare_with(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
+        _compare_with(
+            window[idx], tie, (reference, rays, normals, written), settings=settings, tallies=tallies, threads=threads
+        )
     kept = _kept(reference, tallies, settings) & written
     position = tallies.sums[kept]
     color = tallies.colors[kept]
@@ -218,6 +224,7 @@ def _compare_with(
     source: ConfidentView,
     tie: float,
     pixels: tuple[ConfidentView, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
+    *,
     settings: FusionSettings,
     tallies: _Tallies,
     threads: int,
@@ -285,7 +292,7 @@ def _tie(*, is_earlier: bool) -> float:
 
 
 def _normals_or_views(
-    reference: ConfidentView, rays: NDArray[np.float64], wanted: NDArray[np.bool_], threads: int
+    reference: ConfidentView, rays: NDArray[np.float64], wanted: NDArray[np.bool_], *, threads: int
 ) -> NDArray[np.float32]:
     """Return unit normals, (H, W, 3): given or, where wanted, fitted ones, else the direction to the camera."""
     normals = normals_from_range(reference.ranges, given=reference.normals, wanted=wanted, threads=threads)

@@ -112,7 +112,7 @@ def sky_pixels(
     if picture.shape[1] < _MIN_WIDTH:
         return np.zeros_like(valid)
     used = list(zip(sources, source_valid, source_from_reference, strict=True))[:MAX_SOURCES]
-    view = _view(range_map, picture, valid, used)
+    view = _view(range_map, picture, valid, sources=used)
     seeds = _seeds(view, min_share=min_share, rng=rng)
     if not seeds.any():
         return np.zeros_like(valid)
@@ -120,7 +120,7 @@ def sky_pixels(
     return sharpened_sky(sky, colors, picture) & valid
 
 
-def _view(range_map: RangeMap, picture: Picture, valid: Mask, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:
+def _view(range_map: RangeMap, picture: Picture, valid: Mask, *, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:
     """Return the reference and its comparisons with the sources, at `WIDTH` columns or fewer."""
     small, small_valid = _reduced(picture, valid)
     rows, columns = (np.arange(new) * old // new for new, old in zip(small_valid.shape, valid.shape, strict=True))
@@ -190,11 +190,11 @@ def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share
     return bool(
         share_of_sphere(area) >= min_flat_share
         and view.consistent[inner].mean() <= _MAX_CONSISTENT
-        and _plane_share(view.ranges, border, inner, rng) <= _MAX_PLANE_SHARE
+        and _plane_share(view.ranges, border, inner, rng=rng) <= _MAX_PLANE_SHARE
     )
 
 
-def _plane_share(ranges: NDArray[np.float32], border: Mask, area: Mask, rng: np.random.Generator) -> float:
+def _plane_share(ranges: NDArray[np.float32], border: Mask, area: Mask, *, rng: np.random.Generator) -> float:
     """Return the largest share of the border points that lie on one plane which all rays of the area meet.
 
     It is 1 if there are too few points to say.

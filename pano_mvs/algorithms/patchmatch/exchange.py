@@ -208,7 +208,7 @@ class _Matcher:
         from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows  # compiles on import
 
         height, width = ranges.shape
-        planes = surface_planes(ranges, normals, self.rays, wanted)
+        planes = surface_planes(ranges, normals, self.rays, wanted=wanted)
         found = np.full((self.count, height, width), -2, np.float32)
         numbers = np.float32(1 / _SIGMA_COLOR), np.float32(_NOISE**2)
 
@@ -222,7 +222,7 @@ class _Matcher:
 
 
 def surface_planes(
-    ranges: FloatImage, normals: NDArray[np.float16] | None, rays: NDArray[np.float64], wanted: Mask
+    ranges: FloatImage, normals: NDArray[np.float16] | None, rays: NDArray[np.float64], *, wanted: Mask
 ) -> FloatImage:
     """Return the planes p with p · X = 1, (3, H, W), through the points of a range map; 0 where not wanted.
 

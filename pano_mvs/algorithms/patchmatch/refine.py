@@ -97,7 +97,7 @@ def refine_range(
     Raises:
         UsageError: if shapes do not match or a parameter is out of bounds.
     """
-    _check(range_map, reference, sources, source_from_reference, source_masks)
+    _check(range_map, reference, sources, poses=source_from_reference, masks=source_masks)
     import numba  # slow to import
 
     from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import
@@ -203,6 +203,7 @@ def _check(
     range_map: RangeMap,
     reference: Picture,
     sources: Sequence[Picture],
+    *,
     poses: Sequence[Rigid3],
     masks: Sequence[Mask | None] | None,
 ) -> None:

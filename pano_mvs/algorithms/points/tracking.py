@@ -145,9 +145,9 @@ def _track_group(
     names = [name for name in poses.names if name in samples]
     position = {name: idx for idx, name in enumerate(poses.names)}
     pose_idx = np.array([position[name] for name in names], np.intp)
-    candidates = _candidates(samples, poses, names, pose_idx, rng)
+    candidates = _candidates(samples, poses, names, pose_idx=pose_idx, rng=rng)
     if not len(candidates.points):
-        return _tracked(names, candidates, _joined([]), np.zeros(0, np.intp))
+        return _tracked(names, candidates, _joined([]), kept=np.zeros(0, np.intp))
     centers = poses.centers[pose_idx]
     tree = cKDTree(centers)
     spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** _SPACING_POWER
@@ -156,18 +156,29 @@ def _track_group(
     asked = _asked(tree, chosen, min(neighbours, len(names)))
     limits = np.array([max_relative_error, _MAX_SURFACE_STEP, float(min_confidence)])
     found = [
-        _sightings(chosen, asked[idx], idx, centers, poses.cam_from_world(pose_idx[idx]), load_range(name), limits)
+        _sightings(
+            chosen,
+            asked[idx],
+            idx,
+            centers=centers,
+            pose=poses.cam_from_world(pose_idx[idx]),
+            range_map=load_range(name),
+            limits=limits,
+        )
         for idx, name in enumerate(names)
     ]
     sightings = _joined(found)
     kept = np.flatnonzero(np.bincount(sightings.point_idx, minlength=len(few)) >= min_views)
-    return _tracked(names, chosen, sightings, kept[spread_points(chosen.points[kept], spacing[kept], count, rng=rng)])
+    return _tracked(
+        names, chosen, sightings, kept=kept[spread_points(chosen.points[kept], spacing[kept], count, rng=rng)]
+    )
 
 
 def _candidates(
     samples: Mapping[str, SurfaceSamples],
     poses: Poses,
     names: list[str],
+    *,
     pose_idx: NDArray[np.intp],
     rng: np.random.Generator,
 ) -> _Candidates:
@@ -202,6 +213,7 @@ def _sightings(
     chosen: _Candidates,
     asked: NDArray[np.intp],
     view_idx: int,
+    *,
     centers: FloatArray,
     pose: Rigid3,
     range_map: RangeMap,
@@ -230,7 +242,7 @@ def _joined(found: list[_Sightings]) -> _Sightings:
     )
 
 
-def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, kept: NDArray[np.intp]) -> TrackedPoints:
+def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, *, kept: NDArray[np.intp]) -> TrackedPoints:
     """Return the selected points with their tracks, in the order of the views."""
     total = len(chosen.points)
     number = np.full(total, -1, np.int32)

@@ -90,7 +90,7 @@ def grown_models(
     tried: set[tuple[Edge, int]] = set()
     while seeds := ranked_seeds(pairs, images, without=tried):
         edge, rank = seeds[0]
-        models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
+        models.append(_grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation))
         # A seed that agrees with this model would lead to the same model again.
         tried |= {seeds[0], *models[-1].model.chosen.items()}
         # Do not try seeds that no image can be attached to.
@@ -159,7 +159,7 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
 
 
 def _grown(
-    pairs: Pairs, images: Collection[int], edge: Edge, rank: int, *, adjust: bool, confirmation: Confirmation | None
+    pairs: Pairs, images: Collection[int], edge: Edge, *, rank: int, adjust: bool, confirmation: Confirmation | None
 ) -> GrownModel:
     """Return the model that grows from a seed, and the reasons for images that could not be added."""
     model = PlacedModel(pairs)
@@ -167,7 +167,7 @@ def _grown(
     left = set(images) - set(edge)
     weights: dict[int, float] = {}
     for image in edge:
-        _count_pairs(pairs, image, left, weights)
+        _count_pairs(pairs, image, left, weights=weights)
     if not adjust:
         model.adjust(cameras=False)
     adjusted = 2
@@ -177,7 +177,7 @@ def _grown(
         model.add(image, pose)
         left.discard(image)
         del weights[image]
-        _count_pairs(pairs, image, left, weights)
+        _count_pairs(pairs, image, left, weights=weights)
         if not adjust or len(model.cameras) > _ADJUST_GROWTH * adjusted:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
@@ -195,7 +195,7 @@ def _grown(
     return GrownModel(model, refused, arbitration, aliased)
 
 
-def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[int, float]) -> None:
+def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:
     """Add the pairs of a newly registered image to the weights of its unregistered partners."""
     for partner in pairs.partners[image]:
         if partner in left:
@@ -217,7 +217,7 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     agreeing = len(set(evidence.partner[agrees].tolist()))
     if enough_points(support, known, agreeing=agreeing):
         return ""
-    return _why_refused(model.pairs, image, support, known, agreeing=agreeing)
+    return _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
 
 
 def _next(
@@ -242,18 +242,18 @@ def _next(
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
             clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
-            if clear and (pose := _accepted(model, image, evidence, found[0], reasons)):
+            if clear and (pose := _accepted(model, image, evidence, placement=found[0], reasons=reasons)):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))
         for _, image, evidence, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
-            for placement in _by_images(model, image, found, confirmation):
-                if pose := _accepted(model, image, evidence, placement, reasons):
+            for placement in _by_images(model, image, found, confirmation=confirmation):
+                if pose := _accepted(model, image, evidence, placement=placement, reasons=reasons):
                     return image, pose
     return None
 
 
 def _by_images(
-    model: PlacedModel, image: int, found: list[Placement], confirmation: Confirmation | None
+    model: PlacedModel, image: int, found: list[Placement], *, confirmation: Confirmation | None
 ) -> list[Placement]:
     """Return placements in the order in which to try them; the images decide between rivals."""
     rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
@@ -264,14 +264,14 @@ def _by_images(
 
 
 def _accepted(
-    model: PlacedModel, image: int, evidence: PairEvidence, placement: Placement, reasons: dict[int, str]
+    model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement, reasons: dict[int, str]
 ) -> Rigid3 | None:
     """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
     pose, support, known = model.polished(image, evidence, placement)
     agreeing = len(set(evidence.partner[placement.explained].tolist()))
     if enough_points(support, known, agreeing=agreeing):
         return pose
-    reasons[image] = _why_refused(model.pairs, image, support, known, agreeing=agreeing)
+    reasons[image] = _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
     return None
 
 
@@ -302,13 +302,13 @@ def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> boo
         _, found = model.place(image)
         if found and found[0].score > 1.2 * score:
             pose, support, known = model.polished(image, evidence, found[0])
-            if enough_points(support, known) and _better_by_images(model, image, pose, confirmation):
+            if enough_points(support, known) and _better_by_images(model, image, pose, confirmation=confirmation):
                 model.add(image, pose)
                 moved = True
     return moved
 
 
-def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
+def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, *, confirmation: Confirmation | None) -> bool:
     """Return whether the images do not contradict moving a camera."""
     if confirmation is None:
         return True
@@ -322,7 +322,7 @@ def _why_nothing(model: PlacedModel, image: int) -> str:
     return "its pairs are all with images that could not be registered"
 
 
-def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing: int) -> str:
+def _why_refused(pairs: Pairs, image: int, support: int, *, known: int, agreeing: int) -> str:
     if known >= MIN_POINTS:
         share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
         needed = max(MIN_POINTS, int(np.ceil(share * known)))

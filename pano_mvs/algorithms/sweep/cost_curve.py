@@ -191,15 +191,15 @@ def _lines(work: SweepInput, row: int, column: int) -> list[Line]:
         walked = np.where(steps >= 0, steps, -1 - steps)
         rows = walked if down > 0 else height - 1 - walked
         columns = column - drift * (last - steps) - np.where(steps >= 0, 0, width // 2)
-        lines.append(_line(work, direction, rows, columns % width))
+        lines.append(_line(work, direction, rows, columns=columns % width))
     for step in (1, -1):
         last = column if step > 0 else width - 1 - column
         steps = np.arange(-before_seam, last + 1) % width
         columns = steps if step > 0 else width - 1 - steps
-        lines.append(_line(work, (0, step), np.full(len(columns), row), columns))
+        lines.append(_line(work, (0, step), np.full(len(columns), row), columns=columns))
     return lines
 
 
-def _line(work: SweepInput, direction: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Line:
+def _line(work: SweepInput, direction: tuple[int, int], rows: NDArray[np.intp], *, columns: NDArray[np.intp]) -> Line:
     penalties = step_penalties(work.reference, direction, work.settings)[rows, columns]
     return rows, columns, penalties.astype(np.int64)[:, None]

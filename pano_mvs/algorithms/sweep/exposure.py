@@ -63,7 +63,7 @@ def match_exposure(
         ranges: (h, w) rough ranges of the reference, at any resolution; NaN is left out.
         source_mask: (Hs, Ws) False is left out.
     """
-    return _exposure_of(source, source_from_reference, _Known.of(reference, ranges), source_mask)
+    return _exposure_of(source, source_from_reference, _Known.of(reference, ranges), source_mask=source_mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class _Known:
 
 
 def _exposure_of(
-    source: NDArray[np.uint8], source_from_reference: Rigid3, known: _Known, source_mask: NDArray[np.bool_] | None
+    source: NDArray[np.uint8], source_from_reference: Rigid3, known: _Known, *, source_mask: NDArray[np.bool_] | None
 ) -> Exposure:
     pixels = pixel_from_ray(source_from_reference.apply(known.points), source.shape[:2])
     seen = sample_panorama(_smooth(source), pixels)
@@ -166,5 +166,5 @@ def match_all(
     matched = []
     for idx, (source, pose) in enumerate(zip(sources, source_from_reference, strict=True)):
         mask = None if masks is None else masks[idx]
-        matched.append(_exposure_of(source, pose, known, mask).apply(source))
+        matched.append(_exposure_of(source, pose, known, source_mask=mask).apply(source))
     return matched

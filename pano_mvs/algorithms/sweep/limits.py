@@ -74,7 +74,7 @@ def limits_by_sweeping(
     small = [reduced_panorama(picture, _WIDTH) for picture in pictures[:_MAX_PICTURES]]
     small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MAX_PICTURES]]
     maps = [
-        _coarse(idx, small, small_masks, poses, width=width, backend=helper_backend(backend), device=device)
+        _coarse(idx, small, small_masks, poses=poses, width=width, backend=helper_backend(backend), device=device)
         for idx in range(len(poses))
     ]
     checked = check_consistency(
@@ -103,8 +103,8 @@ def _coarse(
     idx: int,
     pictures: Sequence[NDArray[np.uint8]],
     masks: Sequence[NDArray[np.bool_]],
-    poses: Sequence[Rigid3],
     *,
+    poses: Sequence[Rigid3],
     width: int,
     backend: str,
     device: str,

@@ -80,7 +80,7 @@ def pin(
     """Protect the results of a run from `gc`."""
     from pano_mvs.cli.cache.command import open_cache, pin_run
 
-    pin_run(open_cache(cache), Console(), run, name)
+    pin_run(open_cache(cache), Console(), run, name=name)
 
 
 @cache_app.command("unpin")

@@ -113,7 +113,7 @@ def _told(found: GarbageCollection, *, delete: bool) -> str:
     return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
 
 
-def pin_run(store: Store, console: Console, run: str, name: str) -> None:
+def pin_run(store: Store, console: Console, run: str, *, name: str) -> None:
     """Protect the results of a run from garbage collection."""
     pin = store.runs.pin(run, name)
     console.print(

@@ -119,7 +119,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     image = _image(wanted.image, found.images)
     unit = found.units.get(sweep, {}).get(image)
     if unit is None:
-        raise InputError(_why_not(plans, sweep, image, session))
+        raise InputError(_why_not(plans, sweep, image, session=session))
     stages = [units[image] for units in found.units.values() if image in units]
     truth = wanted.truth or _truth_of(session, image)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
@@ -148,7 +148,7 @@ def _image(wanted: str, names: Sequence[str]) -> str:
     )
 
 
-def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Session) -> str:
+def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, *, session: Session) -> str:
     plan = next(plan for plan in plans if plan.name == sweep)
     if image in plan.blocked:
         return f"{sweep}:{image} cannot be swept: {plan.blocked[image]}"

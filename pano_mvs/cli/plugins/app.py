@@ -60,7 +60,7 @@ def plugin_new(
     """Write a working plugin, NAME.py, and its test, test_NAME.py."""
     from pano_mvs.cli.plugins.new import write_plugin
 
-    write_plugin(kind, name, folder, Console())
+    write_plugin(kind, name, folder, console=Console())
 
 
 @plugin_app.command("kinds")

@@ -99,7 +99,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
     )
 
 
-def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
+def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> None:
     """Write a new plugin and its test into a folder, and print how to use it.
 
     Raises:

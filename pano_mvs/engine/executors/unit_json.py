@@ -132,7 +132,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     require_same_code(spec, params, text["identity"])
     inputs = {port: _input_from_json(value) for port, value in text["inputs"].items()}
     if text["inputs_file"]:
-        _read_large_inputs(Path(text["inputs_file"]), inputs, text["identity"], store)
+        _read_large_inputs(Path(text["inputs_file"]), inputs, text["identity"], store=store)
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
@@ -144,7 +144,9 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     )
 
 
-def _read_large_inputs(path: Path, inputs: Mapping[str, UnitInput], identity: Mapping[str, Any], store: Store) -> None:
+def _read_large_inputs(
+    path: Path, inputs: Mapping[str, UnitInput], identity: Mapping[str, Any], *, store: Store
+) -> None:
     """Add the inputs in a file to those of a unit, and to its identity."""
     try:
         with path.open(encoding="utf-8") as stream:

@@ -103,7 +103,7 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
     """
     valid = range_map.valid if image is None else range_map.valid & image.load_mask()
     values = np.where(valid, range_map.range, np.float32(np.nan))
-    files = {f"range/{{item}}.{name}": _write_range(values, name, params, ctx) for name in params.formats}
+    files = {f"range/{{item}}.{name}": _write_range(values, name, params, ctx=ctx) for name in params.formats}
     if "png" in params.formats:
         files["range/{item}.json"] = ctx.scratch / "range.json"
     if params.confidence:
@@ -130,7 +130,7 @@ def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> 
     return Files({"preview/{item}.jpg": path})
 
 
-def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams, ctx: Context) -> Path:
+def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams, *, ctx: Context) -> Path:
     path = ctx.scratch / f"range.{suffix}"
     if suffix == "tiff":
         write_range_tiff(path, values)

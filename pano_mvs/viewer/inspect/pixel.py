@@ -59,7 +59,7 @@ def inspect_pixel(
     settings = SweepSettings(**{field.name: getattr(params, field.name) for field in dataclasses.fields(SweepSettings)})
     pictures = [view.load() for view in (read.reference, *read.sources)]
     masks = [view.load_mask() for view in (read.reference, *read.sources)]
-    near, far = _limits(params, record, pictures, read, masks)
+    near, far = _limits(params, record, pictures, read=read, masks=masks)
     work = sweep_input(
         pictures[0],
         pictures[1:],
@@ -75,8 +75,8 @@ def inspect_pixel(
     curve = cost_curve(work, column=column, row=row, masked=not masks[0][row, column])
     ray = ray_from_pixel([column + 0.5, row + 0.5], (height, width))
     pose = read.poses[0]
-    true_range, notes = _true_range(truth, unit.item, read, row, column)
-    found = _stage_ranges(stages, store, row, column)
+    true_range, notes = _true_range(truth, unit.item, read, row=row, column=column)
+    found = _stage_ranges(stages, store, row, column=column)
     return Inspection(
         image=unit.item,
         column=column,
@@ -90,9 +90,9 @@ def inspect_pixel(
         sweep=unit.entry.name,
         settings=settings,
         curve=curve,
-        sources=_sights(curve, ray, read, pictures[1:], masks[1:]),
+        sources=_sights(curve, ray, read, pictures=pictures[1:], masks=masks[1:]),
         true_range=true_range,
-        notes=(*notes, *_curve_notes(unit, record, settings, curve, found)),
+        notes=(*notes, *_curve_notes(unit, record, settings, curve=curve, stages=found)),
     )
 
 
@@ -124,6 +124,7 @@ def _limits(
     params: SweepParams,
     record: UnitRecord | None,
     pictures: list[NDArray[np.uint8]],
+    *,
     read: _SweepRead,
     masks: list[NDArray[np.bool_]],
 ) -> tuple[float, float]:
@@ -138,7 +139,7 @@ def _limits(
     return params.near or near, params.far or far
 
 
-def _stage_ranges(stages: Sequence[UnitFound], store: Store, row: int, column: int) -> tuple[StageRange, ...]:
+def _stage_ranges(stages: Sequence[UnitFound], store: Store, row: int, *, column: int) -> tuple[StageRange, ...]:
     found = []
     for unit, record in stages:
         if record is None:
@@ -155,6 +156,7 @@ def _sights(
     curve: CostCurve,
     ray: NDArray[np.float64],
     read: _SweepRead,
+    *,
     pictures: list[NDArray[np.uint8]],
     masks: list[NDArray[np.bool_]],
 ) -> tuple[SourceSight, ...]:
@@ -184,7 +186,7 @@ def _sights(
 
 
 def _true_range(
-    folder: Path | None, image: str, read: _SweepRead, row: int, column: int
+    folder: Path | None, image: str, read: _SweepRead, *, row: int, column: int
 ) -> tuple[float, tuple[str, ...]]:
     """Return the true range in scene units, scaled by the camera centres, or the reason why it is unknown."""
     if folder is None:
@@ -207,7 +209,7 @@ def _true_range(
 
 
 def _curve_notes(
-    unit: Unit, record: UnitRecord | None, settings: SweepSettings, curve: CostCurve, stages: Sequence[StageRange]
+    unit: Unit, record: UnitRecord | None, settings: SweepSettings, *, curve: CostCurve, stages: Sequence[StageRange]
 ) -> tuple[str, ...]:
     notes = []
     name = unit.entry.name

@@ -140,7 +140,7 @@ def gather_pair_evidence(
                 from_partner,
                 bearings[partner][matches[:, 0]],
                 bearings[image][matches[:, 1]],
-                ranges[partner][matches[:, 0]],
+                known_ranges=ranges[partner][matches[:, 0]],
                 estimator=estimator,
                 kappa=kappa,
             )
@@ -185,8 +185,8 @@ def _length(
     second_from_first: Rigid3,
     p: FloatArray,
     q: FloatArray,
-    known_ranges: FloatArray,
     *,
+    known_ranges: FloatArray,
     estimator: ScaleEstimator,
     kappa: float,
 ) -> float:

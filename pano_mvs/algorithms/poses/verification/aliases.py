@@ -104,7 +104,8 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
         if not left.any() or len(found) == _MAX_ALIASES:
             break
         signed_weights = [
-            _signed_weights(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))
+            _signed_weights(edges, weights, apart[row] <= opposite[row], near=near[row] & left)
+            for row in range(len(edges))
         ]
         support = np.array([sum(map(abs, signed.values())) for signed in signed_weights]) * left
         best = int(np.argmax(support))
@@ -241,7 +242,7 @@ def _suggestions(model: PlacedModel) -> list[_Suggestion]:
 
 
 def _signed_weights(
-    edges: list[Edge], weights: FloatArray, same_way: NDArray[np.bool_], near: NDArray[np.bool_]
+    edges: list[Edge], weights: FloatArray, same_way: NDArray[np.bool_], *, near: NDArray[np.bool_]
 ) -> dict[Edge, float]:
     """Return the heaviest signed weight of each pair among the motions that are near one of them."""
     signed_weights: dict[Edge, float] = {}

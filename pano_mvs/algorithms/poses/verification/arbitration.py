@@ -105,7 +105,7 @@ def arbitrate(
         for image in suspects:
             if image in fixed:
                 continue
-            pose = _better_place(model, image, trusted, confirmation)
+            pose = _better_place(model, image, trusted, confirmation=confirmation)
             if pose is not None:
                 model.add(image, pose)
                 trusted[image] = pose
@@ -144,7 +144,7 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
     for remaining in reversed(range(_BLOCK_ROUNDS + 1)):
         aliases = find_aliases(model)
         gains = [
-            (_gain_of(model, alias, labels, confirmation), alias, labels)
+            (_gain_of(model, alias, labels, confirmation=confirmation), alias, labels)
             for alias in aliases
             for labels in labellings(model, alias)
         ]
@@ -152,7 +152,7 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
             break
         gain, alias, labels = max(gains, key=lambda found: found[0])
         if gain > _PROMISING_GAIN and remaining:
-            labels, gain = _with_better_labels(model, alias, labels, gain, confirmation)
+            labels, gain = _with_better_labels(model, alias, labels, gain=gain, confirmation=confirmation)
         if gain <= _MIN_BLOCK_GAIN or not remaining:
             periodic = len(alias.signed_weights) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
@@ -206,7 +206,7 @@ def _turn_deg(alias: Alias) -> float:
 
 
 def _with_better_labels(
-    model: PlacedModel, alias: Alias, labels: dict[int, int], gain: float, confirmation: Confirmation
+    model: PlacedModel, alias: Alias, labels: dict[int, int], *, gain: float, confirmation: Confirmation
 ) -> tuple[dict[int, int], float]:
     """Change the labels of the images that confirm least, one at a time, while that gains; return labels and gain."""
     for _ in range(_FLIPPED):
@@ -216,7 +216,7 @@ def _with_better_labels(
         for image in sorted(shares, key=lambda idx: (np.nan_to_num(shares[idx]), idx))[:_FLIPPED]:
             flipped = {**labels, image: 1 - labels[image]}
             if 0 < sum(flipped.values()) < len(flipped):
-                flipped_gain = _gain_of(model, alias, flipped, confirmation)
+                flipped_gain = _gain_of(model, alias, flipped, confirmation=confirmation)
                 if flipped_gain > gain:
                     labels, gain = flipped, flipped_gain
         if gain == before:
@@ -224,7 +224,7 @@ def _with_better_labels(
     return labels, gain
 
 
-def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmation: Confirmation) -> float:
+def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], *, confirmation: Confirmation) -> float:
     """Return the relative gain in agreement of images and pairs if a block is moved (the factor minus one).
 
     The factor is the ratio of confirmed shares, times a power of the ratio of explained shares of pairs: repeated
@@ -303,7 +303,7 @@ def _suspects(found: Arbitration) -> list[int]:
 
 
 def _better_place(
-    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], confirmation: Confirmation
+    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], *, confirmation: Confirmation
 ) -> Rigid3 | None:
     """Return another pose of an image that the images confirm clearly better than its own; None if there is none."""
     cameras = {idx: camera for idx, camera in trusted.items() if idx != image}

@@ -134,14 +134,14 @@ class Confirmation:
         textured = small.textured & small.mask
         if not sources:
             return Evidence(np.zeros(_CLASSES), np.zeros(_CLASSES))
-        own = self._swept(image, pose, sources, others)
+        own = self._swept(image, pose, sources, cameras=others)
         maps, poses = [], []
         for source in sources:
             around = {idx: camera for idx, camera in others.items() if idx != source}
             everybody = {**around, image: pose}
             # With two images, each can only be checked against the other.
             seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
-            maps.append(self._swept(source, others[source], seen_by, everybody))
+            maps.append(self._swept(source, others[source], seen_by, cameras=everybody))
             poses.append(others[source])
         checked = check_consistency(
             own,
@@ -170,7 +170,7 @@ class Confirmation:
             self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
         return self._small[image]
 
-    def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], cameras: Mapping[int, Rigid3]) -> RangeMap:
+    def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
 
         A map with nearly the same relative poses is reused: an adjustment moves all cameras slightly.
@@ -180,7 +180,7 @@ class Confirmation:
         known = self._maps.setdefault((image, *sources), [])
         self._maps.move_to_end((image, *sources))
         for before, before_scale, ranges in known:
-            if all(_nearly(a, scale, b, before_scale) for a, b in zip(relative, before, strict=True)):
+            if all(_nearly(a, scale, b, other_scale=before_scale) for a, b in zip(relative, before, strict=True)):
                 return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
         ranges = self._sweep(image, sources, relative)
         known.append((relative, scale, ranges))
@@ -204,7 +204,7 @@ class Confirmation:
         )
 
 
-def _nearly(pose: Rigid3, scale: float, other: Rigid3, other_scale: float) -> bool:
+def _nearly(pose: Rigid3, scale: float, other: Rigid3, *, other_scale: float) -> bool:
     """Return whether two relative poses, each in its own unit, are equivalent for a sweep at 256 columns."""
     moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
     return moved < _SAME_PLACE and float(geodesic_angle(pose.rotation, other.rotation)) < _SAME_TURN_RAD
