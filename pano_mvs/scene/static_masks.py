@@ -50,5 +50,5 @@ class StaticMasks(Record):
 
 
 def camera_of(panorama: Panorama) -> Camera:
-    """Return what identifies the camera of a panorama: the sizes of the sphere in its file and here, the part covered."""
+    """Return what identifies a camera: the sizes of the sphere in its file and here, and the part that it covers."""
     return (*panorama.source_size_hw, *panorama.covers_ltwh, *panorama.size_hw)
