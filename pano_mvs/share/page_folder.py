@@ -21,7 +21,8 @@ SCRIPTS = ("three.min.js", "loader.js", "cloud.js", "panorama.js", "measure.js",
 """In the order in which the page loads them: classic scripts, since browsers refuse modules from file://."""
 
 SINGLE_FILE = "page.html"
-_MARK = "data/scene.js"
+# Written first and never removed, so that an interrupted command can be repeated.
+_MARK = "pano-mvs-page.txt"
 
 
 class PageFolder:
@@ -40,6 +41,7 @@ class PageFolder:
 
         Raises:
             UsageError: if the folder holds something else.
+            StoreError: if it cannot be written.
         """
         if exists(folder) and not is_folder(folder):
             raise UsageError(f"--to {folder}: this is a file. Give a folder")
@@ -47,6 +49,7 @@ class PageFolder:
             raise UsageError(f"--to {folder}: the folder is not empty and holds no earlier page. Give a new folder")
         for name in ("data", "index.html", SINGLE_FILE):
             remove_whole(folder / name)
+        write_text(folder / _MARK, "This folder was written by pano-mvs share, which may replace its files.\n")
         self.folder = folder
         self.written: dict[str, int] = {}
 

@@ -79,8 +79,7 @@ def sweep(
     """Sphere sweep: select, for each pixel of the reference, the depth hypothesis at which the sources match best.
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
-    must agree with each other. A blurred panorama is swept at the resolution at which
-    it is sharp.
+    must agree with each other. A blurred panorama is swept at the resolution at which it is sharp.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]

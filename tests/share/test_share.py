@@ -129,6 +129,18 @@ def test_a_folder_with_something_else_is_refused_and_kept(tmp_path: Path) -> Non
         share_run(run, tmp_path / "mine" / "index.html")
 
 
+def test_an_interrupted_page_is_written_again(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=100)
+
+    def interrupt(_done: int, _total: int) -> None:
+        raise KeyboardInterrupt("by the user")
+
+    with pytest.raises(KeyboardInterrupt, match="by the user"):
+        share_run(run, tmp_path / "page", progress=interrupt)
+    assert not (tmp_path / "page" / "index.html").exists()
+    assert share_run(run, tmp_path / "page").panoramas == 3
+
+
 def test_a_panorama_that_is_gone_is_noted(tmp_path: Path) -> None:
     run = box_run(tmp_path, points=100)
     (tmp_path / "images" / NAMES[1]).unlink()
