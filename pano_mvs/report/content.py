@@ -89,10 +89,10 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     reasons = {(first, second): why for first, second, _, why in rejected_pairs}
     record = values.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
+    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, kept=earlier)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(
-        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, kept=earlier)
     )
     scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})

@@ -98,7 +98,7 @@ def test_a_step_of_a_path_is_that_of_the_definition() -> None:
     )
     found = path_step(bytes_, sums, steps, 5000)
     for k in range(3):
-        np.testing.assert_array_equal(found[k].numpy(), plain_path_step(costs[k], before[k], penalty[k], 5000))
+        np.testing.assert_array_equal(found[k].numpy(), plain_path_step(costs[k], before[k], penalty[k], p1=5000))
 
 
 def test_of_equal_planes_the_nearest_wins() -> None:

@@ -123,8 +123,8 @@ def test_what_lies_behind_tells_the_two_matrices_of_a_plane_apart() -> None:
     found, _ = essentials_from_five(p[:1], q[:1])
     fitting = [e for e in found if sampson_angles(e, flat_p, flat_q).max() < 1e-6]
     assert len(fitting) == 2
-    poses = [facing_pose(e, flat_p, flat_q, 0.0035) for e in fitting]
-    costs = facing_costs(poses, flat_p, flat_q, 0.0035)
+    poses = [facing_pose(e, flat_p, flat_q, threshold_rad=0.0035) for e in fitting]
+    costs = facing_costs(poses, flat_p, flat_q, threshold_rad=0.0035)
     best = poses[int(np.argmin(costs))]
     assert max(errors_deg(best.rotation, best.translation, pose)) < 1e-3
     assert costs.min() < 1e-3
