@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver
+from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation

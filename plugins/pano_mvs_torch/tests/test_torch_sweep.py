@@ -21,7 +21,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import CASES, agreement, sweep_case
 
 from pano_mvs_torch import sweep
-from pano_mvs_torch.device import Batch, batch_for
+from pano_mvs_torch.batch import Batch, batch_for
 from pano_mvs_torch.lookup import _blend, packed_patches
 from pano_mvs_torch.paths import path_step
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.five_point import essentials_from_five
+from pano_mvs.algorithms.two_view.minimal_solvers import essentials_from_five
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
