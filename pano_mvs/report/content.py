@@ -22,7 +22,7 @@ from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojec
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.index import pair_name
+from pano_mvs.scene.pairs_and_views import pair_name
 
 _MAX_REASONS = 300
 
