@@ -22,7 +22,7 @@ from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojec
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.index import pair_name
+from pano_mvs.scene.pairs_and_views import pair_name
 
 _MAX_REASONS = 300
 
@@ -89,10 +89,10 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     reasons = {(first, second): why for first, second, _, why in rejected_pairs}
     record = values.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
+    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, kept=earlier)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(
-        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, kept=earlier)
     )
     scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})

@@ -73,7 +73,7 @@ def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always:
 
 
 def view_cards(
-    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, *, kept: EarlierPage
 ) -> tuple[ViewCard, ...]:
     """Return the cards of views, reusing images of an earlier page that show the same values.
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.one_color import areas_of_color
 from pano_mvs.algorithms.masks.people import people
-from pano_mvs.algorithms.masks.static import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
+from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, arguments_from, params_from, stage
 from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
 
