@@ -10,7 +10,6 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """
 
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
 from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
 from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
@@ -36,6 +35,7 @@ from pano_mvs.geometry import (
     roll_panorama,
     sample_panorama,
 )
+from pano_mvs.geometry.geodesy import lla_from_local
 from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
 from pano_mvs.io.clouds.thinning import SelectedPoints as KeptPoints
 from pano_mvs.io.clouds.thinning import Selection as PointSelection

@@ -30,6 +30,7 @@ from pano_mvs.stages.patchmatch import exchange, patchmatch
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
+from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
@@ -58,6 +59,7 @@ __all__ = [
     "gaussian",
     "guided",
     "level",
+    "localise",
     "median",
     "mesh",
     "nearest",

@@ -30,6 +30,7 @@ PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
+    "phone",
     "photos/lobby",
     "photos/flat",
     "photos/site",

@@ -176,7 +176,9 @@ def _model_images(folder: Path) -> dict[str, np.ndarray]:
 
 
 def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path)
+    out = _placed(
+        colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx), tmp_path
+    )
     assert sorted(path.name for path in (out / "colmap" / "sparse").iterdir()) == ["0", "1"]
     for number, group in enumerate(split_groups(rooms.poses)):
         centers = _model_images(out / "colmap" / "sparse" / str(number))
@@ -188,7 +190,10 @@ def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path)
 def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     rooms: Rooms, ctx: Context, tmp_path: Path
 ) -> None:
-    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
+    out = _placed(
+        colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx),
+        tmp_path / "out",
+    )
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
     assert known.rejected["b0.png"].startswith(

@@ -13,6 +13,7 @@ from tests.io.images.videos import tiny_video
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
+    "poses.localise": {"path": "{capture}/images"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
     "source.video": {"path": str(tiny_video())},
