@@ -11,7 +11,7 @@ from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.report.panorama_table import Row, panorama_rows
+from pano_mvs.report.panorama_rows import Row, panorama_rows
 from pano_mvs.report.static_pictures import static_pictures
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
