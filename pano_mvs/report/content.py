@@ -9,6 +9,7 @@ from typing import Any
 
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
+from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.panorama_rows import Row, panorama_rows
@@ -39,6 +40,7 @@ class Content:
         rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
         pairs: number of compared pairs.
         cloud: pictures of the cloud.
+        turnable: the cloud for the viewer in the page; None if there is none.
         cards: views shown in full.
         total_views: number of views.
         static: (image, share, picture) of what moves with each camera.
@@ -60,6 +62,7 @@ class Content:
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
     pairs: int
     cloud: CloudPictures
+    turnable: TurnableCloud | None
     cards: tuple[ViewCard, ...]
     total_views: int
     static: tuple[tuple[str, float, Picture], ...]
@@ -104,6 +107,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         rejected_pairs=rejected_pairs,
         pairs=len(poses.links),
         cloud=cloud_pictures(values, earlier, up=up_of(poses)),
+        turnable=turnable_cloud(values, groups[0], earlier, up=up_of(poses)),
         cards=cards,
         total_views=len(views),
         static=static_pictures(values, earlier),

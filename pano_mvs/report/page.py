@@ -22,6 +22,8 @@ from pano_mvs.results.records import Verdict
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 
+_SCRIPTS = ("report.js", "cloud_viewer.js")
+
 MAX_SHOWN = 200
 """Failures, rejected pairs and the like that the page lists; run.json has all of them."""
 
@@ -55,7 +57,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
     Raises:
         StoreError: if it cannot be written.
     """
-    script = _resource("report.js")
+    scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
     page = (
         _environment()
@@ -68,9 +70,9 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
             content=content,
             most_shown=MAX_SHOWN,
             facts=content.facts,
-            script=Markup(script),  # noqa: S704  # ours
+            scripts=[Markup(script) for script in scripts],  # noqa: S704  # ours
             style=Markup(_resource("report.css")),  # noqa: S704  # ours
-            script_digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
+            script_sources=Markup(" ".join(map(_source, scripts))),  # noqa: S704  # digests
         )
     )
     write_text(out_dir / "report.html", page)
@@ -94,6 +96,11 @@ def _environment() -> Environment:
         "plural": plural,
     }
     return environment
+
+
+def _source(script: str) -> str:
+    """Return the expression by which a content security policy allows one inline script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')}'"
 
 
 def _resource(name: str) -> str:
