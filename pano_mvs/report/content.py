@@ -47,6 +47,7 @@ class Content:
         rows: one for each panorama.
         total_rows: number of panoramas.
         mean_shares: of the sphere, over all measured views.
+        measured_views: number of these.
         residuals: of the points.
         pair_residuals: medians of the pairs' residuals.
         scores: (stage, tables) of each branch with scores.
@@ -69,6 +70,7 @@ class Content:
     rows: tuple[Row, ...]
     total_rows: int
     mean_shares: Shares | None
+    measured_views: int
     residuals: Residuals | None
     pair_residuals: Histogram | None
     scores: tuple[tuple[str, Mapping[str, Any]], ...]
@@ -92,7 +94,9 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     reasons = {(first, second): why for first, second, _, why in rejected_pairs}
     record = values.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
+    chosen = [views[idx] for idx in chosen_views(views, always=poses.doubts)]
+    group_of = {name: number for number, group in enumerate(groups) for name in group.registered}
+    cards = view_cards(out_dir, chosen, values, earlier, groups=group_of)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(
         summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
@@ -114,6 +118,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         rows=rows,
         total_rows=len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected}),
         mean_shares=_mean(list(shares.values())),
+        measured_views=len(shares),
         residuals=residuals,
         pair_residuals=histogram([link.residual_deg for link in poses.links if link.residual_deg is not None]),
         scores=scores,

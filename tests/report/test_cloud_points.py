@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +22,9 @@ from tests.viewer.scenes import box_cloud
 UP = np.array([0.0, -1.0, 0.0])
 
 
-def decoded(fact: dict[str, object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decoded(fact: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points, normals and colours as the viewer's shader sees them."""
-    packed = np.frombuffer(base64.b64decode(str(fact["data"])), np.uint8).reshape(-1, 12)
+    packed = np.frombuffer(base64.b64decode(fact["data"]), np.uint8).reshape(-1, 12)
     places = np.ascontiguousarray(packed[:, :6]).view("<u2").astype(float) / 65535
     return places * fact["size"] + np.array(fact["lower"]), packed[:, 6:9].view(np.int8) / 127, packed[:, 9:]
 
