@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
+from pano_mvs.report.capture_facts import CaptureFacts, capture_facts
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
 from pano_mvs.report.completeness import Shares
@@ -33,6 +34,7 @@ class Content:
     """The content of the page.
 
     Attributes:
+        capture: what the report is about.
         verdict: the head of the page.
         groups: the poses of each group of cameras, the largest first.
         maps: the cameras of each group, from above and from the side.
@@ -56,6 +58,7 @@ class Content:
         facts: figures that the next page may reuse.
     """
 
+    capture: CaptureFacts
     verdict: Verdict
     groups: tuple[PosesSummary, ...]
     maps: tuple[tuple[CameraMap, ...], ...]
@@ -102,8 +105,10 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
     )
     scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
+    total_rows = len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected})
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
     return Content(
+        capture=capture_facts(summary, values, panoramas=total_rows or len(values.refs.get("images", {}))),
         verdict=verdict(judged, residuals=residuals, image_width=_image_width(values)),
         groups=groups,
         maps=tuple(camera_maps(group, reasons) for group in groups),
@@ -116,7 +121,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         total_views=len(views),
         static=static_pictures(values, earlier),
         rows=rows,
-        total_rows=len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected}),
+        total_rows=total_rows,
         mean_shares=_mean(list(shares.values())),
         measured_views=len(shares),
         residuals=residuals,

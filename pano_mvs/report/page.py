@@ -94,6 +94,7 @@ def _environment() -> Environment:
         "words": figures.words,
         "degrees": figures.degrees,
         "plural": plural,
+        "pixels": lambda size_hw: f"{size_hw[1]} × {size_hw[0]} px",
     }
     return environment
 
