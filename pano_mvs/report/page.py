@@ -91,6 +91,7 @@ def _environment() -> Environment:
         "share": figures.share,
         "duration": figures.duration,
         "figure": figures.figure,
+        "short": figures.short,
         "words": figures.words,
         "degrees": figures.degrees,
         "plural": plural,
