@@ -19,12 +19,13 @@ from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.pictures import Picture
-from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
+from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.index import pair_name
+from pano_mvs.scene.scores import NO_TRUTH
 
 _MAX_REASONS = 300
 
@@ -104,7 +105,8 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     rows = panorama_rows(
         summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
     )
-    scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
+    known = {stage: scored for stage, scored in summary.scores_by_stage.items() if not _without_truth(scored)}
+    scores = tuple((stage, score_tables(scored)) for stage, scored in known.items())
     total_rows = len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected})
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
     return Content(
@@ -131,6 +133,11 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         notes=tuple(sorted(set(values.notes))),
         facts=earlier.facts,
     )
+
+
+def _without_truth(scores: ScoresSummary) -> bool:
+    """Return whether there is nothing to say but that nobody has a ground truth."""
+    return not scores.poses and not scores.views and set(scores.notes) <= {NO_TRUTH}
 
 
 def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:

@@ -18,6 +18,7 @@ from pano_mvs.report.view_cards import chosen_views
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene.scores import NO_TRUTH
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
@@ -296,6 +297,13 @@ def test_scores_of_all_branches_are_told_apart(out_dir: Path) -> None:
     assert beside.index("ours") < beside.index("30") < beside.index("papers") < beside.index("11.25")
     assert words.count("11.25") == 2, "and in the table of its branch"
     assert "Median over views" not in reported(out_dir, SUMMARY).words
+
+
+def test_nothing_is_said_of_a_ground_truth_that_nobody_has(out_dir: Path) -> None:
+    scores = {"poses": {}, "views": {}, "notes": [NO_TRUTH]}
+    assert "ground truth" not in reported(out_dir, SUMMARY | {"scores": scores}).words
+    other = reported(out_dir, SUMMARY | {"scores": scores | {"notes": [NO_TRUTH, "1.png is another image"]}})
+    assert "1.png is another image" in other.words
 
 
 def test_where_nothing_failed_nothing_is_said_of_failures(out_dir: Path) -> None:
