@@ -13,12 +13,11 @@ from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
 from pano_mvs.report.panorama_rows import Row, panorama_rows
-from pano_mvs.report.static_pictures import static_pictures
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
-from pano_mvs.results.pictures import Picture
 from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
@@ -46,7 +45,7 @@ class Content:
         turnable: the cloud for the viewer in the page; None if there is none.
         cards: views shown in full.
         total_views: number of views.
-        static: (image, share, picture) of what moves with each camera.
+        masked: what is masked in the panoramas.
         rows: one for each panorama.
         total_rows: number of panoramas.
         mean_shares: of the sphere, over all measured views.
@@ -70,7 +69,7 @@ class Content:
     turnable: TurnableCloud | None
     cards: tuple[ViewCard, ...]
     total_views: int
-    static: tuple[tuple[str, float, Picture], ...]
+    masked: MaskedAreas
     rows: tuple[Row, ...]
     total_rows: int
     mean_shares: Shares | None
@@ -121,7 +120,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         turnable=turnable_cloud(values, groups[0], earlier, up=up_of(poses)),
         cards=cards,
         total_views=len(views),
-        static=static_pictures(values, earlier),
+        masked=masked_areas(values, earlier),
         rows=rows,
         total_rows=total_rows,
         mean_shares=_mean(list(shares.values())),
