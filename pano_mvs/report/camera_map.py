@@ -60,7 +60,7 @@ class CameraMap:
         dots: an SVG path of the cameras if there are too many to name.
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
-        marks: (x, y, number) of places to stand, numbered as in the list of suggestions.
+        marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
     """
 
     title: str
@@ -96,7 +96,8 @@ def camera_maps(
     Args:
         poses: of one group of cameras.
         reasons: why pairs have no common geometry, if known.
-        marks: number and position in the world of places to stand. Those outside of the map are drawn at its edge.
+        marks: number and position in the world of places to stand, drawn from above. Those outside of the map are drawn
+            at its edge.
     """
     names = list(poses.registered)
     centers = np.array(poses.centers, dtype=np.float64).reshape(-1, 3)
@@ -115,7 +116,9 @@ def camera_maps(
             title,
             _flat(centers, axes),
             labels,
-            marks=[(number, at) for (number, _), at in zip(marks, _flat(places, axes), strict=True)],
+            marks=[(number, at) for (number, _), at in zip(marks, _flat(places, axes), strict=True)]
+            if title == "From above"
+            else (),
             links=links,
             doubts=doubts,
             unit=unit,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.report.advice import MAX_SUGGESTIONS, advice
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.capture_facts import CaptureFacts, capture_facts
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
@@ -18,6 +19,7 @@ from pano_mvs.report.panorama_rows import Row, panorama_rows
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
+from pano_mvs.results.next_time import Suggestion, marks_of
 from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
@@ -36,6 +38,7 @@ class Content:
     Attributes:
         capture: what the report is about.
         verdict: the head of the page.
+        advice: what to do next time, the most urgent first.
         groups: the poses of each group of cameras, the largest first.
         maps: the cameras of each group, from above and from the side.
         metric: images whose ranges are in metres.
@@ -60,6 +63,7 @@ class Content:
 
     capture: CaptureFacts
     verdict: Verdict
+    advice: tuple[Suggestion, ...]
     groups: tuple[PosesSummary, ...]
     maps: tuple[tuple[CameraMap, ...], ...]
     metric: frozenset[str]
@@ -108,11 +112,14 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     scores = tuple((stage, score_tables(scored)) for stage, scored in known.items())
     total_rows = len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected})
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
+    advised = advice(judged, values, earlier, chosen=[view.name for view in chosen])
+    marked = advised[:MAX_SUGGESTIONS]
     return Content(
         capture=capture_facts(summary, values, panoramas=total_rows or len(values.refs.get("images", {}))),
         verdict=verdict(judged, residuals=residuals, image_width=_image_width(values)),
+        advice=advised,
         groups=groups,
-        maps=tuple(camera_maps(group, reasons) for group in groups),
+        maps=tuple(camera_maps(group, reasons, marks=marks_of(marked, number)) for number, group in enumerate(groups)),
         metric=frozenset(name for group in groups if group.metric for name in group.registered),
         rejected_pairs=rejected_pairs,
         pairs=len(poses.links),

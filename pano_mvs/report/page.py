@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural
+from pano_mvs.report.advice import MAX_SUGGESTIONS
 from pano_mvs.report.content import Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
@@ -69,6 +70,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
             longest=max((stage.seconds for stage in summary.stages), default=0) or 1,
             content=content,
             most_shown=MAX_SHOWN,
+            most_advice=MAX_SUGGESTIONS,
             facts=content.facts,
             scripts=[Markup(script) for script in scripts],  # noqa: S704  # ours
             style=Markup(_resource("report.css")),  # noqa: S704  # ours

@@ -45,7 +45,7 @@ def test_views_are_shown_with_panorama_range_and_confidence(
     assert "From inside, where" in page.words
     assert "only 7 of 31 matches agree" in page.words
     assert "median reprojection residual" in page.words
-    assert "Median epipolar residual of each matched pair: 5 values" in page.words
+    assert "Median epipolar residual of each matched pair: 5 pairs" in page.words
     assert "Not shown" not in page.words
 
 
