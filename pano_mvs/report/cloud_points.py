@@ -136,15 +136,17 @@ def one_per_voxel(points: FloatArray, most: int) -> tuple[NDArray[np.intp], floa
         most: largest number of points.
 
     Returns:
-        Positions in `points`, ascending, and the edge to about 1 %.
+        Positions in `points`, ascending, and the edge to about 1 %; if all points are kept, a typical distance.
     """
     origin = points.min(axis=0)
-    size = float((points.max(axis=0) - origin).max()) or 1.0
+    extent = points.max(axis=0) - origin
+    size = float(extent.max()) or 1.0
     shifted = points - origin
     low, high = size / 2**17, size
     chosen = _first_of_voxels(shifted, low)
     if len(chosen) <= most:
-        return chosen, size / max(1.0, np.sqrt(len(chosen)))
+        area = 2 * float(extent @ np.roll(extent, 1)) or size**2  # of the box, near to which surfaces usually are
+        return chosen, np.sqrt(area / len(chosen))
     chosen = _first_of_voxels(shifted, high)
     for _ in range(_STEPS):
         middle = float(np.sqrt(low * high))
