@@ -10,6 +10,7 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.results.coverage import LonelyArea, ViewCoverage
@@ -32,7 +33,7 @@ LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 
 _USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
 _GOOD_BASELINE = 0.05, 0.2
-_NEIGHBOURS = 4
+_NEIGHBOURS, _KNOWN_NEIGHBOURS = 4, 6
 _WEAK = 0.5  # of the median share that other views confirm
 _MAX_ADDED = 20
 _MAX_UNREGISTERED = 4
@@ -78,6 +79,7 @@ class _Group:
     number: int
     poses: PosesSummary
     centers: FloatArray
+    neighbours: NDArray[np.intp]
     coverage: Mapping[str, ViewCoverage]
 
     @property
@@ -92,10 +94,8 @@ class _Group:
         return f"{significant(value)} {self.unit}"
 
     def nearest(self, idx: int) -> NDArray[np.intp]:
-        """Return the other cameras, nearest first."""
-        distance = np.linalg.norm(self.centers - self.centers[idx], axis=1)
-        order = np.argsort(distance, kind="stable")
-        return np.asarray(order[order != idx], np.intp)
+        """Return up to six other cameras, nearest first."""
+        return np.asarray(self.neighbours[idx])
 
     def distance(self, first: int, second: int) -> float:
         return float(np.linalg.norm(self.centers[first] - self.centers[second]))
@@ -125,7 +125,7 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
         centers = np.array(poses.centers, np.float64).reshape(-1, 3)
         if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
             continue
-        group = _Group(number, poses, centers, coverage or {})
+        group = _Group(number, poses, centers, _neighbours(centers), coverage or {})
         _spacing(group, found)
         _doubtful(group, found)
         _weak(group, summary, found)
@@ -357,6 +357,16 @@ def direction_words(area: LonelyArea) -> str:
     if abs(elevation) < 5:
         return across
     return f"{across}, {abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
+
+
+def _neighbours(centers: FloatArray) -> NDArray[np.intp]:
+    """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
+    count = len(centers)
+    distance, found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
+    near = np.take_along_axis(np.asarray(found, np.intp), np.lexsort((found, distance)), axis=1)
+    own = near == np.arange(count)[:, None]
+    own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
+    return near[~own].reshape(count, -1)
 
 
 def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:

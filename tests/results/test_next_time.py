@@ -167,6 +167,11 @@ def test_unknown_places_give_no_advice() -> None:
     assert advice(poses | {"centers": poses["centers"][:3]}) == ()
 
 
+def test_cameras_in_one_place_are_no_failure() -> None:
+    assert advice(in_a_row(*[0.0] * 12), 5.0)[0].action.startswith("Take panoramas 0.25–1")
+    assert advice(in_a_row(0, 0), 5.0)
+
+
 def test_the_tree_is_the_shortest() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(40, 3))
