@@ -362,11 +362,13 @@ def direction_words(area: LonelyArea) -> str:
 def _neighbours(centers: FloatArray) -> NDArray[np.intp]:
     """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
     count = len(centers)
-    distance, found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
-    near = np.take_along_axis(np.asarray(found, np.intp), np.lexsort((found, distance)), axis=1)
+    found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
+    distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
+    near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
     own = near == np.arange(count)[:, None]
     own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
-    return near[~own].reshape(count, -1)
+    neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
+    return neighbours
 
 
 def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
