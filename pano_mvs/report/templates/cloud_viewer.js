@@ -50,7 +50,7 @@
   const view = {target: stored.middle, yaw: 0, pitch: 0, distance: 1, fov: OUTSIDE_FOV};
   let shownCameras = true, inside = -1, asked = false;
   const named = cameras.map(function (camera, i) { return i; }).filter(function (i) { return cameras[i][4]; });
-  const fitted = function () { return 0.85 * stored.radius / Math.sin(OUTSIDE_FOV / 2) / Math.min(1, canvas.clientWidth / Math.max(1, canvas.clientHeight)); };
+  const fitted = function () { return 0.95 * stored.radius / Math.sin(OUTSIDE_FOV / 2) / Math.min(1, canvas.clientWidth / Math.max(1, canvas.clientHeight)); };
   const look = function (yaw, pitch, text) {
     Object.assign(view, {target: stored.middle.slice(), yaw: yaw, pitch: pitch, distance: fitted(), fov: OUTSIDE_FOV});
     inside = -1;
