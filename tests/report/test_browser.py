@@ -59,10 +59,11 @@ def browser(window: Browser, page: Path) -> Iterator[Browser]:
 
 def cloud_of(browser: Browser) -> NDArray[np.int64]:
     """Return the part of the window that shows the cloud."""
+    browser.wait("!document.getElementById('viewer').hidden && document.readyState === 'complete'")
     browser.evaluate(
-        "document.querySelector('#viewer canvas').scrollIntoView({block: 'center', behavior: 'instant'}), 0"
+        "document.querySelector('#viewer canvas').scrollIntoView({block: 'center', behavior: 'instant'}),"
+        " new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))"
     )
-    browser.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))) && true")
     box: dict[str, Any] = browser.evaluate("document.querySelector('#viewer canvas').getBoundingClientRect().toJSON()")
     top, left = round(box["top"]), round(box["left"])
     picture = browser.screenshot()[top : top + round(box["height"]), left : left + round(box["width"])]
@@ -198,3 +199,25 @@ def test_all_controls_have_names(browser: Browser) -> None:
         " !e.getAttribute('aria-label') && !(e.labels && e.labels.length)).map((e) => e.outerHTML.slice(0, 80))"
     )
     assert nameless == []
+
+
+def test_a_view_is_compared_with_what_is_shown_over_it(browser: Browser) -> None:
+    browser.evaluate("document.querySelector('.slider').focus(), 0")
+    clip = "getComputedStyle(document.querySelector('.laid .pane.range')).clipPath"
+    before = browser.evaluate(clip)
+    browser.press("\ue012")  # arrow to the left
+    assert browser.evaluate(clip) != before
+    browser.evaluate("document.querySelector('.tabs').lastElementChild.click(), 0")
+    assert browser.evaluate(clip.replace(".clipPath", ".display")) == "none"
+    label = browser.evaluate("document.querySelector('.slider').getAttribute('aria-label')")
+    assert label == "000.png: panorama left of the line, confidence right of it"
+
+
+def test_panoramas_are_found_by_a_part_of_their_names(browser: Browser) -> None:
+    shown = "[...document.querySelectorAll('#rows tr b')].map((name) => name.textContent)"
+    assert len(browser.evaluate(shown)) == 4
+    find = "Object.assign(document.getElementById('find'), {value: VALUE}).dispatchEvent(new Event('input'))"
+    browser.evaluate(find.replace("VALUE", "'02.p'"))
+    assert browser.evaluate(shown) == ["002.png"]
+    browser.evaluate(find.replace("VALUE", "'nothing'"))
+    assert browser.evaluate("document.getElementById('page').textContent") == "none found"
