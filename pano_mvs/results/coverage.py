@@ -95,7 +95,7 @@ def coverage(values: StoredValues, names: Sequence[str]) -> dict[str, ViewCovera
             if name not in names:
                 continue
             near = _nearest(group, idx, with_ranges)
-            views = [_cached(small, values, group, at) for at in (idx, *near)]
+            views = [_cached(small, values, at, group=group) for at in (idx, *near)]
             own, others = views[0], [view for view in views[1:] if view is not None]
             if own is not None and np.isfinite(own.points).any():
                 found[name] = view_coverage(own.points, own.pose, [(view.surfaces, view.pose) for view in others])
@@ -151,7 +151,7 @@ def view_coverage(ranges: FloatArray, pose: Rigid3, others: Sequence[tuple[Float
     middle = np.searchsorted(np.cumsum(weights[valid][order]), weights[valid].sum() / 2)
     typical = float(ranges[valid][order][min(middle, len(order) - 1)])
     alone = seen_alone(ranges, pose, others)
-    areas = _areas(alone, ranges, pose, weights)
+    areas = _areas(alone, ranges, pose, weights=weights)
     return ViewCoverage(typical, float(weights[alone].sum()), areas)
 
 
@@ -172,7 +172,7 @@ def seen_alone(ranges: FloatArray, pose: Rigid3, others: Sequence[tuple[FloatArr
     return np.asarray(alone, np.bool_)
 
 
-def _areas(alone: Mask, ranges: FloatArray, pose: Rigid3, weights: NDArray[np.floating]) -> tuple[LonelyArea, ...]:
+def _areas(alone: Mask, ranges: FloatArray, pose: Rigid3, *, weights: NDArray[np.floating]) -> tuple[LonelyArea, ...]:
     labels = _labels(alone)
     shares = np.bincount(labels.ravel(), weights.ravel(), minlength=1)
     shares[0] = 0
@@ -210,7 +210,7 @@ def _nearest(group: Poses, idx: int, with_ranges: Sequence[int]) -> list[int]:
     return [others[at] for at in np.argsort(distances, kind="stable")[:_MAX_OTHERS]]
 
 
-def _cached(small: dict[str, _Small | None], values: StoredValues, group: Poses, idx: int) -> _Small | None:
+def _cached(small: dict[str, _Small | None], values: StoredValues, idx: int, *, group: Poses) -> _Small | None:
     name = group.names[idx]
     if name not in small:
         ranges, confidence = values.ranges(name), values.confidence(name)

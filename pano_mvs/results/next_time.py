@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pano_mvs.core.text import plural, shortened_list
+from pano_mvs.results.camera_group import CameraGroup, shortest_tree
 from pano_mvs.results.coverage import LonelyArea, ViewCoverage
 from pano_mvs.results.figures import median, share, significant
 from pano_mvs.results.findings import compares_views
@@ -33,7 +33,7 @@ LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 
 _USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
 _GOOD_BASELINE = 0.05, 0.2
-_NEIGHBOURS, _KNOWN_NEIGHBOURS = 4, 6
+_NEIGHBOURS = 4
 _WEAK = 0.5  # of the median share that other views confirm
 _MAX_ADDED = 20
 _MAX_UNREGISTERED = 4
@@ -72,44 +72,6 @@ class _Between:
     count: int = 1
 
 
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """The cameras of a group, with what is known of their surroundings."""
-
-    number: int
-    poses: PosesSummary
-    centers: FloatArray
-    neighbours: NDArray[np.intp]
-    coverage: Mapping[str, ViewCoverage]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.poses.registered
-
-    @property
-    def unit(self) -> str:
-        return "m" if self.poses.metric else "scene units"
-
-    def length(self, value: float) -> str:
-        return f"{significant(value)} {self.unit}"
-
-    def nearest(self, idx: int) -> NDArray[np.intp]:
-        """Return up to six other cameras, nearest first."""
-        return np.asarray(self.neighbours[idx])
-
-    def distance(self, first: int, second: int) -> float:
-        return float(np.linalg.norm(self.centers[first] - self.centers[second]))
-
-    def typical_range(self, idx: int) -> float | None:
-        known = self.coverage.get(self.names[idx])
-        return None if known is None else known.typical_range
-
-    def too_close(self, first: int, second: int) -> bool:
-        """Return whether a panorama between two cameras would be too close to both to be of use."""
-        known = self.typical_range(first)
-        return known is not None and self.distance(first, second) < SHORT_BASELINE * known
-
-
 def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None = None) -> tuple[Suggestion, ...]:
     """Return what to do when the place is captured again, the most urgent first.
 
@@ -122,10 +84,9 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
     _connect_groups(summary, found)
     _register(summary, found)
     for number, poses in enumerate(parts):
-        centers = np.array(poses.centers, np.float64).reshape(-1, 3)
-        if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
+        group = CameraGroup.of(number, poses, coverage or {})
+        if group is None:
             continue
-        group = _Group(number, poses, centers, _neighbours(centers), coverage or {})
         _spacing(group, found)
         _doubtful(group, found)
         _weak(group, summary, found)
@@ -237,7 +198,7 @@ def _matches(inliers: int, candidates: int | None) -> str:
     return verified if candidates is None else f"{verified} of {candidates} {plural(candidates, 'candidate')}"
 
 
-def _spacing(group: _Group, found: _Collected) -> None:
+def _spacing(group: CameraGroup, found: _Collected) -> None:
     """Suggest panoramas in gaps, and other distances if neighbours are too close."""
     edges = shortest_tree(group.centers)
     typical = median([length for _, _, length in edges]) or 0.0
@@ -249,7 +210,7 @@ def _spacing(group: _Group, found: _Collected) -> None:
                 f"{group.length(typical)}"
             )
             count = min(_MAX_ADDED, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
-            _stand_between(group, found, (first, second), _Severity.SPACING, reason, count=count)
+            _stand_between(group, found, (first, second), severity=_Severity.SPACING, reason=reason, count=count)
     for idx, name in enumerate(group.names):
         known = group.typical_range(idx)
         other = int(group.nearest(idx)[0])
@@ -258,11 +219,17 @@ def _spacing(group: _Group, found: _Collected) -> None:
                 f"{name} is {group.length(distance)} from its nearest neighbour, {share(distance / known)} of the "
                 f"median distance to what it sees ({group.length(known)}): near surfaces look too different"
             )
-            _stand_between(group, found, (idx, other), _Severity.SPACING, reason)
-    _too_close(group, found)
+            _stand_between(group, found, (idx, other), severity=_Severity.SPACING, reason=reason)
+    _all_too_close(group, found)
 
 
-def _too_close(group: _Group, found: _Collected) -> None:
+def _too_close(group: CameraGroup, first: int, second: int) -> bool:
+    """Return whether a panorama between two cameras would be too close to both to be of use."""
+    known = group.typical_range(first)
+    return known is not None and group.distance(first, second) < SHORT_BASELINE * known
+
+
+def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
     known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
     farthest = {idx: group.distance(idx, int(group.nearest(idx)[:_NEIGHBOURS][-1])) for idx in known}
@@ -284,14 +251,14 @@ def _too_close(group: _Group, found: _Collected) -> None:
     )
 
 
-def _doubtful(group: _Group, found: _Collected) -> None:
+def _doubtful(group: CameraGroup, found: _Collected) -> None:
     for idx, name in enumerate(group.names):
         if name in group.poses.doubts:
             reason = f"{name} is doubtful: {group.poses.doubts[name]}"
-            _stand_between(group, found, (idx, int(group.nearest(idx)[0])), _Severity.DOUBTFUL, reason)
+            _stand_between(group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason)
 
 
-def _weak(group: _Group, summary: RunSummary, found: _Collected) -> None:
+def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:
     """Suggest panoramas beside cameras of whose pixels other views confirm much less than usual."""
     shares = {view.name: view.consistent for view in summary.views if view.consistent is not None}
     usual = median(list(shares.values()))
@@ -300,12 +267,12 @@ def _weak(group: _Group, summary: RunSummary, found: _Collected) -> None:
     limit = max(FAIR_CONSISTENT, _WEAK * usual)
     for idx, name in enumerate(group.names):
         other = int(group.nearest(idx)[0])
-        if shares.get(name, 1.0) < limit and not group.too_close(idx, other):
+        if shares.get(name, 1.0) < limit and not _too_close(group, idx, other):
             reason = f"other views confirm {share(shares[name])} of {name}, and {share(usual)} of the median view"
-            _stand_between(group, found, (idx, other), _Severity.WEAK, reason)
+            _stand_between(group, found, (idx, other), severity=_Severity.WEAK, reason=reason)
 
 
-def _loose(group: _Group, found: _Collected) -> None:
+def _loose(group: CameraGroup, found: _Collected) -> None:
     """Suggest panoramas beside cameras that share a verified geometry with only one other."""
     links = [link for link in group.poses.links if link.inliers]
     if len(group.names) < MIN_CAMERAS or not links:
@@ -319,10 +286,10 @@ def _loose(group: _Group, found: _Collected) -> None:
         partner = link.second if link.first == name else link.first
         others = [int(at) for at in group.nearest(idx) if group.names[at] != partner]
         reason = f"{name} shares a verified geometry with one panorama only, {partner} ({_matches(link.inliers, None)})"
-        _stand_between(group, found, (idx, others[0]), _Severity.LOOSE, reason)
+        _stand_between(group, found, (idx, others[0]), severity=_Severity.LOOSE, reason=reason)
 
 
-def _lonely(group: _Group, found: _Collected) -> None:
+def _lonely(group: CameraGroup, found: _Collected) -> None:
     """Suggest panoramas towards the largest areas that one camera alone sees."""
     areas = [
         (area, idx)
@@ -359,44 +326,20 @@ def direction_words(area: LonelyArea) -> str:
     return f"{across}, {abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
 
 
-def _neighbours(centers: FloatArray) -> NDArray[np.intp]:
-    """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
-    count = len(centers)
-    found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
-    distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
-    near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
-    own = near == np.arange(count)[:, None]
-    own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
-    neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
-    return neighbours
-
-
-def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
-    """Return (first, second, length) of the edges of the minimum spanning tree of points (N, 3), by Prim's method."""
-    count = len(centers)
-    length = np.full(count, np.inf)
-    nearest = np.zeros(count, np.int64)
-    outside = np.ones(count, np.bool_)
-    edges: list[tuple[int, int, float]] = []
-    current = 0
-    for _ in range(count - 1):
-        outside[current] = False
-        distance = np.linalg.norm(centers - centers[current], axis=1)
-        closer = outside & (distance < length)
-        length[closer], nearest[closer] = distance[closer], current
-        current = int(np.argmin(np.where(outside, length, np.inf)))
-        edges.append((int(nearest[current]), current, float(length[current])))
-    return edges
-
-
 def _stand_between(
-    group: _Group, found: _Collected, pair: tuple[int, int], severity: _Severity, reason: str, *, count: int = 1
+    group: CameraGroup,
+    found: _Collected,
+    pair: tuple[int, int],
+    *,
+    severity: _Severity,
+    reason: str,
+    count: int = 1,
 ) -> None:
     x, y, z = (float(value) for value in group.centers[list(pair)].mean(axis=0))
     names = group.names[pair[0]], group.names[pair[1]]
     found.between(names, severity, reason, group=group.number, at=(x, y, z), count=count)
 
 
-def marks_of(found: Sequence[Suggestion] | Iterable[Suggestion], group: int) -> list[tuple[int, Direction]]:
+def marks_of(found: Iterable[Suggestion], group: int) -> list[tuple[int, Direction]]:
     """Return the number, from 1, and the place of each suggestion that has one in the world of a group."""
     return [(number, one.at) for number, one in enumerate(found, start=1) if one.at is not None and one.group == group]
