@@ -25,7 +25,7 @@ from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojec
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.index import pair_name
+from pano_mvs.scene.pairs_and_views import pair_name
 from pano_mvs.scene.scores import NO_TRUTH
 
 _MAX_REASONS = 300
@@ -103,10 +103,10 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     residuals = reprojection_residuals(record) if record is not None else None
     chosen = [views[idx] for idx in chosen_views(views, always=poses.doubts)]
     group_of = {name: number for number, group in enumerate(groups) for name in group.registered}
-    cards = view_cards(out_dir, chosen, values, earlier, groups=group_of)
+    cards = view_cards(out_dir, chosen, values, kept=earlier, groups=group_of)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(
-        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, kept=earlier)
     )
     known = {stage: scored for stage, scored in summary.scores_by_stage.items() if not _without_truth(scored)}
     scores = tuple((stage, score_tables(scored)) for stage, scored in known.items())

@@ -24,7 +24,7 @@ _VERSION = 2
 
 
 def thumbnails(
-    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, *, kept: EarlierPage
 ) -> dict[str, Picture]:
     """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]

@@ -86,8 +86,8 @@ def view_cards(
     out_dir: Path,
     views: Sequence[ViewSummary],
     results: StoredValues,
-    kept: EarlierPage,
     *,
+    kept: EarlierPage,
     groups: Mapping[str, int] | None = None,
 ) -> tuple[ViewCard, ...]:
     """Return the cards of views, reusing images of an earlier page that show the same values.

@@ -23,7 +23,7 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
-from pano_mvs.stages.masks import apply, color, static
+from pano_mvs.stages.masks import apply, color, operator, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch
@@ -63,6 +63,7 @@ __all__ = [
     "nearest",
     "nerfstudio",
     "nerfstudio_frames",
+    "operator",
     "orb_tangent",
     "patchmatch",
     "planes",

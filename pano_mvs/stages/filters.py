@@ -116,7 +116,7 @@ def consistency(
         range_map,
         pose.cam_from_world,
         sources,
-        [other.cam_from_world for other in source_poses],
+        source_poses=[other.cam_from_world for other in source_poses],
         **settings,
     )
     for name, value in asdict(agreement).items():

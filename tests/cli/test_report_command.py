@@ -27,7 +27,7 @@ def pictures(page: Page) -> dict[str | None, str | None]:
 
 
 def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, tmp_path: Path) -> None:
-    write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), (48, 96))
+    write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=(48, 96))
     truth = tmp_path / "capture" / "truth"
     command = (
         "known_poses",
@@ -147,7 +147,7 @@ def test_what_an_interrupted_run_had_made_is_shown(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pano_mvs.stages.filters.fast_bilateral_solver", interrupted)
-    write_capture(tmp_path / "capture", default_room(), capture_poses(2, spread=0.4), (32, 64))
+    write_capture(tmp_path / "capture", default_room(), capture_poses(2, spread=0.4), size_hw=(32, 64))
     truth = tmp_path / "capture" / "truth"
     result = pano_mvs(
         "run",

@@ -24,7 +24,7 @@ def block(mark: str) -> str:
 
 
 def test_plugin_and_workflow_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_capture(tmp_path / "room", default_room(), capture_poses(3, spread=0.4), (128, 256))
+    write_capture(tmp_path / "room", default_room(), capture_poses(3, spread=0.4), size_hw=(128, 256))
     (tmp_path / "room" / "images").rename(tmp_path / "photos")
     (tmp_path / "far_cut.py").write_text(block("plugin"))
     (tmp_path / "mine.yaml").write_text(block("workflow"))

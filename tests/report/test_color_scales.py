@@ -53,7 +53,7 @@ def farther(results: StoredValues, tiny: TinyCapture) -> StoredValues:
 def cards_of(results: StoredValues, tiny: TinyCapture, earlier: EarlierPage, **groups: int) -> tuple[ViewCard, ...]:
     views = [ViewSummary(name=name) for name in tiny.names]
     return view_cards(
-        Path("nowhere"), views, results, earlier, groups={name: groups.get(name[2], 0) for name in tiny.names}
+        Path("nowhere"), views, results, kept=earlier, groups={name: groups.get(name[2], 0) for name in tiny.names}
     )
 
 

@@ -87,7 +87,7 @@ def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str
         colors = distance_colors(distances, evaluation.limits)
         for view in viewpoints(points, cameras, up, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
             parts.append(strip(_LINE, f"{title}, {view.title.lower()}"))
-            parts.append(draw_cloud(points, normals, colors, view, size_hw=_SIZE_HW))
+            parts.append(draw_cloud(points, normals, colors, viewpoint=view, size_hw=_SIZE_HW))
     write_stack(path, parts)
 
 

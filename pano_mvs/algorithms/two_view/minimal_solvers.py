@@ -1,14 +1,38 @@
-"""Essential matrices from five pairs of bearings."""
+"""Essential matrices from minimal samples: the five-point and the eight-point solver, by name."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.two_view.essential import essential_from_bearings
+
 FloatArray = NDArray[np.float64]
+Solver: TypeAlias = Literal["five_point", "eight_point"]
 
 _SAMPLE = 5
 _MAX_SOLUTIONS = 10  # maximum number of essential matrices from one sample
+
+
+@dataclass(frozen=True)
+class MinimalSolver:
+    """A minimal solver.
+
+    Attributes:
+        sample: number of matches in a sample.
+        batch: number of samples that are drawn together.
+        solve: (N, sample, 3) bearings of the first and of the second image to (K, 3, 3) essential matrices.
+        models: maximum number of essential matrices from one sample.
+    """
+
+    sample: int
+    batch: int
+    solve: Callable[[FloatArray, FloatArray], FloatArray]
+    models: int
 
 
 def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
@@ -39,3 +63,13 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
         sample_idx,
     )
     return essentials[:found], sample_idx[:found]
+
+
+def _five(first: FloatArray, second: FloatArray) -> FloatArray:
+    return essentials_from_five(first, second)[0]
+
+
+SOLVERS: dict[Solver, MinimalSolver] = {
+    "five_point": MinimalSolver(sample=5, batch=64, solve=_five, models=10),
+    "eight_point": MinimalSolver(sample=8, batch=256, solve=essential_from_bearings, models=1),
+}

@@ -1,4 +1,4 @@
-"""Resolve ambiguous poses by the images: move cameras, leave them out, or report them as doubtful."""
+"""Check the cameras of a model by the images, and correct them: move them, leave them out, or mark them as doubtful."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or mor
 
 
 @dataclass(eq=False)
-class Arbitration:
+class CameraChecks:
     """Evidence of the images for or against the cameras of a model.
 
     Attributes:
@@ -77,9 +77,9 @@ class Arbitration:
     asked: bool = True
 
 
-def arbitrate(
+def correct_cameras(
     model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
-) -> Arbitration:
+) -> CameraChecks:
     """Check all cameras of a model by the images, and correct those for which another pose explains more.
 
     Cameras that confirm much less than their neighbours are tried at the other poses that their pairs suggest, against
@@ -91,7 +91,7 @@ def arbitrate(
         fixed: images that are never moved or removed, only reported as doubtful.
         remove: whether a camera that nothing explains is removed from the model.
     """
-    found = Arbitration()
+    found = CameraChecks()
     ambiguity = ""
     if not fixed:
         found.moved, ambiguity = _unshift_blocks(model, confirmation)
@@ -253,9 +253,9 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], *, confir
     return float((1 + gain) * explained**PAIRS_POWER - 1)
 
 
-def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
+def check_cameras(model: PlacedModel, confirmation: Confirmation | None) -> CameraChecks:
     """Return the evidence of the images, or of the pairs alone, for the cameras of a model, without changing it."""
-    found = Arbitration(asked=confirmation is not None)
+    found = CameraChecks(asked=confirmation is not None)
     if confirmation is None:
         found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
     else:
@@ -264,7 +264,7 @@ def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
     return found
 
 
-def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:
+def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) -> None:
     """Compare the confirmed share of each image with the share that its nearest neighbours suggest.
 
     In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
@@ -293,7 +293,7 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -
     found.expected = {image: expected_of(image) for image in evidence}
 
 
-def _suspects(found: Arbitration) -> list[int]:
+def _suspects(found: CameraChecks) -> list[int]:
     """Return the images that confirm much less than expected, worst first."""
     ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
     return sorted(
@@ -336,7 +336,7 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
 def _conclude(
     model: PlacedModel,
     confirmation: Confirmation | None,
-    found: Arbitration,
+    found: CameraChecks,
     *,
     fixed: Collection[int],
     remove: bool,
@@ -388,7 +388,7 @@ def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmati
     return 2 * confirmed > asked
 
 
-def _doubt_pairs_alone(model: PlacedModel, found: Arbitration) -> None:
+def _doubt_pairs_alone(model: PlacedModel, found: CameraChecks) -> None:
     """Report two isolated cameras with several geometries as doubtful, since nothing else can decide between these."""
     if len(model.cameras) != 2:
         return

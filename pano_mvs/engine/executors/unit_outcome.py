@@ -1,4 +1,4 @@
-"""Compute one unit in this process and return the outcome; all executors use this function."""
+"""The outcome of one unit that is computed in this process: done, or failed and why; all executors use this."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.planning.units import Unit
 
 
-def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
-    """Run a unit with its output in `log`, and store its result."""
+def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
+    """Run a unit with its output in `log`, store its result, and return how it ended."""
     started = time.perf_counter()
     try:
         log.parent.mkdir(parents=True, exist_ok=True)

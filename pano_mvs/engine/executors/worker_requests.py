@@ -14,9 +14,9 @@ from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
-from pano_mvs.engine.executors.perform import perform
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.unit_json import unit_from_json
+from pano_mvs.engine.executors.unit_outcome import unit_outcome
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 
@@ -30,7 +30,7 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
-    outcome = perform(unit, store, threads=request["threads"], log=Path(request["log"]))
+    outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
     for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))

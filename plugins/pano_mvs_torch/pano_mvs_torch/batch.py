@@ -1,4 +1,4 @@
-"""Where to compute, and how much at a time."""
+"""The device of a sweep, and how much it works on at a time."""
 
 from __future__ import annotations
 
