@@ -4,7 +4,7 @@
     pano-mvs inspect quickstart 000.png 620 330 --plot inspect.png
     python docs/_pictures/quickstart_pictures.py out/quickstart inspect.png
 
-The picture of the report is one of a browser's window of 1200×1000 pixels.
+`report_pictures.py` makes those of the report.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from pano_mvs.results.stored_values import StoredValues
 
 MAX_THUMBNAILS = 1000
 MAX_MEASURED = 1000
-MAX_BYTES = 9_000
+MAX_BYTES = 6_000
 _WIDTH = 160
 _THREADS = 2
 _VERSION = 2

@@ -57,6 +57,10 @@ class Browser:
         arguments = {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics}
         _call("POST", f"{self.root}/goog/cdp/execute", arguments)
 
+    def command(self, name: str, **params: Any) -> Any:
+        """Run a command of the DevTools protocol, such as `Emulation.setEmulatedMedia`."""
+        return _call("POST", f"{self.root}/goog/cdp/execute", {"cmd": name, "params": params})
+
     def evaluate(self, script: str) -> Any:
         """Return the value of a JavaScript expression in the page."""
         return _call("POST", f"{self.root}/execute/sync", {"script": f"return ({script})", "args": []})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -15,6 +15,7 @@ from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
 from pano_mvs.engine.running.packed_figures import PackedFigures
+from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 _MAX_SHOWN_CAUSES = 10
@@ -151,7 +152,7 @@ class RunStatistics:
         summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
         notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
-        summary.notes = list(dict.fromkeys(notes))
+        summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
         self._observer.stage_finished(summary)
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_MAX_SHOWN_CAUSES])
@@ -189,6 +190,11 @@ class RunStatistics:
         for name in (summary.name for summary in result.stages):
             enter(name, self._counts[name].rejected, result.rejected)
             enter(name, {} if name in replaced else self._counts[name].doubts, result.doubts)
+
+
+def _counted(note: str, units: int, total: int) -> str:
+    """Return a note with the number of units that gave it, if it asks for that; see `Context.note`."""
+    return note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
 
 
 def _check_thresholds(entry: StageEntry, summary: StageSummary) -> None:
