@@ -211,12 +211,13 @@ def show(
     ] = False,
     images: ImagesOption = None,
     overrides: SetOption = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Print a workflow and the files that it extends, or one file with all settings."""
     from pano_mvs.cli.show_command import show_workflow
     from pano_mvs.session.session import open_session
 
-    show_workflow(open_session(workflow, overrides=overrides or [], images=images), resolved=resolved)
+    show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
 
 
 @app.command()

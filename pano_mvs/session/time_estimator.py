@@ -12,6 +12,7 @@ being computed; until then the estimate is a lower bound.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -130,7 +131,7 @@ class StageProgress:
 
 
 class TimeEstimator:
-    """Keeps track of a run by its events.
+    """Keeps track of a run by its events; several threads may use it at a time.
 
     Attributes:
         stages: what is known of each stage, in order.
@@ -144,6 +145,7 @@ class TimeEstimator:
         """
         self.stages: dict[str, StageProgress] = {}
         self._clock = clock
+        self._lock = threading.Lock()
         self._workers = 1
         self._most_done = 0.0
         self._report_s = 0.0
@@ -157,6 +159,15 @@ class TimeEstimator:
 
     def __call__(self, event: Event) -> None:
         """Take an event into account."""
+        with self._lock:
+            self._take(event)
+
+    def estimate(self) -> TimeLeft:
+        """Return the estimate at this moment; it is the same for the same events and time."""
+        with self._lock:
+            return self._estimate()
+
+    def _take(self, event: Event) -> None:
         match event:
             case RunStarted():
                 self._workers = max(1, event.workers)
@@ -185,8 +196,7 @@ class TimeEstimator:
             case _:
                 pass
 
-    def estimate(self) -> TimeLeft:
-        """Return the estimate at this moment; it is the same for the same events and time."""
+    def _estimate(self) -> TimeLeft:
         if self._is_over:
             return TimeLeft(0.0, at_least=False, done=1.0)
         now, speed = self._clock(), self._speed()

@@ -59,8 +59,13 @@ def test_every_setting_is_there_with_its_value(pano_mvs: Command, tmp_path: Path
     assert "    cost: census_gradient\n" in shown
     depth = open_session("quality").workflow.stages["depth"].params
     assert all(f"    {name}: " in shown for name in type(depth).model_fields)
-    (tmp_path / "mine.yaml").write_text(shown)
+    written = pano_mvs("show", "quality", "--resolved", "--set", "depth.planes=77", "--out", tmp_path / "mine.yaml")
+    assert (written.code, written.text) == (0, "")
+    assert (tmp_path / "mine.yaml").read_text() == shown
     assert pano_mvs("check", tmp_path / "mine.yaml").code == 0
+    (tmp_path / "file").touch()
+    refused = pano_mvs("show", "quality", "--out", tmp_path / "file" / "mine.yaml")
+    assert (refused.code, "cannot be written" in refused.flat) == (2, True)
 
 
 def test_a_resolved_workflow_depends_on_no_other_file_and_computes_nothing_again(
