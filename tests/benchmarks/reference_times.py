@@ -2,15 +2,16 @@
 
     python -m tests.benchmarks.reference_times [PRESET ...]     # default: quickstart quality
 
-Each preset runs on its samples, serially, with one thread, into a new cache that the presets share. Times are CPU
-seconds, so that they hold for an idle machine whatever else runs. Stages that the presets do not have keep the times
-that they had. The result is `pano_mvs/session/reference_times.json`; runs scale it by the size of the capture, and by
-how long their own units take.
+Each preset runs on its samples, serially, into a new cache that the presets share. Times are CPU seconds, those of
+child processes included, so that they hold for one thread of an idle machine, whatever else runs. Stages that the
+presets do not have keep the times that they had. The result is `pano_mvs/session/reference_times.json`; runs scale it
+by the size of the capture, and by how long their own units take.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -35,16 +36,25 @@ def merged(
     kept: dict[str, list[list[object]]], measured: dict[str, list[list[object]]]
 ) -> dict[str, list[list[object]]]:
     """Return the samples of each stage: what was measured, else what was kept."""
-    rounded = {
-        stage: [[round(value, 4) if isinstance(value, float) else value for value in sample] for sample in found]
-        for stage, found in measured.items()
-    }
-    return dict(sorted({**kept, **{stage: found[-_MAX_SAMPLES:] for stage, found in rounded.items()}}.items()))
+    rounded = {stage: [_rounded(sample) for sample in found[-_MAX_SAMPLES:]] for stage, found in measured.items()}
+    return dict(sorted({**kept, **rounded}.items()))
+
+
+def _rounded(sample: list[object]) -> list[object]:
+    """Return a sample for one thread, since its time is CPU time, with rounded numbers."""
+    settings, _threads, *numbers = sample
+    return [settings, 1, *(round(number, 4) if isinstance(number, float) else number for number in numbers)]
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and of the children that have ended."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
 
 
 def measure(presets: list[str]) -> dict[str, list[list[object]]]:
     """Run presets on their samples, and return what their units took."""
-    time.perf_counter = time.process_time
+    time.perf_counter = cpu_seconds
     with TemporaryDirectory() as folder:
         cache = Path(folder) / "cache"
         for preset in presets:
