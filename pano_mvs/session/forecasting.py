@@ -50,8 +50,9 @@ def expected_report_s(stages: Sequence[StageForecast], size: CaptureSize, histor
     """Return the expected time for the report of a run; 0 if it is unknown, or nothing is computed."""
     if all(stage.units == 0 for stage in stages):
         return 0.0
+    images = CaptureSize(size.images, pixels=1.0)  # the pictures in the report are small, whatever the images are
     found = (
-        history.expected_unit(_REPORT, size, settings=_NO_SETTINGS, threads=1, whole=True) for history in histories
+        history.expected_unit(_REPORT, images, settings=_NO_SETTINGS, threads=1, whole=True) for history in histories
     )
     return next((report.seconds for report in found if report is not None), 0.0)
 
@@ -60,10 +61,9 @@ def remember_report(run: Run, seconds: float) -> None:
     """Store how long it took to write the report of a run that computed something, for the estimates of later runs."""
     if not run.result.computed:
         return
-    size = run.listing.size()
-    run.store.unit_times.add(
-        _REPORT, Sample(_NO_SETTINGS, 1, size.images, size.pixels, units=1, seconds=seconds, stored_bytes=0.0)
-    )
+    images = run.listing.size().images
+    sample = Sample(_NO_SETTINGS, 1, images, pixels=1.0, units=1, seconds=seconds, stored_bytes=0.0)
+    run.store.unit_times.add(_REPORT, sample)
     with suppress(StoreError):
         run.store.unit_times.save()
 
