@@ -34,7 +34,8 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     summary = output.summary
     units = summary.units
     failed = f", {units.failed} failed" if units.failed else ""
-    cached = " (nothing to compute)" if not units.run and not units.failed else ""
+    is_idle = not (units.run or units.failed or summary.stopped)
+    cached = " (nothing to compute)" if is_idle else ""
     counts = f"{units.run} {plural(units.run, 'unit')} computed, {units.cached} cached{failed}"
     console.print(f"\n{counts} in {summary.seconds or 0:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
@@ -67,7 +68,7 @@ def next_commands(output: RunOutput, session: Session) -> list[str]:
         commands.append(run_command(session))
     if is_to_see(summary.files):
         commands.append(shlex.join(["pano-mvs", "view", out]))
-    if summary.poses.registered or summary.cloud.points:
+    if summary.cloud.points or summary.views:
         words = ["pano-mvs", "share", out, "--to", f"{out}_page"]
         if resolved(cache_of(summary)) != resolved(Path(summary.cache)):
             words += ["--cache", summary.cache]

@@ -11,7 +11,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.results.records import Finding, PosesSummary, StageOutcome, Verdict
+from pano_mvs.results.records import CloudSummary, Finding, StageOutcome, Verdict
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
@@ -75,6 +75,7 @@ def test_a_partial_run_names_the_command_for_the_rest(
     ran = pano_mvs("run", "wf.yaml", "--until", "scaled", "--executor", "serial")
     (rest,) = commands_of(ran.text)
     assert rest == ["run", "wf.yaml"]
+    assert "share" not in ran.text, "there is nothing to show yet"
     assert pano_mvs(*rest).code == 0
 
 
@@ -84,7 +85,7 @@ def test_verdict_and_reasons_come_before_the_next_commands(
     monkeypatch.chdir(here.folder)
     here.run()
     session = here.session()
-    output = _output(session.out, poses=PosesSummary(registered=("a.jpg",)))
+    output = _output(session.out, cloud=CloudSummary(points=9))
     print_summary(output, Console(), following=next_commands(output, session))
     lines = capsys.readouterr().out.splitlines()
     start = lines.index("Usable, with doubts: see below.")
@@ -97,7 +98,7 @@ def test_verdict_and_reasons_come_before_the_next_commands(
 def test_share_names_the_cache_if_another_one_is_set(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.run()
     session = toy.session()
-    output = _output(session.out, poses=PosesSummary(registered=("a.jpg",)), cache=str(session.store_root))
+    output = _output(session.out, cloud=CloudSummary(points=9), cache=str(session.store_root))
     out = str(session.out)
     assert next_commands(output, session) == [shlex.join(["pano-mvs", "share", out, "--to", f"{out}_page"])]
     monkeypatch.setenv("PANO_MVS_CACHE", str(toy.folder / "elsewhere"))
