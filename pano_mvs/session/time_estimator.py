@@ -119,14 +119,14 @@ class StageProgress:
     def work_s(self, now: float, speed: float) -> tuple[float, float] | None:
         """Return the computing time that is left and that which is done; None if unknown."""
         elapsed = [now - began for began in self.running.values()]
-        done_s = self.seconds + sum(elapsed)
         units = self.units_left()
         if units == 0:
-            return 0.0, done_s
+            return 0.0, self.seconds
         unit_s = self.unit_s(now, speed)
         if unit_s is None or units is None:
             return None
         running_s = sum(max(unit_s - so_far, (_OVERDUE - 1) * so_far) for so_far in elapsed)
+        done_s = self.seconds + sum(min(unit_s, so_far) for so_far in elapsed)  # a worker may still be starting
         return running_s + max(0, units - len(elapsed)) * unit_s, done_s
 
 

@@ -192,6 +192,16 @@ def test_the_bar_counts_work_and_never_goes_back() -> None:
     assert run.left() == TimeLeft(0.0, at_least=False, done=1.0)
 
 
+def test_the_start_of_a_worker_is_not_work() -> None:
+    """A bar that ran ahead while workers started stood still for as long afterwards."""
+    run = SimulatedRun(stage("a", 1, 0.1), stage("b", 1, 99.9, "a"))
+    run.start("a", "", units=1)
+    assert run.left(9.0).done == pytest.approx(0.1 / 101.8)
+    run.finish("a", "", seconds=0.1)
+    run.start("b", "", units=1)
+    assert run.left(10.0).done > 0.09
+
+
 def test_unknown_stages_weigh_like_the_others_in_the_bar() -> None:
     run = SimulatedRun(stage("a", 1, 10.0), stage("b", None, None, "a"))
     run.start("a", "", units=1)
