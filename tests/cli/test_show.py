@@ -69,22 +69,24 @@ def test_every_setting_is_there_with_its_value(pano_mvs: Command, tmp_path: Path
 
 
 def test_a_resolved_workflow_depends_on_no_other_file_and_computes_nothing_again(
-    pano_mvs: Command, toy: Toy, tmp_path: Path
+    pano_mvs: Command, toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(toy.folder)  # where its paths are relative
     (toy.folder / "top.yaml").write_text(
         "pano_mvs: 1\nname: toy\nextends: wf.yaml\n"
         "stages: {scaled: {by: 5, retries: 2}, mean: {min_success: 0.5}, all: null}\n"
     )
     options = ["--cache", toy.folder / "cache", "--out", toy.folder / "out", "--executor", "serial"]
-    assert pano_mvs("run", toy.folder / "top.yaml", *options).code == 0
-    shown = pano_mvs("show", toy.folder / "top.yaml", "--resolved").text
+    assert pano_mvs("run", "top.yaml", *options).code == 0
+    shown = pano_mvs("show", "top.yaml", "--resolved").text
     assert "retries: 2" in shown
     assert "min_success: 0.5" in shown
     assert "extends" not in shown
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "all.yaml").write_text(shown)
-    again = pano_mvs("run", elsewhere / "all.yaml", *options)
+    monkeypatch.chdir(elsewhere)
+    again = pano_mvs("run", "all.yaml", *options)
     assert again.code == 0
     assert "(nothing to compute)" in again.text
 
