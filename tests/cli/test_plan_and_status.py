@@ -37,7 +37,19 @@ def test_a_plan_without_experience_says_so_and_gives_no_number(pano_mvs: Command
     planned = pano_mvs("plan", here / "wf.yaml")
     assert planned.code == 0
     assert planned.text.count("unknown") == 2 * 9 + 1
+    cells = {
+        row[1].strip(): row[5].strip() for row in (line.split("│") for line in planned.text.splitlines()) if row[4:]
+    }
+    assert (cells["images"], cells["scaled"], cells["difference"], cells["mean"]) == ("", "5", "all", "about 5")
+    assert "cannot run" not in planned.text
     assert "time and disk space: unknown, because no earlier run" in planned.flat
+
+
+def test_units_that_cannot_run_have_a_column_if_there_are_any(pano_mvs: Command, here: Path) -> None:
+    (here / "capture" / "9.txt").symlink_to("nowhere")
+    planned = pano_mvs("plan", here / "wf.yaml")
+    assert "cannot run" in planned.text.splitlines()[1]
+    assert "images:9.txt: cannot run: " in planned.flat
 
 
 def test_a_plan_states_times_and_disk_space_by_earlier_runs(pano_mvs: Command, here: Path) -> None:
@@ -45,7 +57,7 @@ def test_a_plan_states_times_and_disk_space_by_earlier_runs(pano_mvs: Command, h
     assert "nothing to compute" in pano_mvs("plan", here / "wf.yaml").text
     times_as(here, 600.0, 2e6)
     planned = pano_mvs("run", here / "wf.yaml", "--set", "scaled.by=5", "-n", "--workers", "1")
-    rows = {row[1]: row[2:] for row in (line.split("│") for line in planned.text.splitlines()) if len(row) == 10}
+    rows = {row[1]: row[2:] for row in (line.split("│") for line in planned.text.splitlines()) if len(row) == 9}
     cells = {name.strip(): [cell.strip() for cell in row] for name, row in rows.items()}
     assert cells["images"][-3:-1] == ["", ""], "it is cached"
     assert cells["scaled"][-3:-1] == ["50 min", "10.0 MB"]
@@ -87,6 +99,7 @@ def test_status_of_an_output_folder_needs_nothing_else(
     assert "exit code 3" in found.text
     assert "thirteen is unlucky" in found.flat
     assert "would run, more may follow" in found.flat
+    assert "cannot run" not in found.text, "a failed unit is tried again"
     (here / "capture" / "3.txt").write_text("30")
     command = shlex.split(pano_mvs("status", here / "out").text.split("to compute this:\n")[1])
     assert command[:2] == ["pano-mvs", "run"]

@@ -43,16 +43,24 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
         threads: of each worker; 0 for the default.
     """
     run_plan = plan_session(session, workers=workers, threads=threads)
-    table = Table("stage", "use", "cached", "run", "may run", "cannot run", "time", "disk")
+    is_blocked = any(plan.blocked for plan in run_plan.stages)
+    table = Table("stage", "use", "cached", "run", "may run", *(["cannot run"] if is_blocked else []), "time", "disk")
     for plan, forecast in zip(run_plan.stages, run_plan.forecasts, strict=True):
-        waiting = "not known yet" if plan.open else str(len(plan.may_run) or "")
-        counts = (str(len(plan.cached) or ""), str(len(plan.run) or ""), waiting, str(len(plan.blocked) or ""))
+        counts = [str(len(plan.cached) or ""), str(len(plan.run) or ""), _may_run(plan, forecast)]
+        counts += [str(len(plan.blocked) or "")] if is_blocked else []
         table.add_row(plan.name, plan.use, *counts, *_expected(forecast, run_plan.workers))
     console.print(table)
     for plan in run_plan.stages:
         _print_reasons(plan, console)
     _print_total(run_plan, console)
     return run_plan
+
+
+def _may_run(plan: StagePlan, forecast: StageForecast) -> str:
+    """Return the number of units that depend on others; of a stage whose units are not known yet, the expected one."""
+    if not plan.open:
+        return str(len(plan.may_run) or "")
+    return "all" if forecast.units is None else f"about {forecast.units}"
 
 
 def _expected(forecast: StageForecast, workers: int) -> tuple[str, str]:
