@@ -57,7 +57,9 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
     results = final_stages(run)
     return RunSummary(
         workflow=WorkflowSummary(
-            name=workflow.name, path=str(workflow.path or ""), overrides=tuple(workflow.overrides)
+            name=workflow.name,
+            path=str(resolved(workflow.path)) if workflow.path is not None else "",
+            overrides=tuple(workflow.overrides),
         ),
         cache=str(resolved(run.store.root)),
         version=pano_mvs.__version__,

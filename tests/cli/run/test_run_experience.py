@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import signal
@@ -13,13 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from pano_mvs.cli.run.command import interrupted_by_termination
-from pano_mvs.cli.run.estimate import Estimate, duration
-from pano_mvs.cli.run.progress import ProgressBars
 from pano_mvs.core.processes import start_of
-from pano_mvs.session.progress import RunStarted, StageStarted, UnitFinished
 from tests.engine.conftest import (  # noqa: F401 (toy is a fixture)
     PATIENCE_S,
     Toy,
@@ -244,41 +239,6 @@ def test_serial_and_processes_leave_the_same_files(toy: Toy) -> None:  # noqa: F
     toy.folder.joinpath("cache").rename(toy.folder / "old")
     assert finish(start(toy, "--workers", "2"))[0] == 0
     assert deliverables(toy) == first
-
-
-def test_view_is_named_only_where_there_is_something_to_view(toy: Toy) -> None:  # noqa: F811
-    out = finish(start(toy, "--executor", "serial"))[1]
-    assert "open report.html" in out
-    assert "pano-mvs view" not in out
-    toy.edit("plug.py", lambda text: text.replace('"all.txt"', '"cloud.ply"'))
-    assert "open report.html, or look around with pano-mvs view" in finish(start(toy, "--executor", "serial"))[1]
-
-
-def test_a_line_says_which_time_is_the_stages_and_which_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pano_mvs.cli.run.progress._LINE_EVERY_S", -1.0)
-    stream = io.StringIO()
-    bars = ProgressBars(Console(file=stream, width=100))
-    bars(RunStarted("w", ("depth", "more"), "serial", workers=1, threads=1, out=Path("out")))
-    bars(StageStarted("depth", 4))
-    bars(UnitFinished("depth", "1.jpg", "run", 17.0))
-    assert stream.getvalue().split("  ")[-1] == "stage: 51 s left, run: more than 51 s left\n"
-    bars(UnitFinished("depth", "2.jpg", "cached", 0.0))
-    assert stream.getvalue().endswith("2 of 4  stage: 34 s left, run: more than 34 s left\n")
-
-
-def test_time_left_is_a_bound_until_all_is_known() -> None:
-    estimate = Estimate(workers=2)
-    estimate.start("a", 10)
-    assert estimate.of_run(2) == ""
-    estimate.count("a", 0.0, computed=False)
-    estimate.count("a", 20.0, computed=True)
-    assert estimate.of_stage("a") == "80 s left"
-    assert estimate.of_run(2) == "more than 80 s left"
-    estimate.start("b", 1)
-    assert estimate.of_run(2) == "more than 80 s left"
-    estimate.count("b", 4.0, computed=True)
-    assert estimate.of_run(2) == "about 80 s left"
-    assert [duration(s) for s in (5, 600, 9000)] == ["5 s", "10 min", "2.5 h"]
 
 
 @ON_POSIX
