@@ -9,6 +9,7 @@ from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_in
 from pano_mvs.stages.exports.files import ply, previews, ranges
 from pano_mvs.stages.exports.mesh import mesh
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
+from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -79,6 +80,8 @@ __all__ = [
     "sky",
     "speckle",
     "sphorb",
+    "splat_bundle",
+    "splat_frames",
     "static",
     "surface",
     "sweep",

@@ -22,7 +22,7 @@ from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, Variant
 from pano_mvs.scene.image_files.header import PNG_START
 from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
-_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
+CAMERA_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
 _OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
 _PNG_RGB_8_BIT = bytes([8, 2])
@@ -57,7 +57,7 @@ def transforms_document(
     else:
         common = {}
         listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
-    document = {"camera_model": _MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    document = {"camera_model": CAMERA_MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
     if with_depth:
         document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
     return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}
@@ -91,8 +91,7 @@ def _jpeg_channels(data: bytes) -> int:
 def _listed(
     name: str, cam_from_world: Rigid3, frame: NerfstudioFrame, *, masked: bool, with_depth: bool
 ) -> dict[str, Any]:
-    frame_from_cam = Rigid3(np.array(frame.frame_from_cam), np.zeros(3))
-    world_from_frame = (frame_from_cam @ cam_from_world).inverse()
+    world_from_frame = frame.cam_from_world(cam_from_world).inverse()
     matrix = np.eye(4)
     matrix[:3, :3] = world_from_frame.rotation @ _OPENGL_FROM_CAM
     matrix[:3, 3] = world_from_frame.translation
