@@ -289,9 +289,18 @@ def test_nerfstudio_reads_the_same_points(room: Path, variant: str) -> None:
     assert len(seeds) == len(capture.whole(Poses).points_in_world)
 
 
+def test_the_code_of_the_documentation_gives_points_on_the_walls(room: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text(encoding="utf-8")
+    _, _, rest = page.partition("<!-- splat bundle -->\n```python\n")
+    names: dict[str, Any] = {}
+    exec(rest.partition("```")[0].replace("lobby/splat_bundle", room.as_posix()), names)
+    expected = points_of(room, names["view"])
+    np.testing.assert_allclose(names["in_world"], expected[np.isfinite(expected).all(axis=-1)], atol=1e-9)
+
+
 def test_poses_are_read_back_by_our_own_reader(room: Path) -> None:
     capture = tiny_capture(Variant(SIZE_HW))
-    poses = read_poses(room / "equirectangular")
+    poses = read_poses(room / "equirectangular" / "transforms.json")
     assert poses.names == capture.names
     np.testing.assert_allclose(poses.rotations, [pose.rotation for pose in capture.poses], atol=1e-12)
 
