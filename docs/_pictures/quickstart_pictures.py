@@ -17,7 +17,8 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-IMAGES = Path(__file__).parents[1] / "images"
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "docs" / "images"
 WIDTH = 1200
 EYE, FOCUS, VIEW_ANGLE = (4.6, -5.4, -4.6), (-0.15, 0.35, 0.3), 42.0
 CEILING_Y = -1.2
