@@ -1,6 +1,6 @@
 """Drawings for docs/frames_and_scale.md: where the axes of the camera are in a panorama, and three frames.
 
-python docs/_pictures/frame_pictures.py
+Run it as `python docs/_pictures/frame_pictures.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Symptoms for docs/troubleshooting.md: plans and sections of a cloud, as it should be and as it looks if something is wrong.
+"""Symptoms for docs/troubleshooting.md: plans and sections of a cloud, as it should be and with an error.
 
     pano-mvs run quality --images CLASSROOM --out classroom
     python docs/_pictures/symptom_pictures.py classroom
@@ -49,7 +49,7 @@ class Cloud:
 
 
 def drawn(points: FloatArray, colors: Picture, *, axes: tuple[int, int], low: FloatArray, high: FloatArray) -> Picture:
-    """Return points drawn parallel to an axis, (SIZE, SIZE, 3) BGR; those with the smallest third coordinate in front."""
+    """Return points drawn parallel to an axis, (SIZE, SIZE, 3) BGR; the smallest third coordinate is in front."""
     scale = (SIZE - 20) / (high - low).max()
     (third,) = {0, 1, 2} - set(axes)
     order = np.argsort(-points[:, third])
@@ -80,7 +80,7 @@ def symptoms(run: RunOutput) -> dict[str, Picture]:
         band = (points[:, 0] > -0.6) & (points[:, 0] < 0.6)
         return drawn(points[band], colors[band], axes=side, low=low[[2, 1]], high=high[[2, 1]])
 
-    wrong = {name: pose for name, pose in cloud.poses.items()}
+    wrong = dict(cloud.poses)
     for number, name in enumerate(sorted(wrong)[1::3]):
         turn = rotation_from_rotvec(np.radians([0.0, 4.0 - 2.0 * number, 0.0]))
         wrong[name] = Rigid3(turn, np.array([0.25, 0.0, -0.2])) @ wrong[name]
@@ -113,7 +113,7 @@ def beside(left: Picture, right: Picture) -> Picture:
     return np.hstack([left, np.full((left.shape[0], 12, 3), 255, np.uint8), right])
 
 
-def weak_ceiling(run: RunOutput, preview: Path) -> Picture:
+def weak_ceiling(preview: Path) -> Picture:
     """Return the upper part of a preview's panorama above that of its ranges: pale is not confirmed."""
     whole = cv2.imread(str(preview))
     assert whole is not None
@@ -127,6 +127,6 @@ def weak_ceiling(run: RunOutput, preview: Path) -> Picture:
 if __name__ == "__main__":
     out = Path(sys.argv[1])
     run = pano_mvs.load(out)
-    pictures = symptoms(run) | {"symptom_ceiling.jpg": weak_ceiling(run, out / "preview" / "000.jpg")}
+    pictures = symptoms(run) | {"symptom_ceiling.jpg": weak_ceiling(out / "preview" / "000.jpg")}
     for name, picture in pictures.items():
         cv2.imwrite(str(IMAGES / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 80])

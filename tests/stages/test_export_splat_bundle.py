@@ -258,7 +258,12 @@ def test_pycolmap_reads_the_cameras_of_the_manifest(room: Path, variant: str) ->
         assert camera.model.name == view["camera"]["model"]
         assert (camera.width, camera.height) == (view["camera"]["width"], view["camera"]["height"])
         assert read_picture(room / view["image"]).shape[:2] == (camera.height, camera.width)
+        assert image.num_points3D > 0 or variant == "faces"
+        assert {point.point3D_id for point in image.get_observation_points2D()} <= set(model.points3D)
         if variant == "faces":
+            calibration = camera.calibration_matrix()  # as gsplat's loader reads it
+            assert calibration[0, 0] == view["camera"]["fx"]
+            assert calibration[1, 2] == view["camera"]["cy"]
             assert list(camera.params) == [view["camera"][key] for key in ("fx", "fy", "cx", "cy")]
 
 
