@@ -363,5 +363,5 @@ def test_the_memory_grows_with_panorama_and_face() -> None:
     small, large = (tiny_capture(Variant(size)).images["000.png"] for size in ((64, 128), (128, 256)))
     params = SplatFramesParams()
     assert splat_frames_memory_bytes(params, {"image": large}) > splat_frames_memory_bytes(params, {"image": small})
-    wide = SplatFramesParams(size_px=2048)
+    wide = SplatFramesParams.model_validate({"size_px": 2048})
     assert splat_frames_memory_bytes(wide, {"image": small}) > 300_000_000
