@@ -12,6 +12,9 @@ from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import pano_mvs
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
@@ -38,6 +41,7 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.up_direction import mean_up_direction
+from pano_mvs.scene.upright import world_up, z_up_from_world
 from pano_mvs.session.final_stages import chain_of, final_stages, latest
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
@@ -158,6 +162,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
                 metric=group.metric,
                 points=len(group.points_in_world),
                 up=_up(group),
+                z_up_from_world=_rows(z_up_from_world(world_up(group))),
                 nearest_pair=nearest_pair(groups[0].names, group.names, links) if number else None,
             )
             for number, group in enumerate(groups)
@@ -221,6 +226,10 @@ def _up(poses: Poses) -> Direction | None:
         return None
     x, y, z = (round(float(value), 6) for value in up)
     return x, y, z
+
+
+def _rows(matrix: NDArray[np.float64]) -> tuple[Direction, ...]:
+    return tuple((float(x), float(y), float(z)) for x, y, z in matrix)
 
 
 def _scores(run: Run) -> dict[str, ScoresSummary]:

@@ -156,7 +156,8 @@ def test_colours_mean_what_the_legend_says(tmp_path: Path) -> None:
     assert heights.colors_rgb[ceiling, 0].min() > heights.colors_rgb[floor, 0].max()  # red above
     assert heights.colors_rgb[floor, 2].min() > heights.colors_rgb[ceiling, 2].max()  # blue below
     normals = color_cloud(cloud, "normals", up=UP, unit="m").colors_rgb
-    upward = cloud.vertices["ny"] < -0.5
+    assert cloud.normals is not None
+    upward = cloud.normals[:, 1] < -0.5
     np.testing.assert_array_equal(np.unique(normals[upward], axis=0), [[128, 255, 128]])
     sure = color_cloud(cloud, "confidence", up=UP, unit="m").colors_rgb
     assert sure[cloud.vertices["confidence"] > 250, 0].min() > sure[cloud.vertices["confidence"] < 60, 0].max()

@@ -41,6 +41,7 @@ from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, tran
 from pano_mvs.io.ranges.files import write_range_png
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.stages.exports.axes import FrameParams, files_from_world
 
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MUCH = 0.01
@@ -103,7 +104,7 @@ def nerfstudio_frames(
     return NerfstudioFrames(made.files, made.pictures, tuple(made.frames), params.depth_unit)
 
 
-class NerfstudioParams(Params):
+class NerfstudioParams(FrameParams):
     """Settings of export.nerfstudio."""
 
     seed_points: int = Field(
@@ -124,8 +125,9 @@ def nerfstudio(
 ) -> Files:
     """Write the frames of export.nerfstudio_frames as nerfstudio/<variant>/transforms.json, with initial points.
 
-    Without a cloud, the sparse points of the poses are used. A file has one frame: further groups of poses are
-    transforms_1.json with seed_1.ply, transforms_2.json …
+    Cameras and points are turned so that z points up; `file_from_world` states the rotation from the world of the poses
+    and of COLMAP models. Without a cloud, the sparse points of the poses are used. A file has one frame: further groups
+    of poses are transforms_1.json with seed_1.ply, transforms_2.json …
     """
     loaded = {name: frames[name] for name in poses.names if name in frames}
     if not loaded:
@@ -167,7 +169,11 @@ def _write_group(
     files: dict[str, Path] = {}
     scratch = ctx.scratch / str(number)
     scratch.mkdir()
-    seed = _write_seed(poses, cloud, params, ctx=ctx, scratch=scratch)
+    (turn,) = files_from_world(params, poses, groups=1)
+    seed = _write_seed(poses, cloud, params, turn, ctx=ctx, scratch=scratch)
+    about = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
+    if turn is not None:
+        about["file_from_world"] = turn.tolist()
     seed_name, transforms = group_file("seed.ply", number), group_file("transforms.json", number)
     for variant in sorted({frame.variant for each in loaded.values() for frame in each.frames}):
         listed = [
@@ -180,7 +186,8 @@ def _write_group(
             variant,
             listed,
             depth_unit=next(iter(loaded.values())).depth_unit,
-            about={"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame},
+            about=about,
+            file_from_world=turn,
             seed="" if seed is None else seed_name,
         )
         folder = f"nerfstudio/{variant}"
@@ -266,7 +273,13 @@ def _add_faces(
 
 
 def _write_seed(
-    poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, *, ctx: Context, scratch: Path
+    poses: Poses,
+    cloud: PointCloud | None,
+    params: NerfstudioParams,
+    turn: NDArray[np.float64] | None,
+    *,
+    ctx: Context,
+    scratch: Path,
 ) -> Path | None:
     """Write the initial points; return None if there are none."""
     if cloud is None or not len(cloud):
@@ -283,7 +296,7 @@ def _write_seed(
     kept = select_points(cloud, selection, scratch)
     ctx.metric("seed_points", ctx.metrics.get("seed_points", 0) + (len(cloud) if kept is None else kept.count))
     path = scratch / "seed.ply"
-    write_ply(path, cloud, kept=kept)
+    write_ply(path, cloud, kept=kept, file_from_world=turn)
     return path
 
 
