@@ -7,6 +7,7 @@ from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.files import ply, previews, ranges
+from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
@@ -53,6 +54,7 @@ __all__ = [
     "exhaustive",
     "extend",
     "fill",
+    "floor_plan",
     "folder",
     "from_model",
     "gaussian",
