@@ -20,10 +20,11 @@ from pano_mvs.stages.filters import (
     guided,
     median,
     planes,
+    scale_ranges,
     speckle,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.fusion import vote
+from pano_mvs.stages.fusion import scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
@@ -75,6 +76,8 @@ __all__ = [
     "refine",
     "retrieval",
     "scale",
+    "scale_cloud",
+    "scale_ranges",
     "scaled_translation",
     "sequential",
     "sift_tangent",

@@ -84,6 +84,8 @@ class ScaleParams(Params):
     )
     gps: bool = Field(default=False, description="scale by the GPS positions in the images' metadata")
     factor: float | None = Field(default=None, gt=0, description="metres per unit of the poses")
+    group: int = Field(default=0, ge=0, description="group of the poses that `factor` applies to; 0 is the largest")
+    origin: str = Field(default="", description="where `factor` comes from, for run.json and the report")
     align: Literal["keep", "gps"] = Field(
         default="keep", description="gps also rotates the world: x east, y down, z north"
     )
@@ -128,8 +130,12 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
             poses, groups, [chosen or 0], scaled=lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx=ctx
         )
     if params.factor is not None:
-        origin, factor = f"the given factor {params.factor:g}", params.factor
-        return _scaled(poses, groups, [0], scaled=lambda group: scaled_poses(group, factor, origin=origin), ctx=ctx)
+        origin, factor = params.origin or f"the given factor {params.factor:g}", params.factor
+        if params.group >= len(groups):
+            raise InputError(f"group {params.group}: the poses have {len(groups)} groups, numbered from 0")
+        return _scaled(
+            poses, groups, [params.group], scaled=lambda group: scaled_poses(group, factor, origin=origin), ctx=ctx
+        )
     every = list(range(len(groups)))
     if params.camera_height_m is not None:
         return _scaled(poses, groups, every, scaled=lambda group: _by_camera_height(group, images, params), ctx=ctx)
