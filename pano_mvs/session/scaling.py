@@ -79,9 +79,7 @@ def metres_from_text(text: str) -> float:
     found = _LENGTH.fullmatch(text.lower())
     metres = float(found[1]) * _METRES[found[2]] if found else 0.0
     if not metres > 0:
-        raise UsageError(
-            f"{text[:80]!r} is not a length: write a positive number with m, cm, mm, ft or in, as in 3.42m"
-        )
+        raise UsageError(f"{text[:80]!r} is not a length: write a positive number and m, cm, mm, ft or in: 3.42m")
     return metres
 
 
@@ -100,14 +98,19 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
         InputError: if the run has no poses.
     """
     groups = _groups(run)
-    ends, homes = [], set()
-    for text in (first, second):
+    ends: list[NDArray[np.float64]] = []
+    homes: set[int] = set()
+    named = []
+    for end in (first, second):
+        text = end
         point = _point(text)
         if point is None:
             number, name = _camera(groups, text)
             homes.add(number)
             point = groups[number].centers[groups[number].names.index(name)]
+            text = name
         ends.append(point)
+        named.append(text)
     if len(homes) > 1:
         raise UsageError(f"{first} and {second} are in different groups of poses, which have separate scales")
     length = float(np.linalg.norm(ends[1] - ends[0]))
@@ -116,7 +119,7 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
     home = homes.pop() if homes else group
     if home >= len(groups):
         raise UsageError(f"--group {home}: the run has {len(groups)} groups of poses, numbered from 0")
-    return Measurement(length, metres, home, f"the distance of {metres:g} m from {first} to {second}")
+    return Measurement(length, metres, home, f"the distance of {metres:g} m from {named[0]} to {named[1]}")
 
 
 def measured_camera_height(run: RunOutput, *, metres: float, group: int = 0) -> Measurement:
@@ -128,9 +131,7 @@ def measured_camera_height(run: RunOutput, *, metres: float, group: int = 0) -> 
     groups = run.summary.poses.groups
     height = groups[group].camera_height if group < len(groups) else None
     if height is None:
-        raise UsageError(
-            f"{run.out}: no floor was found below the cameras. Measure a distance between two images instead"
-        )
+        raise UsageError(f"{run.out}: no floor was found below the cameras. Measure a distance instead: A B 3.42m")
     return Measurement(height, metres, group, f"the cameras' height of {metres:g} m above the floor of the cloud")
 
 

@@ -1,8 +1,8 @@
 """Wall lines of a floor plan: a Hough transform on the cells with vertical surfaces, then least squares.
 
-Each cell votes for the one line through it that its normal determines. The strongest line takes its cells and is
-fitted to them; the rest vote again. Both sides of a wall give a line each, because normals are on the side that was
-seen.
+Each cell supports the one line through it that its normal determines. The line with the most support takes its cells
+and is fitted to them; then the rest are searched again. Both sides of a wall give a line each, because normals are on
+the side that was seen.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def wall_lines(cells: WallCells, *, min_share: float, min_length: float, max_gap
     left = np.ones(len(xy), np.bool_)
     found: list[FloatArray] = []
     for _ in range(_MAX_LINES):
-        line, votes = _strongest(xy[left], normals[left], weights[left], cell=cells.cell)
-        if line is None or votes < 0.25 * min_share * LAYERS * min_length / cells.cell:
+        line, support = _strongest(xy[left], normals[left], weights[left], cell=cells.cell)
+        if line is None or support < 0.25 * min_share * LAYERS * min_length / cells.cell:
             break
         line = _fitted(line, xy[left], normals[left], weights[left], cell=cells.cell)
         near = left & _of_line(line, xy, normals, within=_NEAR_CELLS * cells.cell)
@@ -91,7 +91,7 @@ def wall_lines(cells: WallCells, *, min_share: float, min_length: float, max_gap
 
 
 def _strongest(xy: FloatArray, normals: FloatArray, weights: FloatArray, *, cell: float) -> tuple[_Line | None, float]:
-    """Return the line with the most votes, and their number."""
+    """Return the line with the most support, and how much that is."""
     if not len(xy):
         return None, 0.0
     angle = np.arctan2(normals[:, 1], normals[:, 0]) / (2 * np.pi) * _ANGLE_BINS
@@ -99,12 +99,12 @@ def _strongest(xy: FloatArray, normals: FloatArray, weights: FloatArray, *, cell
     low = np.floor(offset.min()) - 2
     size = int(offset.max() - low) + 4
     index = (np.floor(angle).astype(np.int64) % _ANGLE_BINS) * size + np.floor(offset - low).astype(np.int64)
-    votes = np.bincount(index, weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
-    smooth = gaussian_filter(votes, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
+    support = np.bincount(index, weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
+    smooth = gaussian_filter(support, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
     best = int(np.argmax(smooth))
     turn = (best // size + 0.5) * 2 * np.pi / _ANGLE_BINS
     normal = np.array([np.cos(turn), np.sin(turn)])
-    # The smoothing spreads the votes of one line over about 1.5 × 1 × 2π bins.
+    # The smoothing spreads the support of one line over about 1.5 × 1 × 2π bins.
     return _Line(normal, (best % size + low + 0.5) * cell), float(smooth.flat[best] * 1.5 * 2 * np.pi)
 
 
