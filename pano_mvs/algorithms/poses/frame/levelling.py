@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.core.settings import Setting, checks_settings
@@ -57,9 +58,11 @@ def level_poses(
         max_uncertainty_deg: standard deviation of the vertical above which the poses stay as they are.
 
     Returns:
-        The poses, and the evidence that they were levelled by. If the vertical cannot be determined, the unchanged
-        poses and a falsy record with the reason.
+        The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned
+        the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
+    if origin_of_frame(poses.frame) is not None:
+        return poses, Vertical(_UP, reason="GPS has already turned it: x east, y down, z north")
     vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
     if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
         reason = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -126,3 +127,12 @@ def test_an_uncertain_vertical_leaves_the_poses_as_they_are() -> None:
     assert same is poses
     assert "is uncertain by 10" in vertical.reason
     assert level_poses(poses, evidence="cameras", max_uncertainty_deg=15)[1]
+
+
+def test_a_world_that_gps_has_turned_stays() -> None:
+    poses, pictures = capture()
+    there = "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
+    placed = replace(poses, frame=there)
+    same, vertical = level_poses(placed, pictures=pictures)
+    assert same is placed
+    assert "GPS has already turned it" in vertical.reason
