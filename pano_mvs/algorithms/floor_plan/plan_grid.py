@@ -74,6 +74,10 @@ class WallCells:
     weights: FloatArray
     cell: float
 
+    def only(self, chosen: NDArray[np.bool_]) -> WallCells:
+        """Return some of the cells."""
+        return WallCells(self.xy[chosen], self.normals_xy[chosen], self.shares[chosen], self.weights[chosen], self.cell)
+
 
 class PlanGrid:
     """The orthophoto and the walls of one storey.

@@ -74,7 +74,8 @@ def find_storeys(heights: FloatArray, normal_heights: FloatArray, camera_heights
         below = float(camera_heights[here].max())
         order = order[camera_heights[order] > limit]
     return [
-        _with_ceiling(number, floors, camera_heights, facing_down, step=step, top=high) for number in range(len(floors))
+        _with_ceiling(number, floors, camera_heights, facing_down=facing_down, step=step, top=high)
+        for number in range(len(floors))
     ]
 
 
@@ -82,8 +83,8 @@ def _with_ceiling(
     number: int,
     floors: list[tuple[float, bool, list[int]]],
     camera_heights: FloatArray,
-    facing_down: FloatArray,
     *,
+    facing_down: FloatArray,
     step: float,
     top: float,
 ) -> Storey:

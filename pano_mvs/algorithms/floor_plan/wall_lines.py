@@ -7,7 +7,7 @@ the side that was seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,6 @@ class Walls:
 
     Attributes:
         ends_xy: (N, 2, 2) start and end of each; the side that was seen is on the left of the way from start to end.
-        lengths: (N,) their lengths.
     """
 
     ends_xy: FloatArray
@@ -68,59 +67,59 @@ def wall_lines(cells: WallCells, *, min_share: float, min_length: float, max_gap
         max_gap: gaps in a line up to this are closed.
         snap: ends are moved to the corner with another wall if it is at most this far away.
     """
-    high = cells.shares >= min_share
-    xy, normals, weights = cells.xy[high], cells.normals_xy[high], cells.weights[high]
-    if not len(xy):
+    left = cells.only(cells.shares >= min_share)
+    if not len(left.xy):
         return Walls(np.zeros((0, 2, 2)))
-    origin = np.median(xy, axis=0)
-    xy = xy - origin
-    left = np.ones(len(xy), np.bool_)
+    origin = np.median(left.xy, axis=0)
+    left = replace(left, xy=left.xy - origin)
     found: list[FloatArray] = []
     for _ in range(_MAX_LINES):
-        line, support = _strongest(xy[left], normals[left], weights[left], cell=cells.cell)
+        line, support = _strongest(left)
         if line is None or support < 0.25 * min_share * LAYERS * min_length / cells.cell:
             break
-        line = _fitted(line, xy[left], normals[left], weights[left], cell=cells.cell)
-        near = left & _of_line(line, xy, normals, within=_NEAR_CELLS * cells.cell)
-        pieces = _pieces(xy[near] @ line.along, cell=cells.cell, max_gap=max_gap, min_length=min_length)
+        line = _fitted(line, left)
+        along = left.xy[_of_line(line, left, within=_NEAR_CELLS)] @ line.along
+        pieces = _pieces(along, cell=cells.cell, max_gap=max_gap, min_length=min_length)
         found += [line.normal * line.offset + line.along * np.array(piece)[:, None] for piece in pieces]
-        left &= ~_of_line(line, xy, normals, within=_TAKEN_CELLS * cells.cell)
+        left = left.only(~_of_line(line, left, within=_TAKEN_CELLS))
     merged = _merged(found, near=_NEAR_CELLS * cells.cell, max_gap=max_gap)
     ends = _at_corners(_without_shadows(merged, near=max_gap / 2), snap=snap)
     return Walls(np.array(ends).reshape(-1, 2, 2) + origin)
 
 
-def _strongest(xy: FloatArray, normals: FloatArray, weights: FloatArray, *, cell: float) -> tuple[_Line | None, float]:
+def _strongest(cells: WallCells) -> tuple[_Line | None, float]:
     """Return the line with the most support, and how much that is."""
-    if not len(xy):
+    if not len(cells.xy):
         return None, 0.0
+    normals = cells.normals_xy
     angle = np.arctan2(normals[:, 1], normals[:, 0]) / (2 * np.pi) * _ANGLE_BINS
-    offset = (xy * normals).sum(axis=1) / cell
+    offset = (cells.xy * normals).sum(axis=1) / cells.cell
     low = np.floor(offset.min()) - 2
     size = int(offset.max() - low) + 4
     index = (np.floor(angle).astype(np.int64) % _ANGLE_BINS) * size + np.floor(offset - low).astype(np.int64)
-    support = np.bincount(index, weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
+    support = np.bincount(index, cells.weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
     smooth = gaussian_filter(support, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
     best = int(np.argmax(smooth))
     turn = (best // size + 0.5) * 2 * np.pi / _ANGLE_BINS
     normal = np.array([np.cos(turn), np.sin(turn)])
     # The smoothing spreads the support of one line over about 1.5 × 1 × 2π bins.
-    return _Line(normal, (best % size + low + 0.5) * cell), float(smooth.flat[best] * 1.5 * 2 * np.pi)
+    return _Line(normal, (best % size + low + 0.5) * cells.cell), float(smooth.flat[best] * 1.5 * 2 * np.pi)
 
 
-def _of_line(line: _Line, xy: FloatArray, normals: FloatArray, *, within: float) -> NDArray[np.bool_]:
-    near = np.abs(xy @ line.normal - line.offset) <= within
-    return np.asarray(near & (normals @ line.normal >= np.cos(np.deg2rad(_MAX_TURN_DEG))))
+def _of_line(line: _Line, cells: WallCells, *, within: float) -> NDArray[np.bool_]:
+    """Return which cells are within so many cells of a line, and face the same side."""
+    near = np.abs(cells.xy @ line.normal - line.offset) <= within * cells.cell
+    return np.asarray(near & (cells.normals_xy @ line.normal >= np.cos(np.deg2rad(_MAX_TURN_DEG))))
 
 
-def _fitted(line: _Line, xy: FloatArray, normals: FloatArray, weights: FloatArray, *, cell: float) -> _Line:
+def _fitted(line: _Line, cells: WallCells) -> _Line:
     """Return the weighted total least-squares line of the cells near a line."""
     for number in range(_FITS):
-        near = _of_line(line, xy, normals, within=(2.5 if not number else _NEAR_CELLS) * cell)
-        if near.sum() < 3:
+        near = cells.only(_of_line(line, cells, within=_NEAR_CELLS if number else _TAKEN_CELLS))
+        if len(near.xy) < 3:
             return line
-        mean = np.average(xy[near], axis=0, weights=weights[near])
-        spread = (xy[near] - mean).T @ ((xy[near] - mean) * weights[near, None])
+        mean = np.average(near.xy, axis=0, weights=near.weights)
+        spread = (near.xy - mean).T @ ((near.xy - mean) * near.weights[:, None])
         normal = np.linalg.eigh(spread)[1][:, 0]
         normal = normal if normal @ line.normal > 0 else -normal
         if normal @ line.normal < np.cos(np.deg2rad(_MAX_TURN_DEG)):

@@ -59,12 +59,12 @@ def write_ply(
     with path.open("wb") as stream:
         stream.write(_header(len(cloud) if kept is None else kept.count, layout, frame_comments(file_from_world)))
         for chunk in chunks(len(cloud)):
-            written = _vertices(cloud, chunk, layout, file_from_world)
+            written = _vertices(cloud, chunk, layout, file_from_world=file_from_world)
             stream.write((written if kept is None else written[kept.within(chunk)]).tobytes())
 
 
 def _vertices(
-    cloud: PointCloud, chunk: slice, layout: np.dtype[np.void], file_from_world: FloatArray | None
+    cloud: PointCloud, chunk: slice, layout: np.dtype[np.void], *, file_from_world: FloatArray | None
 ) -> NDArray[np.void]:
     vertices = np.zeros(chunk.stop - chunk.start, layout)
     points = turned(cloud.points_in_world[chunk], file_from_world)

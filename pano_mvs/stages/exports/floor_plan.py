@@ -82,7 +82,7 @@ def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParam
             continue
         folder = f"floor_plan_{number}" if number else "floor_plan"
         (ctx.scratch / folder).mkdir()
-        plan = _GroupPlan(group, own, params, ctx.scratch / folder)
+        plan = _GroupPlan(group, own, params, folder=ctx.scratch / folder)
         about = plan.write()
         (ctx.scratch / folder / "floor_plan.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
         files |= {f"{folder}/{path.name}": path for path in sorted((ctx.scratch / folder).iterdir())}
@@ -98,7 +98,7 @@ def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParam
 class _GroupPlan:
     """The plans of one group."""
 
-    def __init__(self, cloud: PointCloud, poses: Poses, params: FloorPlanParams, folder: Path) -> None:
+    def __init__(self, cloud: PointCloud, poses: Poses, params: FloorPlanParams, *, folder: Path) -> None:
         self.cloud = cloud
         self.poses = poses
         self.params = params

@@ -170,7 +170,7 @@ def _write_group(
     scratch = ctx.scratch / str(number)
     scratch.mkdir()
     (turn,) = files_from_world(params, poses, groups=1)
-    seed = _write_seed(poses, cloud, params, turn, ctx=ctx, scratch=scratch)
+    seed = _write_seed(poses, cloud, params, turn=turn, ctx=ctx, scratch=scratch)
     about = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
     if turn is not None:
         about["file_from_world"] = turn.tolist()
@@ -276,8 +276,8 @@ def _write_seed(
     poses: Poses,
     cloud: PointCloud | None,
     params: NerfstudioParams,
-    turn: NDArray[np.float64] | None,
     *,
+    turn: NDArray[np.float64] | None,
     ctx: Context,
     scratch: Path,
 ) -> Path | None:
