@@ -85,8 +85,8 @@ def test_the_world_file_places_the_picture(tmp_path: Path) -> None:
     about = stated(files)
     (storey,) = about["storeys"]
     picture = read_picture(files.files["floor_plan/storey_0.png"])[..., ::-1]
-    assert picture.shape[1] == storey["size_px"][0]
-    assert picture.shape[0] > storey["size_px"][1]  # with the strip of the scale bar
+    assert list(picture.shape[1::-1]) == storey["size_px"]
+    assert picture.shape[0] > storey["plan_size_px"][1]  # with the strip of the scale bar
     size, skew_1, skew_2, down, x, y = map(float, files.files["floor_plan/storey_0.pgw"].read_text().split())
     assert (skew_1, skew_2, down) == (0, 0, -size)
     assert size == pytest.approx(storey["metres_per_pixel"])
@@ -150,7 +150,7 @@ def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_too_many_pixels_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pano_mvs.stages.exports.floor_plan._MAX_SIDE_PX", 300)
     files, ctx = planned(tmp_path, the_cloud(room_cloud()), the_poses((2, 2, 1.5)), pixel=0.0005, formats=("svg",))
-    assert max(stated(files)["storeys"][0]["size_px"]) <= 300
+    assert max(stated(files)["storeys"][0]["plan_size_px"]) <= 300
     assert "would be too many" in ctx.notes[0]
 
 

@@ -27,6 +27,11 @@ def bar_length(width: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= limit))
 
 
+def strip_px(size_hw: tuple[int, int]) -> int:
+    """Return the rows of the strip for the scale bar below a plan of a size."""
+    return max(_MIN_STRIP_PX, round(_STRIP_SHARE * max(size_hw)))
+
+
 def draw_plan(
     photo: NDArray[np.uint8],
     known: NDArray[np.bool_],
@@ -47,8 +52,7 @@ def draw_plan(
         unit: of lengths, beside the scale bar.
     """
     height, width = extent.size_hw
-    strip = max(_MIN_STRIP_PX, round(_STRIP_SHARE * max(height, width)))
-    image = np.full((height + strip, width, 3), _PAPER, np.uint8)
+    image = np.full((height + strip_px(extent.size_hw), width, 3), _PAPER, np.uint8)
     image[:height][known] = photo[known]
     thickness = max(2, round(width / 350))
     for x1, y1, x2, y2 in _subpixels(extent.pixels_from_xy(walls)).reshape(-1, 4).tolist():

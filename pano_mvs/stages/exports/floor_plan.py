@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan
+from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan, strip_px
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid
 from pano_mvs.algorithms.floor_plan.storeys import Storey, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
@@ -175,7 +175,8 @@ class _GroupPlan:
             "units_per_pixel": extent.pixel,
             "metres_per_pixel": extent.pixel if self.poses.metric else None,
             "origin_xy": [extent.left, extent.top],
-            "size_px": [extent.size_hw[1], extent.size_hw[0]],
+            "size_px": [extent.size_hw[1], extent.size_hw[0] + strip_px(extent.size_hw)],
+            "plan_size_px": [extent.size_hw[1], extent.size_hw[0]],
             "walls": len(walls.ends_xy),
             "cameras": {name: list(place) for name, place in names.items()},
         }
