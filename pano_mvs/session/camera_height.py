@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.floor_plan.storeys import find_storeys
 from pano_mvs.scene import PointCloud, Poses
@@ -11,7 +12,7 @@ from pano_mvs.scene.upright import world_up, z_up_from_world
 PLAUSIBLE_HEIGHT_M = 1.6
 """A usual height of a camera on a tripod or a stick."""
 
-_SAMPLED_POINTS = 300_000
+_BLOCKS, _BLOCK_POINTS = 300, 1000
 _MIN_POINTS = 1000
 
 
@@ -27,9 +28,9 @@ def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
     if not poses.names or len(cloud) < _MIN_POINTS:
         return None
     turn = z_up_from_world(world_up(poses))
-    step = max(1, len(cloud) // _SAMPLED_POINTS)
-    heights = cloud.points_in_world[::step].astype(np.float64) @ turn[2]
-    ups = cloud.normals_in_world[::step].astype(np.float64) @ turn[2]
+    chosen = _sample(len(cloud))
+    heights = cloud.points_in_world[chosen].astype(np.float64) @ turn[2]
+    ups = cloud.normals_in_world[chosen].astype(np.float64) @ turn[2]
     centers = poses.centers @ turn[2]
     storeys = [storey for storey in find_storeys(heights, ups, centers) if storey.has_floor]
     if not storeys:
@@ -37,6 +38,14 @@ def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
     largest = max(storeys, key=lambda storey: len(storey.cameras))
     height = float(np.median(centers[list(largest.cameras)])) - largest.floor
     return height if height > 0 else None
+
+
+def _sample(count: int) -> NDArray[np.intp] | slice:
+    """Return evenly spaced blocks of points, so that little of a memory-mapped cloud is read."""
+    if count <= _BLOCKS * _BLOCK_POINTS:
+        return slice(None)
+    starts = np.linspace(0, count - _BLOCK_POINTS, _BLOCKS).astype(np.intp)
+    return np.asarray(starts[:, None] + np.arange(_BLOCK_POINTS), np.intp).ravel()
 
 
 def height_note(height: float) -> str:

@@ -183,6 +183,15 @@ def test_the_height_of_the_cameras_is_found_and_offered_but_not_applied() -> Non
     assert camera_height(poses, PointCloud(*(value[:10] for value in list(vars(cloud).values())[:4]))) is None
 
 
+def test_the_height_does_not_depend_on_the_size_of_the_cloud() -> None:
+    """Of a large cloud, only some blocks are read."""
+    cloud, poses = the_cloud(room_cloud(density=9000)), the_poses((2, 2, 1.28), metric=False)
+    assert len(cloud) > 600_000
+    mixed = np.random.default_rng(0).permutation(len(cloud))
+    shuffled = PointCloud(*(value[mixed] for value in list(vars(cloud).values())[:4]))
+    assert camera_height(poses, shuffled) == pytest.approx(1.28, abs=0.02)
+
+
 def test_a_measured_height_gives_the_factor(run: pano_mvs.RunOutput) -> None:
     groups = (PoseGroup(camera_height=0.8),)
     poses = run.summary.poses.model_copy(update={"groups": groups})

@@ -107,7 +107,7 @@ def _strongest(cells: WallCells) -> tuple[_Line | None, float]:
 
 
 def _of_line(line: _Line, cells: WallCells, *, within: float) -> NDArray[np.bool_]:
-    """Return which cells are within so many cells of a line, and face the same side."""
+    """Return which cells face the same side as a line, at a distance of at most `within` cells."""
     near = np.abs(cells.xy @ line.normal - line.offset) <= within * cells.cell
     return np.asarray(near & (cells.normals_xy @ line.normal >= np.cos(np.deg2rad(_MAX_TURN_DEG))))
 
