@@ -18,6 +18,8 @@ import pyvista as pv
 from numpy.typing import NDArray
 from quickstart_pictures import IMAGES
 
+from pano_mvs.io.clouds.ply_reader import open_ply_points
+
 WIDTH, HEIGHT, STRIP, GAP = 1280, 560, 460, 30
 EYE, FOCUS, VIEW_ANGLE = (3.3, -5.2, -6.2), (0.72, 0.45, 0.2), 35.0
 CEILING_Y, CUT_Z = -1.25, -1.25
@@ -30,8 +32,9 @@ Picture = NDArray[np.uint8]
 def room_picture(path: Path, size_wh: tuple[int, int]) -> Picture:
     """Return the cloud from outside, BGR, without the ceiling and the wall beside the viewer."""
     cloud = pv.read(path)
-    points, colors = np.asarray(cloud.points), np.asarray(cloud.point_data["RGB"])
-    normals = np.asarray(cloud.point_data["Normals"])
+    file = open_ply_points(path)  # whose header states the rotation from the world
+    points, colors = file.in_world(np.asarray(cloud.points)), np.asarray(cloud.point_data["RGB"])
+    normals = file.in_world(np.asarray(cloud.point_data["Normals"]))
     faces_us = np.einsum("ij,ij->i", np.asarray(EYE) - points, normals) > 0
     extent = np.abs(points - np.median(points, axis=0)).max(axis=1)
     keep = faces_us & (points[:, 1] > CEILING_Y) & (points[:, 2] > CUT_Z) & (extent < 4.5)

@@ -17,6 +17,8 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
+from pano_mvs.io.clouds.ply_reader import open_ply_points
+
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 WIDTH = 1200
@@ -29,8 +31,9 @@ Picture = NDArray[np.uint8]
 def cloud_picture(path: Path) -> Picture:
     """Return the cloud from outside, (H, W, 3) BGR, without what is turned away (the near walls) and the ceiling."""
     cloud = pv.read(path)
-    points, colors = np.asarray(cloud.points), np.asarray(cloud.point_data["RGB"])
-    normals = np.asarray(cloud.point_data["Normals"])
+    file = open_ply_points(path)  # whose header states the rotation from the world
+    points, colors = file.in_world(np.asarray(cloud.points)), np.asarray(cloud.point_data["RGB"])
+    normals = file.in_world(np.asarray(cloud.point_data["Normals"]))
     faces_us = np.einsum("ij,ij->i", np.asarray(EYE) - points, normals) > 0
     keep = faces_us & ((points[:, 1] > CEILING_Y) | (np.abs(normals[:, 1]) < 0.3))
     shown = pv.PolyData(points[keep])

@@ -142,7 +142,7 @@ def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> N
 
 def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
     cloud = _fused(rooms)
-    files = ply(cloud=cloud, params=PlyParams(), ctx=ctx).files
+    files = ply(cloud=cloud, poses=None, params=PlyParams(), ctx=ctx).files
     assert list(files) == ["cloud.ply", "cloud_1.ply"]
     for path, group in zip(files.values(), cloud.groups(), strict=True):
         np.testing.assert_array_equal(read_ply(path).points_in_world, group.points_in_world)
@@ -151,7 +151,7 @@ def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
 
 @pytest.mark.slow
 def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context) -> None:
-    files = mesh(cloud=_fused(rooms), params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
+    files = mesh(cloud=_fused(rooms), poses=None, params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
     assert list(files) == ["mesh.ply", "mesh_1.ply"]
 
 
@@ -159,7 +159,9 @@ def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: C
     large = _fused(rooms).groups()[0]
     shorter: dict[str, Any] = {name: value[:5] for name, value in vars(large).items() if isinstance(value, np.ndarray)}
     few = replace(large, **shorter)
-    files = mesh(cloud=PointCloud.of_groups([large, few]), params=MeshParams(depth=4, trim=0), ctx=ctx).files
+    files = mesh(
+        cloud=PointCloud.of_groups([large, few]), poses=None, params=MeshParams(depth=4, trim=0), ctx=ctx
+    ).files
     assert list(files) == ["mesh.ply"]
     assert ctx.notes[0].startswith("no mesh_1.ply: 5 of 5 points are left")
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,22 +241,41 @@ class PosedGroup:
 
 
 def write_transforms(
-    root: str, group: PosedGroup, cloud: PointCloud | None, *, params: SeedParams, ctx: Context
+    root: str,
+    group: PosedGroup,
+    cloud: PointCloud | None,
+    *,
+    params: SeedParams,
+    ctx: Context,
+    file_from_world: NDArray[np.float64] | None = None,
 ) -> dict[str, Path]:
-    """Write transforms.json of each variant and the initial points of a group; return the targets of the files."""
+    """Write transforms.json of each variant and the initial points of a group; return the targets of the files.
+
+    Args:
+        root: folder of the variants in the output folder.
+        group: poses and frames.
+        cloud: of the group; None: the sparse points of its poses.
+        params: of the initial points.
+        ctx: of the stage.
+        file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
+    """
     files: dict[str, Path] = {}
     scratch = ctx.scratch / str(group.number)
     scratch.mkdir()
     poses = group.poses
-    seed = _write_seed(poses, cloud, params, ctx=ctx, scratch=scratch)
+    seed = _write_seed(group, cloud, params, ctx=ctx, file_from_world=file_from_world)
     seed_name = "" if seed is None else group_file("seed.ply", group.number)
+    about: dict[str, Any] = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
+    if file_from_world is not None:
+        about["file_from_world"] = file_from_world.tolist()
     cameras = poses.cameras
     for variant, listed in group.listed().items():
         document = transforms_document(
             variant,
             [(name, cameras[name], frame) for name, frame in listed],
             depth_unit=group.depth_unit,
-            about={"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame},
+            about=about,
+            file_from_world=file_from_world,
             seed=seed_name,
         )
         folder = f"{root}/{variant}"
@@ -270,9 +289,15 @@ def write_transforms(
 
 
 def _write_seed(
-    poses: Poses, cloud: PointCloud | None, params: SeedParams, *, ctx: Context, scratch: Path
+    group: PosedGroup,
+    cloud: PointCloud | None,
+    params: SeedParams,
+    *,
+    ctx: Context,
+    file_from_world: NDArray[np.float64] | None,
 ) -> Path | None:
     """Write the initial points; return None if there are none."""
+    poses, scratch = group.poses, ctx.scratch / str(group.number)
     if cloud is None or not len(cloud):
         count = len(poses.points_in_world)
         cloud = PointCloud(
@@ -287,7 +312,7 @@ def _write_seed(
     kept = select_points(cloud, selection, scratch)
     ctx.metric("seed_points", ctx.metrics.get("seed_points", 0) + (len(cloud) if kept is None else kept.count))
     path = scratch / "seed.ply"
-    write_ply(path, cloud, kept=kept)
+    write_ply(path, cloud, kept=kept, file_from_world=file_from_world)
     return path
 
 

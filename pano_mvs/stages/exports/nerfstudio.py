@@ -24,6 +24,7 @@ from pano_mvs.api import (
 )
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.stages.exports.axes import FrameParams, files_from_world
 from pano_mvs.stages.exports.frame_files import (
     FrameFiles,
     FramesParams,
@@ -67,7 +68,7 @@ def nerfstudio_frames(
     return NerfstudioFrames(made.files, made.pictures, tuple(made.frames), params.depth_unit)
 
 
-class NerfstudioParams(SeedParams):
+class NerfstudioParams(FrameParams, SeedParams):
     """Settings of export.nerfstudio."""
 
 
@@ -81,8 +82,9 @@ def nerfstudio(
 ) -> Files:
     """Write the frames of export.nerfstudio_frames as nerfstudio/<variant>/transforms.json, with initial points.
 
-    Without a cloud, the sparse points of the poses are used. A file has one frame: further groups of poses are
-    transforms_1.json with seed_1.ply, transforms_2.json …
+    Cameras and points are turned so that z points up; `file_from_world` states the rotation from the world of the poses
+    and of COLMAP models. Without a cloud, the sparse points of the poses are used. A file has one frame: further groups
+    of poses are transforms_1.json with seed_1.ply, transforms_2.json …
     """
     loaded = frames_with_poses(poses, frames, ctx)
     files: dict[str, Path] = {}
@@ -92,7 +94,9 @@ def nerfstudio(
         own = {name: loaded[name] for name in group.names if name in loaded}
         if own:
             given = clouds[number] if number < len(clouds) else None
-            files |= write_transforms(_ROOT, PosedGroup(number, group, own), given, params=params, ctx=ctx)
+            (turn,) = files_from_world(params, group, groups=1)
+            posed = PosedGroup(number, group, own)
+            files |= write_transforms(_ROOT, posed, given, params=params, ctx=ctx, file_from_world=turn)
     if len(groups) > 1:
         ctx.note(
             f"the poses are in {len(groups)} groups, each in its own frame: transforms.json lists the largest group, "
