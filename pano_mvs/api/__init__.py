@@ -59,6 +59,7 @@ from pano_mvs.scene import (
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
+from pano_mvs.scene.upright import world_up, y_up_from_world, z_up_from_world
 
 __all__ = [
     "CHUNK_POINTS",
@@ -127,5 +128,8 @@ __all__ = [
     "split_groups",
     "stage",
     "verify_pair",
+    "world_up",
     "write_png",
+    "y_up_from_world",
+    "z_up_from_world",
 ]

@@ -299,6 +299,37 @@ def view_results(
     view_scene(out, options, Console())
 
 
+@app.command("scale", context_settings={"ignore_unknown_options": True})
+@guarded
+def scale_results(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
+    known: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[A B LENGTH]",
+            help="Two images, or two points x,y,z, and the distance between them, such as 3.42m, 342cm or 11.2ft.",
+        ),
+    ] = None,
+    camera_height: Annotated[
+        str,
+        typer.Option(
+            "--camera-height", metavar="LENGTH", help="Height of the cameras above the floor.", show_default=False
+        ),
+    ] = "",
+    group: Annotated[
+        int, typer.Option("--group", min=0, help="Group of the poses in which points or the height were measured.")
+    ] = 0,
+    cache: CacheOption = None,
+) -> None:
+    """Put a run into metres by a measured length; without one, print what a usual camera height would give."""
+    from pano_mvs.cli.scale_command import scale_output
+
+    code = scale_output(
+        out, tuple(known or ()), camera_height=camera_height, group=group, cache=cache, console=Console()
+    )
+    raise typer.Exit(code)
+
+
 @app.command()
 @guarded
 def share(

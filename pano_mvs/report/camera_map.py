@@ -14,6 +14,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
+from pano_mvs.scene.upright import states_y_down
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +27,6 @@ _NEAR, _TINY_MAP = 9, 140
 _MAX_LABELS, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
 _ALONG_NORTH = re.compile(r"\bz north\b")
-_DOWN = re.compile(r"\by down\b")
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def up_of(poses: PosesSummary) -> FloatArray:
     """
     up = np.array(poses.up or (0, -1, 0), np.float64)
     usable = np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
-    if not usable or _DOWN.search(poses.frame):
+    if not usable or states_y_down(poses.frame):
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
 

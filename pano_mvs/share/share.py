@@ -18,6 +18,7 @@ from pano_mvs.results.run_output import RunOutput, RunView
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.upright import states_y_down
 from pano_mvs.share.encoding import encode_jpeg, encode_points, encode_ranges
 from pano_mvs.share.frame import page_from_world
 from pano_mvs.share.octree import octree
@@ -89,7 +90,7 @@ def share_run(
     if len(run.summary.poses.by_group()) > 1:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
-    frame = page_from_world(cameras)
+    frame = page_from_world(cameras, is_level=states_y_down(run.summary.poses.by_group()[0].frame))
     page = PageFolder(folder)
     nodes, bounds = _put_cloud(page, cloud, frame, max_points=options.max_points)
     described = []

@@ -37,6 +37,7 @@ FOLDERS = (
     "masks",
     "out/site/colmap/sparse/0",
     "colmap/sparse/0",
+    "lobby/colmap/sparse/0",
     "truth",
     "videos",
 )

@@ -115,7 +115,7 @@ def _top_view(points: Points, distances: Points, evaluation: CloudEvaluation) ->
         return strip(_LINE)
     low, high = np.quantile(flat, [0.005, 0.995], axis=0)
     scale = (WIDTH - 1) / max(float((high - low).max()), 1e-9)
-    size = np.ceil((high - low) * scale).astype(int) + 1
+    size = np.minimum(np.ceil((high - low) * scale).astype(int) + 1, WIDTH)  # the product may round above WIDTH - 1
     pixel = np.rint((flat - low) * scale).astype(int)
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     order = np.flatnonzero(inside)[np.argsort(distances[inside], kind="stable")]
