@@ -42,7 +42,7 @@ def write_ply_mesh(path: Path, mesh: MeshArrays, *, file_from_world: FloatArray 
     faces["count"], faces["corners"] = 3, triangles
     with path.open("wb") as stream:
         form = "property list uchar int vertex_indices"
-        stream.write(_header(len(vertices), len(faces), form, frame_comments(file_from_world)))
+        stream.write(_header(len(vertices), len(faces), form, comments=frame_comments(file_from_world)))
         stream.write(vertices.tobytes())
         stream.write(faces.tobytes())
 
@@ -77,7 +77,7 @@ def read_ply_mesh(path: Path) -> MeshArrays:
     return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1), faces["corners"].copy()
 
 
-def _header(vertices: int, faces: int, face_property: str, comments: str = "") -> bytes:
+def _header(vertices: int, faces: int, face_property: str, *, comments: str = "") -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",

@@ -165,7 +165,7 @@ class _GroupPlan:
         )
         places = self.centers[:, :2].tolist()
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
-        drawing = self._drawing(number, extent, walls.ends_xy, names)
+        drawing = self._drawing(number, extent, walls=walls.ends_xy, cameras=names)
         files = self._write_files(f"storey_{number}", grid, drawing)
         return {
             **files,
@@ -182,7 +182,7 @@ class _GroupPlan:
         }
 
     def _drawing(
-        self, number: int, extent: Extent, walls: FloatArray, cameras: dict[str, tuple[float, float]]
+        self, number: int, extent: Extent, *, walls: FloatArray, cameras: dict[str, tuple[float, float]]
     ) -> PlanDrawing:
         rows, columns = extent.size_hw
         width, height = columns * extent.pixel, rows * extent.pixel
