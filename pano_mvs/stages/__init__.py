@@ -8,6 +8,7 @@ from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.files import ply, previews, ranges
 from pano_mvs.stages.exports.mesh import mesh
+from pano_mvs.stages.exports.mesh_textured import mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
@@ -60,6 +61,7 @@ __all__ = [
     "level",
     "median",
     "mesh",
+    "mesh_textured",
     "nearest",
     "nerfstudio",
     "nerfstudio_frames",

@@ -52,7 +52,7 @@ def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
         folder = ctx.scratch / str(number)
         folder.mkdir()
         try:
-            solved, depth = _solved(group, params, folder)
+            solved, depth = solved_mesh(group, params, folder)
         except InputError as error:
             if not number:
                 raise
@@ -68,7 +68,7 @@ def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
     return Files(files)
 
 
-def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
+def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
     """Return the mesh of one group, and the depth of its octree.
 
     Raises:
