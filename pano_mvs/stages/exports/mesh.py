@@ -68,8 +68,10 @@ def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
     return Files(files)
 
 
-def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
+def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest: int = 14) -> tuple[Mesh, int]:
     """Return the mesh of one group, and the depth of its octree.
+
+    That is the depth of the settings, or one by point spacing, at most `deepest`.
 
     Raises:
         InputError: if too few points are left, or they have no common surface.
@@ -84,7 +86,7 @@ def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Me
             "are needed. Lower `min_views` or `min_confidence`, or find out why the cloud is empty"
         )
     spacing = float(np.median(point_spacings(points)))
-    depth = params.depth or poisson_depth(points, spacing)
+    depth = params.depth or min(poisson_depth(points, spacing), deepest)
     solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))
     if params.trim:
         solved = trimmed_mesh(solved, points, max_spacings=params.trim)

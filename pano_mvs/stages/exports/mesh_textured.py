@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,9 @@ from pydantic import Field
 
 from pano_mvs.algorithms.mesh.atlas import unwrapped
 from pano_mvs.algorithms.mesh.decimate import decimated
+from pano_mvs.algorithms.mesh.free_space import FreeSpace
 from pano_mvs.algorithms.mesh.texture import TexturedMesh, balanced_views, textured
+from pano_mvs.algorithms.mesh.triangles import Mesh, used_part, without_crumbs
 from pano_mvs.algorithms.mesh.view_quality import PaintView
 from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.io.meshes.glb_writer import write_glb
@@ -28,6 +29,9 @@ from pano_mvs.stages.exports.mesh import MeshParams, solved_mesh
 
 NAME = "mesh_textured"
 
+# Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
+_DEEPEST = 9
+
 # Measured: of each texel, with room for the fill; of each pixel of a panorama; and the solver with its cloud.
 _BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _SOLVER_BYTES = 48, 120, 1_000_000_000
 
@@ -35,6 +39,12 @@ _BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _SOLVER_BYTES = 48, 120, 1_000_000_000
 class TexturedParams(MeshParams):
     """Settings of export.mesh_textured."""
 
+    depth: int = Field(
+        default=0,
+        ge=0,
+        le=14,
+        description="depth of the octree: cells are extent / 2^depth wide; 0: by point spacing, at most 9",
+    )
     trim: float = Field(
         default=12.0,
         ge=0,
@@ -83,9 +93,8 @@ def mesh_textured(
     for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
         folder = ctx.scratch / str(number)
         folder.mkdir()
-        source = _Views(own, images, ranges)
         try:
-            made = _textured_mesh(group, source, params, folder=folder, ctx=ctx)
+            made = textured_mesh(group, (own, images, ranges), params, folder=folder, ctx=ctx)
         except InputError as error:
             if not number:
                 raise
@@ -100,40 +109,76 @@ def mesh_textured(
     return Files(files)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Views:
-    """The panoramas of one group."""
-
-    poses: Poses
-    images: All[Panorama]
-    ranges: All[RangeMap]
-
-    @property
-    def names(self) -> list[str]:
-        return [name for name in self.poses.names if name in self.images]
-
-    def load(self, idx: int) -> PaintView:
-        name = self.names[idx]
-        image = self.images[name]
-        pose = self.poses.cam_from_world(self.poses.names.index(name))
-        range_map = self.ranges.get(name)
-        if range_map is not None and range_map.range.shape != image.size_hw:
-            range_map = None
-        return PaintView(pose, image.load(), image.load_mask(), range_map)
-
-
-def _textured_mesh(
-    cloud: PointCloud, views: _Views, params: TexturedParams, *, folder: Path, ctx: Context
+def textured_mesh(
+    cloud: PointCloud,
+    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
+    params: TexturedParams,
+    *,
+    folder: Path,
+    ctx: Context,
 ) -> TexturedMesh:
-    solved, _ = solved_mesh(cloud, params, folder)
+    """Return the textured surface of the cloud of one group of panoramas.
+
+    Args:
+        cloud: the cloud.
+        views: poses of the group, and images and ranges by name. Panoramas are loaded one at a time.
+        params: settings of export.mesh_textured.
+        folder: an empty folder.
+        ctx: context of the stage.
+
+    Raises:
+        InputError: if the cloud has no surface, or no panorama sees it.
+    """
+    solved, _ = solved_mesh(cloud, params, folder, deepest=_DEEPEST)
+    names = [name for name in views[0].names if name in views[1]]
+
+    def load(idx: int) -> PaintView:
+        return _paint_view(names[idx], views)
+
+    solved = _without_free_space(solved, names, views, smallest_part=params.smallest_part)
     vertices, faces = decimated(solved.vertices_in_world, solved.faces, triangles=params.triangles)
-    balance = balanced_views(vertices, faces, views.load, views=len(views.names), threads=ctx.threads)
+
+    balance = balanced_views(vertices, faces, load, views=len(names), threads=ctx.threads)
     if not balance.density > 0:
         raise InputError(
             "no panorama sees the mesh, so it has no texture. Check the masks and the poses, or lower `trim`"
         )
     atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
-    return textured(vertices, faces, atlas, views.load, balance=balance, threads=ctx.threads)
+    return textured(vertices, faces, atlas, load, balance=balance, threads=ctx.threads)
+
+
+def _without_free_space(
+    mesh: Mesh,
+    names: Sequence[str],
+    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
+    *,
+    smallest_part: float,
+) -> Mesh:
+    """Return a mesh without the parts through which panoramas look.
+
+    Raises:
+        InputError: if nothing is left.
+    """
+    space = FreeSpace(mesh.vertices_in_world)
+    for name in names:
+        if name in views[2]:
+            pose = views[0].cam_from_world(views[0].names.index(name))
+            space.add(views[2][name], pose, views[1][name].load_mask())
+    free = space.free()
+    kept = used_part(mesh, mesh.faces[~free[mesh.faces].any(axis=1)])
+    kept = without_crumbs(kept, smallest_share=smallest_part)
+    if not len(kept.faces):
+        raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
+    return kept
+
+
+def _paint_view(name: str, views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]]) -> PaintView:
+    poses, images, ranges = views
+    image, range_map = images[name], ranges.get(name)
+    if range_map is not None and range_map.range.shape != image.size_hw:
+        range_map = None
+    pose = poses.cam_from_world(poses.names.index(name))
+    return PaintView(pose, image.load(), image.load_mask(), range_map)
 
 
 def _write(

@@ -26,19 +26,14 @@ Surface = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]
 
 def box(steps: int = 4, *, board: bool = False) -> Surface:
     """Return the inner walls of the box, each of steps × steps quads; with a board 0.8 in front of the wall +z."""
-    walls = [(axis, sign, HALF) for axis in range(3) for sign in (-1.0, 1.0)]
-    vertices, faces, wall = [], [], []
-    for number, (axis, sign, half) in enumerate(walls):
-        points, triangles = _quads(axis, sign, half, steps)
-        faces.append(triangles + sum(map(len, vertices)))
-        vertices.append(points)
-        wall.append(np.full(len(triangles), number))
+    parts = [_quads(axis, sign, HALF, steps) for axis in range(3) for sign in (-1.0, 1.0)]
     if board:
-        points, triangles = _quads(2, 1.0, np.array([0.5, 0.4, 0.8]), steps)
-        faces.append(triangles + sum(map(len, vertices)))
-        vertices.append(points)
-        wall.append(np.full(len(triangles), BOARD))
-    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32), np.concatenate(wall)
+        parts.append(_quads(2, 1.0, np.array([0.5, 0.4, 0.8]), steps))
+    vertices = np.concatenate([points for points, _ in parts]).astype(np.float32)
+    first = np.cumsum([0, *(len(points) for points, _ in parts)])
+    faces = np.concatenate([triangles + start for (_, triangles), start in zip(parts, first, strict=False)])
+    wall = np.repeat(np.arange(len(parts)), [len(triangles) for _, triangles in parts])
+    return vertices, faces.astype(np.int32), wall
 
 
 def _quads(

@@ -41,7 +41,7 @@ def inside_wall(points: NDArray[np.float64], wall: NDArray[np.int64], margin: fl
     """Which points of the walls are not near another wall."""
     near = np.abs(points) > HALF - margin
     near[np.arange(len(points)), np.minimum(wall, 5) // 2] = False
-    return ~near.any(axis=1)
+    return np.asarray(~near.any(axis=1))
 
 
 def test_texels_have_the_colors_of_their_walls() -> None:
@@ -156,5 +156,5 @@ def test_the_atlas_keeps_the_triangles_and_its_limit() -> None:
 def test_pictures_and_ranges_must_have_one_size() -> None:
     shown = capture(poses(1))
     shown.views[0] = replace(shown.views[0], valid=np.ones((8, 16), np.bool_))
-    with pytest.raises(UsageError, match="a picture of .* with a mask of"):
+    with pytest.raises(UsageError, match=r"a picture of .* with a mask of"):
         painted(shown)

@@ -1,0 +1,113 @@
+"""How a mesh looks where no panorama was used: `python -m tests.benchmarks.mesh_views FOLDER [FOLDER …]`.
+
+Leaves out one panorama of a rendered capture with true poses, computes ranges of the others by the dense stages of a
+workflow, and makes the mesh with coloured vertices (`export.mesh`) and the textured one (`export.mesh_textured`).
+Both are rendered at the pose of the panorama left out and compared with it: PSNR and SSIM of all pixels, where holes
+are black, and of the pixels that the mesh covers. The first mesh is also simplified to the triangles of the second,
+with the colours of the nearest vertices. `--out` keeps the pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pano_mvs.algorithms.mesh.texture import TexturedMesh
+from pano_mvs.algorithms.mesh.triangles import Mesh
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.evaluation.meshes.held_out import HeldOutScores, held_out_scores
+from pano_mvs.scene import PointCloud, RangeMap
+from pano_mvs.stages.exports.mesh import MeshParams, solved_mesh
+from pano_mvs.stages.exports.mesh_textured import TexturedParams, textured_mesh
+from pano_mvs.stages.fusion import vote
+from tests.benchmarks.captures import Capture, read_capture
+from tests.benchmarks.dense_chain import DenseChain, given_records, true_poses
+
+
+def without(capture: Capture, left_out: str) -> Capture:
+    """Return a capture without one of its panoramas."""
+    names = [name for name in capture.panoramas if name != left_out]
+    return Capture(
+        capture.name,
+        {name: capture.panoramas[name] for name in names},
+        {name: capture.poses[name] for name in names},
+        {name: capture.ranges[name] for name in names},
+        capture.outdoor,
+    )
+
+
+def meshes(capture: Capture, workflow: str, folder: Path, settings: dict[str, object]) -> tuple[Mesh, TexturedMesh]:
+    """Return the mesh with coloured vertices and the textured one, and print the CPU seconds of their parts."""
+    chain = DenseChain(workflow)
+    started = time.process_time()
+    maps = chain.run(capture).range_maps
+    last = maps[list(maps)[-1]]
+    poses = true_poses(capture)
+    cloud = fused(chain, capture, maps)
+    print(f"  ranges and fusion: {time.process_time() - started:.0f} s, {len(cloud)} points", flush=True)
+    for name in ("plain", "textured"):
+        (folder / name).mkdir()
+    plain, _ = solved_mesh(cloud, MeshParams(), folder / "plain")
+    started = time.process_time()
+    ctx = Context(np.random.default_rng(0), folder)
+    params = TexturedParams.model_validate(settings)
+    made = textured_mesh(cloud, (poses, capture.panoramas, last), params, folder=folder / "textured", ctx=ctx)
+    print(f"  texture: {time.process_time() - started:.0f} s without the solver", flush=True)
+    return plain, made
+
+
+def fused(chain: DenseChain, capture: Capture, maps: dict[str, dict[str, RangeMap]]) -> PointCloud:
+    """Return the cloud that the workflow's fusion makes."""
+    name = next(name for name, entry in chain.stages.items() if entry.spec.name == "fusion.vote")
+    given = given_records(capture, true_poses(capture))
+    return vote(
+        ranges=maps[chain.graph.edges[name]["ranges"].producer],
+        poses=next(items for kind, items in given.items() if kind.__name__ == "Pose"),
+        images=capture.panoramas,
+        params=chain.stages[name].params,
+        ctx=Context(np.random.default_rng(0), Path(tempfile.gettempdir())),
+    )
+
+
+def report(name: str, mesh: Mesh | TexturedMesh, scores: HeldOutScores) -> None:
+    """Print the scores of one mesh."""
+    whole, covered = scores.everywhere, scores.covered
+    print(
+        f"  {name:9}{len(mesh.faces):9} triangles  all: {whole.psnr_db:.2f} dB, SSIM {whole.ssim:.3f}  covered: "
+        + (f"{covered.psnr_db:.2f} dB, SSIM {covered.ssim:.3f}, {covered.share:.1%}" if covered else "none"),
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the scores of each capture."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("folders", type=Path, nargs="+", help="rendered captures with poses.json and depth.npz")
+    parser.add_argument("--left-out", default="004.png", help="the panorama to render")
+    parser.add_argument("--width", type=int, default=1024, help="width of the panoramas")
+    parser.add_argument("--workflow", default="quality", help="workflow of the ranges")
+    parser.add_argument("--triangles", type=int, default=TexturedParams().triangles, help="of the textured mesh")
+    parser.add_argument("--out", type=Path, help="folder for the pictures")
+    options = parser.parse_args()
+    for folder in options.folders:
+        capture = read_capture(folder, width=options.width)
+        print(f"{capture.name} at {options.left_out}, {options.width} px wide", flush=True)
+        truth, pose = capture.panoramas[options.left_out].load(), capture.poses[options.left_out]
+        with tempfile.TemporaryDirectory() as scratch:
+            used, settings = without(capture, options.left_out), {"triangles": options.triangles}
+            pair = meshes(used, options.workflow, Path(scratch), settings)
+        for name, mesh in zip(("vertices", "textured"), pair, strict=True):
+            scores = held_out_scores(mesh, pose, truth)
+            report(name, mesh, scores)
+            if options.out:
+                options.out.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(options.out / f"{capture.name}_{name}.png"), scores.picture[..., ::-1])
+
+
+if __name__ == "__main__":
+    main()
