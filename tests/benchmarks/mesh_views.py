@@ -16,7 +16,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.mesh.decimate import decimated
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
 from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.engine.stages.context import Context
@@ -24,7 +26,7 @@ from pano_mvs.evaluation.meshes.held_out import HeldOutScores, held_out_scores
 from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.stages.exports.mesh import MeshParams, solved_mesh
 from pano_mvs.stages.exports.mesh_textured import TexturedParams, textured_mesh
-from pano_mvs.stages.fusion import vote
+from pano_mvs.stages.fusion import FusionParams, vote
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, given_records, true_poses
 
@@ -61,15 +63,24 @@ def meshes(capture: Capture, workflow: str, folder: Path, settings: dict[str, ob
     return plain, made
 
 
+def simplified(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh with coloured vertices and about a number of triangles; vertices have the nearest colours."""
+    vertices, faces = decimated(mesh.vertices_in_world, mesh.faces, triangles=triangles)
+    _, nearest = cKDTree(mesh.vertices_in_world).query(vertices)
+    return Mesh(vertices, mesh.colors_rgb[nearest], faces)
+
+
 def fused(chain: DenseChain, capture: Capture, maps: dict[str, dict[str, RangeMap]]) -> PointCloud:
     """Return the cloud that the workflow's fusion makes."""
     name = next(name for name, entry in chain.stages.items() if entry.spec.name == "fusion.vote")
+    params = chain.stages[name].params
+    assert isinstance(params, FusionParams)
     given = given_records(capture, true_poses(capture))
     return vote(
         ranges=maps[chain.graph.edges[name]["ranges"].producer],
         poses=next(items for kind, items in given.items() if kind.__name__ == "Pose"),
         images=capture.panoramas,
-        params=chain.stages[name].params,
+        params=params,
         ctx=Context(np.random.default_rng(0), Path(tempfile.gettempdir())),
     )
 
@@ -101,12 +112,19 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             used, settings = without(capture, options.left_out), {"triangles": options.triangles}
             pair = meshes(used, options.workflow, Path(scratch), settings)
-        for name, mesh in zip(("vertices", "textured"), pair, strict=True):
+        plain, made = pair
+        named: dict[str, Mesh | TexturedMesh] = {
+            "vertices": plain,
+            "as many": simplified(plain, len(made.faces)),
+            "textured": made,
+        }
+        for name, mesh in named.items():
             scores = held_out_scores(mesh, pose, truth)
             report(name, mesh, scores)
             if options.out:
                 options.out.mkdir(parents=True, exist_ok=True)
-                cv2.imwrite(str(options.out / f"{capture.name}_{name}.png"), scores.picture[..., ::-1])
+                path = options.out / f"{capture.name}_{name.replace(' ', '_')}.png"
+                cv2.imwrite(str(path), scores.picture[..., ::-1])
 
 
 if __name__ == "__main__":
