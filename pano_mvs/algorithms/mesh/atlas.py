@@ -44,12 +44,12 @@ class Texels:
     """The texels in the charts of an atlas.
 
     Attributes:
-        pixel: (T,) int64 index of each texel in the texture, row by row.
+        pixel: (T,) int32 index of each texel in the texture, row by row.
         triangle: (T,) int32 its triangle.
         weights: (T, 2) float32 weights of the triangle's second and third corner at the texel's centre.
     """
 
-    pixel: NDArray[np.int64]
+    pixel: NDArray[np.int32]
     triangle: NDArray[np.int32]
     weights: NDArray[np.float32]
 
@@ -91,5 +91,5 @@ def texels_of(atlas: Atlas) -> Texels:
     triangle = np.full(atlas.size_hw, -1, np.int32)
     weights = np.zeros((*atlas.size_hw, 2), np.float32)
     draw_charts(atlas.uv_px, triangle, weights)
-    pixel = np.flatnonzero(triangle >= 0)
+    pixel = np.flatnonzero(triangle >= 0).astype(np.int32)
     return Texels(pixel, triangle.ravel()[pixel], weights.reshape(-1, 2)[pixel])

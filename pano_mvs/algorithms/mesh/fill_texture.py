@@ -14,6 +14,7 @@ from pano_mvs.algorithms.mesh.atlas import Texels
 FloatImage = NDArray[np.float32]
 
 _GREY = 128.0
+_TEXELS_AT_ONCE = 1 << 20  # bounds the memory
 
 
 def vertex_colors(
@@ -32,12 +33,15 @@ def vertex_colors(
         vertices: the number V of vertices.
     """
     sums, totals = np.zeros((vertices, 3)), np.zeros(vertices)
-    triangle, weights = texels.triangle[seen], texels.weights[seen].astype(np.float64)
-    for corner, weight in enumerate((1 - weights.sum(axis=1), weights[:, 0], weights[:, 1])):
-        vertex = faces[triangle, corner]
-        totals += np.bincount(vertex, weight, vertices)
-        for channel in range(3):
-            sums[:, channel] += np.bincount(vertex, weight * colors[seen, channel], vertices)
+    for first in range(0, len(seen), _TEXELS_AT_ONCE):
+        part = slice(first, first + _TEXELS_AT_ONCE)
+        shown = seen[part]
+        triangle, weights = texels.triangle[part][shown], texels.weights[part][shown].astype(np.float64)
+        for corner, weight in enumerate((1 - weights.sum(axis=1), weights[:, 0], weights[:, 1])):
+            vertex = faces[triangle, corner]
+            totals += np.bincount(vertex, weight, vertices)
+            for channel in range(3):
+                sums[:, channel] += np.bincount(vertex, weight * colors[part][shown, channel], vertices)
     known = totals > 1e-3
     result = np.full((vertices, 3), _GREY if not known.any() else 0.0)
     if not known.any():
@@ -52,10 +56,13 @@ def fill_unseen(
     colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], of_vertices: FloatImage
 ) -> None:
     """Give the texels that are not seen the colour between those of their triangle's vertices, in place."""
-    triangle, weights = texels.triangle[~seen], texels.weights[~seen]
-    second, third = weights[:, :1], weights[:, 1:]
-    corners = of_vertices[faces[triangle]]
-    colors[~seen] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
+    for first in range(0, len(seen), _TEXELS_AT_ONCE):
+        part = slice(first, first + _TEXELS_AT_ONCE)
+        hidden = ~seen[part]
+        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
+        second, third = weights[:, :1], weights[:, 1:]
+        corners = of_vertices[faces[triangle]]
+        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
 
 
 def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -71,7 +78,7 @@ def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> N
         return texture
     gaps = np.where(filled, np.uint8(0), np.uint8(1))
     _, labels = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
-    source = np.zeros(int(labels.max()) + 1, np.int64)
+    source = np.zeros(int(labels.max()) + 1, np.int32)
     source[labels[filled]] = np.flatnonzero(filled)
     flat = texture.reshape(filled.size, -1)
     return np.asarray(flat[source[labels.ravel()]].reshape(texture.shape))

@@ -155,19 +155,27 @@ def textured(
         threads: number of threads; the result does not depend on it.
     """
     texels = texels_of(atlas)
-    surface = Surface(vertices_in_world, faces)
+    colors, seen = _painted(Surface(vertices_in_world, faces), texels, load, balance=balance, threads=threads)
+    texture, filled, where = np.zeros((*atlas.size_hw, 3), np.uint8), *np.zeros((2, *atlas.size_hw), np.bool_)
+    texture.reshape(-1, 3)[texels.pixel], filled.ravel()[texels.pixel] = colors, True
+    where.ravel()[texels.pixel] = seen
+    del texels, colors
+    return TexturedMesh(vertices_in_world, faces, atlas, spread_over_gaps(texture, filled), where)
+
+
+def _painted(
+    surface: Surface, texels: Texels, load: Loader, *, balance: ViewBalance, threads: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return the colours (T, 3) of all texels, and which of them a panorama sees."""
     painting = _Painting(len(texels.pixel))
     for idx, (gain, worth) in enumerate(zip(balance.gains, balance.worths, strict=True)):
         look = surface.looks(texels, load(idx), worth=float(worth), threads=threads)
         painting.add(look, gain.astype(np.float32), threads=threads)
     colors, seen = painting.colors()
-    of_vertices = vertex_colors(colors, seen, texels, faces, vertices=len(vertices_in_world))
-    fill_unseen(colors, seen, texels, faces=faces, of_vertices=of_vertices)
-    texture, where = np.zeros((*atlas.size_hw, 3), np.uint8), np.zeros(atlas.size_hw, np.bool_)
-    filled = np.zeros(atlas.size_hw, np.bool_)
-    texture.reshape(-1, 3)[texels.pixel] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-    where.ravel()[texels.pixel], filled.ravel()[texels.pixel] = seen, True
-    return TexturedMesh(vertices_in_world, faces, atlas, spread_over_gaps(texture, filled), where)
+    of_vertices = vertex_colors(colors, seen, texels, surface.faces, vertices=len(surface.vertices_in_world))
+    fill_unseen(colors, seen, texels, faces=surface.faces, of_vertices=of_vertices)
+    np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
+    return colors.astype(np.uint8), seen
 
 
 class _Painting:
@@ -218,7 +226,7 @@ def _blurred(picture: NDArray[np.uint8], sigma: float) -> FloatImage:
 def _triangle_centers(count: int) -> Texels:
     """Return the centres of evenly spread triangles as if they were texels."""
     triangle = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).astype(np.int32))
-    return Texels(np.arange(len(triangle)), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
+    return Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
 
 
 def _reduced(view: PaintView) -> PaintView:

@@ -32,8 +32,9 @@ NAME = "mesh_textured"
 # Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
 _DEEPEST = 9
 
-# Measured: of each texel, with room for the fill; of each pixel of a panorama; and the solver with its cloud.
-_BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _SOLVER_BYTES = 48, 120, 1_000_000_000
+# Measured: of each texel and of each pixel of a panorama while the texture is painted, of the mesh before it is
+# simplified, and of the solver.
+_BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _MESH_BYTES, _SOLVER_BYTES = 60, 120, 400_000_000, 1_000_000_000
 
 
 class TexturedParams(MeshParams):
@@ -70,7 +71,7 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
     for name in images:
         height, width = images[name].size_hw
         pixels = max(pixels, height * width)
-    painting = params.texture_px**2 * _BYTES_PER_TEXEL + pixels * _BYTES_PER_PIXEL
+    painting = params.texture_px**2 * _BYTES_PER_TEXEL + pixels * _BYTES_PER_PIXEL + _MESH_BYTES
     return max(_SOLVER_BYTES, painting)
 
 

@@ -52,7 +52,7 @@ def test_looks_are_those_of_numpy() -> None:
     rng = np.random.default_rng(2)
     count = 300
     weights = rng.dirichlet([1, 1, 1], count)[:, 1:].astype(np.float32)
-    texels = Texels(np.arange(count), rng.integers(0, len(faces), count).astype(np.int32), weights)
+    texels = Texels(np.arange(count, dtype=np.int32), rng.integers(0, len(faces), count).astype(np.int32), weights)
     ranges = surface_view(vertices, faces, pose, size_hw=SIZE).ranges
     quality = rng.uniform(0.1, 1, SIZE).astype(np.float32)
     quality[rng.random(SIZE) < 0.02] = 0
