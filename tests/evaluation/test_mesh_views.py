@@ -102,7 +102,7 @@ def test_texture_shows_more_than_vertices() -> None:
     ]
     balance = balanced_views(vertices, faces, views[:3].__getitem__, views=3)
     atlas = unwrapped(vertices, faces, texels_per_unit=1.5 * balance.density, max_px=512)
-    made = textured(vertices, faces, atlas, views[:3].__getitem__, balance=balance)
+    made = textured(vertices, faces, atlas, load=views[:3].__getitem__, balance=balance)
     pose, truth = views[3].cam_from_world, views[3].picture
     at_vertices = sample_panorama(truth, pixel_from_ray(pose.apply(vertices), (64, 128)))
     plain = Mesh(vertices, np.rint(at_vertices).astype(np.uint8), faces)

@@ -18,7 +18,7 @@ _TEXELS_AT_ONCE = 1 << 20  # bounds the memory
 
 
 def vertex_colors(
-    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, faces: NDArray[np.int32], *, vertices: int
+    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], vertices: int
 ) -> FloatImage:
     """Return the colour of each vertex, (V, 3): the mean of the texels around it that are seen, by their weights.
 

@@ -139,8 +139,8 @@ def textured(
     vertices_in_world: NDArray[np.float32],
     faces: NDArray[np.int32],
     atlas: Atlas,
-    load: Loader,
     *,
+    load: Loader,
     balance: ViewBalance,
     threads: int = 1,
 ) -> TexturedMesh:
@@ -172,7 +172,7 @@ def _painted(
         look = surface.looks(texels, load(idx), worth=float(worth), threads=threads)
         painting.add(look, gain.astype(np.float32), threads=threads)
     colors, seen = painting.colors()
-    of_vertices = vertex_colors(colors, seen, texels, surface.faces, vertices=len(surface.vertices_in_world))
+    of_vertices = vertex_colors(colors, seen, texels, faces=surface.faces, vertices=len(surface.vertices_in_world))
     fill_unseen(colors, seen, texels, faces=surface.faces, of_vertices=of_vertices)
     np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
     return colors.astype(np.uint8), seen

@@ -20,7 +20,7 @@ _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 _UNLIT = "KHR_materials_unlit"
 
 
-def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, form: TextureFormat) -> None:
+def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: TextureFormat) -> None:
     """Write a mesh with its texture as one GLB file, without lighting (KHR_materials_unlit), visible from both sides.
 
     Args:

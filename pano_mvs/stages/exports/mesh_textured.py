@@ -145,7 +145,7 @@ def textured_mesh(
             "no panorama sees the mesh, so it has no texture. Check the masks and the poses, or lower `trim`"
         )
     atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
-    return textured(vertices, faces, atlas, load, balance=balance, threads=ctx.threads)
+    return textured(vertices, faces, atlas, load=load, balance=balance, threads=ctx.threads)
 
 
 def _without_free_space(
@@ -198,7 +198,7 @@ def _write(
     write_png(files[seen], np.where(mesh.seen, np.uint8(255), np.uint8(0)))
     if "glb" in params.formats:
         files[target(".glb")] = folder / "mesh.glb"
-        write_glb(files[target(".glb")], arrays, picture, params.texture_format)
+        write_glb(files[target(".glb")], arrays, picture, form=params.texture_format)
     if "obj" in params.formats:
         texture = target(SUFFIXES[params.texture_format])
         files |= {target(".obj"): folder / "mesh.obj", target(".mtl"): folder / "mesh.mtl", texture: folder / "texture"}

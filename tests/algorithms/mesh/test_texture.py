@@ -22,7 +22,7 @@ def painted(shown: Capture, *, threads: int = 1) -> TexturedMesh:
     vertices, faces, _ = shown.surface
     balance = balanced_views(vertices, faces, shown.load, views=len(shown.views), threads=threads)
     atlas = unwrapped(vertices, faces, texels_per_unit=TEXELS_PER_UNIT, max_px=512)
-    return textured(vertices, faces, atlas, shown.load, balance=balance, threads=threads)
+    return textured(vertices, faces, atlas, load=shown.load, balance=balance, threads=threads)
 
 
 def texel_places(mesh: TexturedMesh) -> tuple[NDArray[np.int32], NDArray[np.float64]]:

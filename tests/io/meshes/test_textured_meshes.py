@@ -33,7 +33,7 @@ def texture() -> NDArray[np.uint8]:
 @pytest.mark.parametrize("form", ["png", "jpeg"])
 def test_another_program_reads_the_glb(tmp_path: Path, form: TextureFormat) -> None:
     mesh = arrays()
-    write_glb(tmp_path / "a.glb", mesh, encoded_texture(texture(), form, quality=95), form)
+    write_glb(tmp_path / "a.glb", mesh, encoded_texture(texture(), form, quality=95), form=form)
     read = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
     assert isinstance(read, trimesh.Trimesh)
     np.testing.assert_array_equal(read.vertices.astype(np.float32), mesh.positions)
@@ -49,7 +49,7 @@ def test_another_program_reads_the_glb(tmp_path: Path, form: TextureFormat) -> N
 
 def test_the_box_stays_watertight(tmp_path: Path) -> None:
     """Its walls have their own vertices, at common places."""
-    write_glb(tmp_path / "a.glb", arrays(), encoded_texture(texture(), "png", quality=95), "png")
+    write_glb(tmp_path / "a.glb", arrays(), encoded_texture(texture(), "png", quality=95), form="png")
     read = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert isinstance(read, trimesh.Trimesh)
     read.merge_vertices(merge_tex=True, merge_norm=True)
@@ -75,7 +75,7 @@ def test_another_program_reads_the_obj_and_its_files(tmp_path: Path) -> None:
 def test_the_bytes_are_the_same_again(tmp_path: Path) -> None:
     digests = set()
     for name in ("a.glb", "b.glb"):
-        write_glb(tmp_path / name, arrays(), encoded_texture(texture(), "jpeg", quality=90), "jpeg")
+        write_glb(tmp_path / name, arrays(), encoded_texture(texture(), "jpeg", quality=90), form="jpeg")
         digests.add(hashlib.sha256((tmp_path / name).read_bytes()).hexdigest())
     assert len(digests) == 1
 
