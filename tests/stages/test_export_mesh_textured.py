@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from pano_mvs.algorithms.fusion.view import FusionView
 from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.pose_groups import join_groups
 from pano_mvs.stages.exports.mesh_textured import TexturedParams, mesh_textured
 from tests.algorithms.mesh.box import HALF, WALL_COLORS, capture, poses
 from tests.stored import read_picture
@@ -116,6 +117,35 @@ def test_formats_and_frame_can_be_chosen(inputs: Inputs, tmp_path: Path) -> None
     picture = cv2.imdecode(np.frombuffer(files["mesh_textured.png"].read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert (vertices[:, 1] > HALF[1] - 0.1).sum() > 3
+
+
+def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -> None:
+    """The box twice, with other names; a third group has too few points for a mesh."""
+    again = {f"again-{name}": name for name in inputs.images}
+    cloud = inputs.cloud
+    arrays = cloud.points_in_world[:5], cloud.normals_in_world[:5], cloud.colors_rgb[:5], cloud.view_counts[:5]
+    few = PointCloud(*arrays)
+    second = replace(inputs.poses, names=tuple(again))
+    third = replace(inputs.poses, names=tuple(f"third-{name}" for name in inputs.images))
+    both = Inputs(
+        PointCloud.of_groups([inputs.cloud, inputs.cloud, few]),
+        inputs.ranges | {name: inputs.ranges[own] for name, own in again.items()},
+        join_groups([inputs.poses, second, third]),
+        inputs.images | {name: inputs.images[own] for name, own in again.items()},
+    )
+    folder = tmp_path / "groups"
+    folder.mkdir()
+    ctx = Context(np.random.default_rng(0), folder)
+    params = TexturedParams.model_validate(SETTINGS | {"formats": ("glb",)})
+    files = mesh_textured(both.cloud, both.ranges, both.poses, both.images, params, ctx).files
+    assert sorted(files) == [
+        "mesh_textured.glb",
+        "mesh_textured_1.glb",
+        "mesh_textured_1_seen.png",
+        "mesh_textured_seen.png",
+    ]
+    assert files["mesh_textured.glb"].read_bytes() == files["mesh_textured_1.glb"].read_bytes()
+    assert ctx.notes[0].startswith("no mesh_textured_2.glb: 5 of 5 points are left")
 
 
 def test_a_missing_extra_is_named(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
