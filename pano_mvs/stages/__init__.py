@@ -9,6 +9,7 @@ from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_in
 from pano_mvs.stages.exports.files import ply, previews, ranges
 from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh
+from pano_mvs.stages.exports.mesh_textured import mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
@@ -66,6 +67,7 @@ __all__ = [
     "localise",
     "median",
     "mesh",
+    "mesh_textured",
     "nearest",
     "nerfstudio",
     "nerfstudio_frames",

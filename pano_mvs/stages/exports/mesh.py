@@ -55,7 +55,7 @@ def mesh(cloud: One[PointCloud], poses: One[Poses] | None, params: MeshParams, c
         folder = ctx.scratch / str(number)
         folder.mkdir()
         try:
-            solved, depth = _solved(group, params, folder)
+            solved, depth = solved_mesh(group, params, folder)
         except InputError as error:
             if not number:
                 raise
@@ -72,8 +72,10 @@ def mesh(cloud: One[PointCloud], poses: One[Poses] | None, params: MeshParams, c
     return Files(files)
 
 
-def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
+def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest: int = 14) -> tuple[Mesh, int]:
     """Return the mesh of one group, and the depth of its octree.
+
+    That is the depth of the settings, or one by point spacing, at most `deepest`.
 
     Raises:
         InputError: if too few points are left, or they have no common surface.
@@ -88,7 +90,7 @@ def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, 
             "are needed. Lower `min_views` or `min_confidence`, or find out why the cloud is empty"
         )
     spacing = float(np.median(point_spacings(points)))
-    depth = params.depth or poisson_depth(points, spacing)
+    depth = params.depth or min(poisson_depth(points, spacing), deepest)
     solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))
     if params.trim:
         solved = trimmed_mesh(solved, points, max_spacings=params.trim)

@@ -1,0 +1,95 @@
+"""Unwrapping of a mesh into charts of a texture, by the package xatlas, and the texels of the charts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.mesh.decimate import EXTRA_REMEDY
+from pano_mvs.core.errors import UsageError
+
+# Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
+PADDING_PX = 4
+_EXPECTED_UTILIZATION = 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Atlas:
+    """A mesh whose vertices have positions in a texture; a vertex on the border of charts occurs once for each.
+
+    Attributes:
+        vertex: (N,) int32 index of the vertex of the mesh at each vertex of the atlas.
+        uv: (N, 2) float32 position in the texture, (0, 0) its upper-left and (1, 1) its lower-right corner.
+        faces: (F, 3) int32 positions in `vertex`; the triangles of the mesh, in its order.
+        size_hw: (height, width) of the texture in texels.
+    """
+
+    vertex: NDArray[np.int32]
+    uv: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    size_hw: tuple[int, int]
+
+    @property
+    def uv_px(self) -> NDArray[np.float64]:
+        """The corners of each triangle in texels, (F, 3, 2), (x, y)."""
+        height, width = self.size_hw
+        return np.ascontiguousarray(self.uv.astype(np.float64)[self.faces] * (width, height))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texels:
+    """The texels in the charts of an atlas.
+
+    Attributes:
+        pixel: (T,) int32 index of each texel in the texture, row by row.
+        triangle: (T,) int32 its triangle.
+        weights: (T, 2) float32 weights of the triangle's second and third corner at the texel's centre.
+    """
+
+    pixel: NDArray[np.int32]
+    triangle: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+
+def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels_per_unit: float, max_px: int) -> Atlas:
+    """Return the charts of a mesh in one texture.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3), at least one.
+        texels_per_unit: resolution of the texture: texels per scene unit.
+        max_px: largest width and height of the texture; it lowers the resolution.
+
+    Raises:
+        UsageError: if xatlas is not installed.
+    """
+    try:
+        xatlas = import_module("xatlas")
+    except ImportError as error:
+        raise UsageError(EXTRA_REMEDY) from error
+    corners = vertices.astype(np.float64)[faces]
+    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+    most = max_px * np.sqrt(_EXPECTED_UTILIZATION / max(area / 2, 1e-30))
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32))
+    options = xatlas.PackOptions()
+    options.padding, options.texels_per_unit = PADDING_PX, float(min(texels_per_unit, most))
+    atlas.generate(pack_options=options)
+    vertex, corners_of_faces, uv = atlas.get_mesh(0)
+    shrink = min(1.0, max_px / max(atlas.width, atlas.height, 1))
+    size_hw = max(1, round(atlas.height * shrink)), max(1, round(atlas.width * shrink))
+    return Atlas(vertex.astype(np.int32), uv.astype(np.float32), corners_of_faces.astype(np.int32), size_hw)
+
+
+def texels_of(atlas: Atlas) -> Texels:
+    """Return the texels whose centres are in a chart."""
+    from pano_mvs.algorithms.mesh.kernels_raster import draw_charts  # compiles on import
+
+    triangle = np.full(atlas.size_hw, -1, np.int32)
+    weights = np.zeros((*atlas.size_hw, 2), np.float32)
+    draw_charts(atlas.uv_px, triangle, weights)
+    pixel = np.flatnonzero(triangle >= 0).astype(np.int32)
+    return Texels(pixel, triangle.ravel()[pixel], weights.reshape(-1, 2)[pixel])

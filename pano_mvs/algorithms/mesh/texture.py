@@ -1,0 +1,238 @@
+"""The texture of a mesh, from panoramas.
+
+Each texel takes its detail from the panorama that sees it best, and its colours at larger scales from all of them by
+weight: two bands of P. J. Burt and E. H. Adelson, "A multiresolution spline with application to image mosaics", ACM TOG
+2(4), 1983, as M. Brown and D. Lowe use them for panoramas (IJCV 74(1), 2007). Exposures are matched before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
+from pano_mvs.algorithms.mesh.fill_texture import fill_unseen, spread_over_gaps, vertex_colors
+from pano_mvs.algorithms.mesh.view_gains import view_gains
+from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality
+from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
+from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.core.bands import for_bands
+from pano_mvs.geometry import pad_panorama
+
+FloatImage = NDArray[np.float32]
+Loader = Callable[[int], PaintView]
+
+# Standard deviation, as a share of a panorama's width, of the Gaussian that separates detail from larger scales.
+_DETAIL_SCALE = 1 / 400
+_FEATHER_SIGMAS = 2.0
+_TEXELS_AT_ONCE = 1 << 13  # of a band; `for_bands` joins 32 of them
+_SAMPLES, _SAMPLE_WIDTH = 20_000, 512
+_LEAST_SHARPNESS = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TexturedMesh:
+    """A mesh with a texture.
+
+    Attributes:
+        vertices_in_world: (V, 3) float32.
+        faces: (F, 3) int32.
+        atlas: positions in the texture.
+        texture: (H, W, 3) uint8 RGB.
+        seen: (H, W) bool, the texels that a panorama sees; the others are filled with colours from around them.
+    """
+
+    vertices_in_world: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    atlas: Atlas
+    texture: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewBalance:
+    """What makes panoramas comparable.
+
+    Attributes:
+        gains: (V, 3) factors of the colour channels.
+        worths: (V,) weight of each panorama by its sharpness, at most 1.
+        density: pixels per scene unit at which the panoramas see the surface, the upper quartile of all triangles at
+            their best.
+    """
+
+    gains: NDArray[np.float64]
+    worths: NDArray[np.float64]
+    density: float
+
+
+class Surface:
+    """A mesh with what its painting needs."""
+
+    def __init__(self, vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        """Prepare the normals."""
+        self.vertices_in_world, self.faces = vertices_in_world, faces
+        self.normals = vertex_normals(vertices_in_world, faces)
+
+    def looks(
+        self, texels: Texels, view: PaintView, *, worth: float, threads: int
+    ) -> Callable[[int, int], tuple[FloatImage, FloatImage, FloatImage]]:
+        """Return a function of a span of texels that returns weight, colour without detail, and detail of each."""
+        from pano_mvs.algorithms.mesh.kernels_texture import look_at_texels  # compiles on import
+
+        size_hw = view.valid.shape[0], view.valid.shape[1]
+        pose = view.cam_from_world
+        ranges = surface_view(self.vertices_in_world, self.faces, pose, size_hw=size_hw, threads=threads).ranges
+        sigma = size_hw[1] * _DETAIL_SCALE
+        quality = pixel_quality(view, ranges, feather_px=_FEATHER_SIGMAS * sigma)
+        smooth = _blurred(view.picture, sigma)
+        mesh = pose.apply(self.vertices_in_world), self.normals @ pose.rotation.T, self.faces
+        # A pixel of a larger panorama covers less of the surface.
+        scaled = (quality * np.float32(worth * size_hw[1] ** 2)).astype(np.float32)
+
+        def look(first: int, end: int) -> tuple[FloatImage, FloatImage, FloatImage]:
+            count = end - first
+            out = np.zeros(count, np.float32), np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+            given = texels.triangle, texels.weights
+            look_at_texels(given, mesh, (ranges, scaled, view.picture, smooth), (first, end), out)
+            return out
+
+        return look
+
+
+def balanced_views(
+    vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32], load: Loader, *, views: int, threads: int = 1
+) -> ViewBalance:
+    """Return the exposures and the sharpness of panoramas, and how densely they see a mesh, from reduced copies.
+
+    Args:
+        vertices_in_world: (V, 3).
+        faces: (F, 3), at least one.
+        load: returns a panorama by its index; they are loaded one at a time.
+        views: number of panoramas.
+        threads: number of threads; the result does not depend on it.
+    """
+    surface = Surface(vertices_in_world, faces)
+    centers = _triangle_centers(len(faces))
+    colors = np.zeros((views, len(centers.triangle), 3), np.float32)
+    weights = np.zeros((views, len(centers.triangle)), np.float32)
+    density, sharp = np.zeros(len(centers.triangle)), np.zeros(views)
+    middles = vertices_in_world[faces[centers.triangle]].mean(axis=1, dtype=np.float64)
+    for idx in range(views):
+        view = load(idx)
+        sharp[idx] = sharpness(view.picture)
+        look = surface.looks(centers, _reduced(view), worth=1.0, threads=threads)
+        weights[idx], base, detail = look(0, len(centers.triangle))
+        colors[idx] = base + detail
+        distance = np.linalg.norm(middles - view.cam_from_world.center, axis=1)
+        pixels = view.picture.shape[1] / (2 * np.pi * np.maximum(distance, 1e-12))
+        density = np.maximum(density, np.where(weights[idx] > 0, pixels, 0))
+    worths = np.clip(sharp / max(float(np.median(sharp)), 1e-12), _LEAST_SHARPNESS, 1.0) if views else sharp
+    seen = density[density > 0]
+    return ViewBalance(view_gains(colors, weights), worths, float(np.quantile(seen, 0.75)) if len(seen) else 0.0)
+
+
+def textured(
+    vertices_in_world: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    atlas: Atlas,
+    *,
+    load: Loader,
+    balance: ViewBalance,
+    threads: int = 1,
+) -> TexturedMesh:
+    """Paint a mesh that was unwrapped.
+
+    Args:
+        vertices_in_world: (V, 3).
+        faces: (F, 3).
+        atlas: of `unwrapped`.
+        load: returns a panorama by its index; they are loaded one at a time.
+        balance: of `balanced_views`.
+        threads: number of threads; the result does not depend on it.
+    """
+    texels = texels_of(atlas)
+    colors, seen = _painted(Surface(vertices_in_world, faces), texels, load, balance=balance, threads=threads)
+    texture, filled, where = np.zeros((*atlas.size_hw, 3), np.uint8), *np.zeros((2, *atlas.size_hw), np.bool_)
+    texture.reshape(-1, 3)[texels.pixel], filled.ravel()[texels.pixel] = colors, True
+    where.ravel()[texels.pixel] = seen
+    del texels, colors
+    return TexturedMesh(vertices_in_world, faces, atlas, spread_over_gaps(texture, filled), where)
+
+
+def _painted(
+    surface: Surface, texels: Texels, load: Loader, *, balance: ViewBalance, threads: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return the colours (T, 3) of all texels, and which of them a panorama sees."""
+    painting = _Painting(len(texels.pixel))
+    for idx, (gain, worth) in enumerate(zip(balance.gains, balance.worths, strict=True)):
+        look = surface.looks(texels, load(idx), worth=float(worth), threads=threads)
+        painting.add(look, gain.astype(np.float32), threads=threads)
+    colors, seen = painting.colors()
+    of_vertices = vertex_colors(colors, seen, texels, faces=surface.faces, vertices=len(surface.vertices_in_world))
+    fill_unseen(colors, seen, texels, faces=surface.faces, of_vertices=of_vertices)
+    np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
+    return colors.astype(np.uint8), seen
+
+
+class _Painting:
+    """The colours of texels, panorama after panorama."""
+
+    def __init__(self, count: int) -> None:
+        self._sums, self._weights = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+        self._best, self._detail = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
+
+    def add(
+        self,
+        look: Callable[[int, int], tuple[FloatImage, FloatImage, FloatImage]],
+        gain: FloatImage,
+        *,
+        threads: int,
+    ) -> None:
+        """Add what one panorama gives."""
+        count = len(self._weights)
+
+        def add_band(first_part: int, parts: int) -> None:
+            first = first_part * _TEXELS_AT_ONCE
+            span = slice(first, min(first + parts * _TEXELS_AT_ONCE, count))
+            weight, base, detail = look(span.start, span.stop)
+            self._sums[span] += weight[:, None] * (base * gain)
+            self._weights[span] += weight
+            better = weight > self._best[span]
+            self._best[span][better] = weight[better]
+            self._detail[span][better] = (detail * gain)[better]
+
+        for_bands(add_band, -(-count // _TEXELS_AT_ONCE), threads=threads)
+
+    def colors(self) -> tuple[FloatImage, NDArray[np.bool_]]:
+        """Return the colours (T, 3), and which texels have one."""
+        seen = self._weights > 0
+        total = np.where(seen, self._weights, np.float32(1))
+        np.divide(self._sums, total[:, None], out=self._sums)
+        self._sums += self._detail
+        return self._sums, seen
+
+
+def _blurred(picture: NDArray[np.uint8], sigma: float) -> FloatImage:
+    margin = min(int(np.ceil(3 * sigma)), len(picture))
+    padded = pad_panorama(picture, margin).astype(np.float32)
+    side = 2 * margin + 1
+    return np.ascontiguousarray(cv2.GaussianBlur(padded, (side, side), sigma)[margin:-margin, margin:-margin])
+
+
+def _triangle_centers(count: int) -> Texels:
+    """Return the centres of evenly spread triangles as if they were texels."""
+    triangle = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).astype(np.int32))
+    return Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
+
+
+def _reduced(view: PaintView) -> PaintView:
+    """Return a panorama of at most 512 columns, without its ranges."""
+    width = min(_SAMPLE_WIDTH, view.picture.shape[1])
+    size = width, width // 2
+    picture = cv2.resize(view.picture, size, interpolation=cv2.INTER_AREA)
+    valid = cv2.resize(view.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) == 1
+    return PaintView(view.cam_from_world, np.asarray(picture, np.uint8), np.asarray(valid))

@@ -1,0 +1,1 @@
+"""Comparison of meshes with panoramas that were not used to make them."""

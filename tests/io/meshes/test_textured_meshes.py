@@ -1,0 +1,85 @@
+"""GLB and OBJ files of textured meshes, as trimesh reads them."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.io.meshes.glb_writer import write_glb
+from pano_mvs.io.meshes.obj_writer import write_mtl, write_obj
+from pano_mvs.io.meshes.picture_data import TextureFormat, encoded_texture
+from pano_mvs.io.meshes.textured_arrays import TexturedArrays
+from tests.algorithms.mesh.box import box
+
+
+def arrays() -> TexturedArrays:
+    vertices, faces, _ = box(2)
+    uv = np.random.default_rng(1).random((len(vertices), 2)).astype(np.float32)
+    return TexturedArrays(vertices, uv, faces)
+
+
+def texture() -> NDArray[np.uint8]:
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:24, :32], picture[:24, 32:], picture[24:] = (250, 10, 10), (10, 250, 10), (10, 10, 250)
+    return picture
+
+
+@pytest.mark.parametrize("form", ["png", "jpeg"])
+def test_another_program_reads_the_glb(tmp_path: Path, form: TextureFormat) -> None:
+    mesh = arrays()
+    write_glb(tmp_path / "a.glb", mesh, encoded_texture(texture(), form, quality=95), form=form)
+    read = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
+    assert isinstance(read, trimesh.Trimesh)
+    np.testing.assert_array_equal(read.vertices.astype(np.float32), mesh.positions)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    visual = read.visual
+    assert isinstance(visual, trimesh.visual.TextureVisuals)
+    np.testing.assert_allclose(visual.uv, np.column_stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]]), atol=1e-6)
+    assert isinstance(visual.material, trimesh.visual.material.PBRMaterial)
+    picture = np.asarray(visual.material.baseColorTexture.convert("RGB"))
+    assert np.abs(picture.astype(int) - texture()).mean() < (4 if form == "jpeg" else 1e-9)
+    assert visual.material.doubleSided
+
+
+def test_the_box_stays_watertight(tmp_path: Path) -> None:
+    """Its walls have their own vertices, at common places."""
+    write_glb(tmp_path / "a.glb", arrays(), encoded_texture(texture(), "png", quality=95), form="png")
+    read = trimesh.load(tmp_path / "a.glb", force="mesh")
+    assert isinstance(read, trimesh.Trimesh)
+    read.merge_vertices(merge_tex=True, merge_norm=True)
+    assert read.is_watertight
+    assert read.is_winding_consistent
+
+
+def test_another_program_reads_the_obj_and_its_files(tmp_path: Path) -> None:
+    mesh = arrays()
+    write_obj(tmp_path / "a.obj", mesh, material_file="a.mtl")
+    write_mtl(tmp_path / "a.mtl", texture_file="a.png")
+    (tmp_path / "a.png").write_bytes(encoded_texture(texture(), "png", quality=95))
+    read = trimesh.load(tmp_path / "a.obj", force="mesh", process=False, maintain_order=True)
+    assert isinstance(read, trimesh.Trimesh)
+    np.testing.assert_allclose(read.vertices, mesh.positions, rtol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    visual = read.visual
+    assert isinstance(visual, trimesh.visual.TextureVisuals)
+    np.testing.assert_allclose(visual.uv, np.column_stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]]), atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(visual.material.image.convert("RGB")), texture())
+
+
+def test_the_bytes_are_the_same_again(tmp_path: Path) -> None:
+    digests = set()
+    for name in ("a.glb", "b.glb"):
+        write_glb(tmp_path / name, arrays(), encoded_texture(texture(), "jpeg", quality=90), form="jpeg")
+        digests.add(hashlib.sha256((tmp_path / name).read_bytes()).hexdigest())
+    assert len(digests) == 1
+
+
+def test_a_texture_too_large_for_its_format_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"a texture of 65600×1 px cannot be written as jpeg"):
+        encoded_texture(np.zeros((1, 65_600, 3), np.uint8), "jpeg", quality=90)
