@@ -1,0 +1,72 @@
+"""Rotations from the world of the poses to the axes that other programs expect: z up or y up.
+
+The world of the poses has y down, as cameras do. CloudCompare, MeshLab, Blender, LAS and nerfstudio have z up; glTF and
+three.js have y up. In a world with y down, both rotations only exchange axes and change signs, so coordinates keep all
+their digits.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pano_mvs.geometry import rotation_from_two_vectors
+from pano_mvs.scene.poses import Poses
+from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+
+FloatArray = NDArray[np.float64]
+
+_Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+_Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+_MAX_SNAP_DEG: Final = 20.0
+_STATES_DOWN: Final = re.compile(r"\by down\b")
+
+
+def world_up(poses: Poses) -> FloatArray:
+    """Return the up direction in the world of poses of one group, (3,), for display.
+
+    It is −y if the frame states that y points down, as `poses.level` writes. Otherwise it is the axis of the world,
+    with its sign, that is nearest to the mean up direction of the cameras, or that mean itself if it is more than 20°
+    from every axis. If the cameras do not agree, it is −y.
+    """
+    mean = None if states_y_down(poses.frame) else mean_up_direction(poses.rotations)
+    if mean is None:
+        return np.array(WORLD_UP)
+    largest = int(np.argmax(np.abs(mean)))
+    axis = np.zeros(3)
+    axis[largest] = np.sign(mean[largest])
+    return axis if float(axis @ mean) >= np.cos(np.deg2rad(_MAX_SNAP_DEG)) else mean
+
+
+def states_y_down(frame: str) -> bool:
+    """Return whether the description of a world frame states that y points down, along gravity."""
+    return _STATES_DOWN.search(frame) is not None
+
+
+def z_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
+    """Return the rotation (3, 3) from the world to axes with z up.
+
+    For `up` = −y, it maps (x, y, z) to (x, z, −y): what lay ahead of the first camera lies along y.
+
+    Args:
+        up: (3,) unit vector, the up direction in the world; see `world_up`.
+    """
+    rotation = np.array(_Z_UP_FROM_Y_DOWN) @ rotation_from_two_vectors(up, WORLD_UP)
+    # An exchange of axes is exact; adding 0 turns −0 into 0.
+    exact = np.round(rotation)
+    return (exact if np.allclose(rotation, exact, rtol=0, atol=1e-12) else rotation) + 0.0
+
+
+def y_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
+    """Return the rotation (3, 3) from the world to axes with y up, as glTF has them.
+
+    For `up` = −y, it maps (x, y, z) to (x, −y, −z). It agrees with `z_up_from_world` in the way in which programs with
+    z up import glTF: (x, y, z) of a file with y up is (x, −z, y) with z up.
+
+    Args:
+        up: (3,) unit vector, the up direction in the world; see `world_up`.
+    """
+    return np.array(_Y_UP_FROM_Z_UP) @ z_up_from_world(up) + 0.0
