@@ -94,6 +94,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> str:
 
 
 def encode_png(image: NDArray[np.uint8]) -> str:
-    """Return an RGBA image as the base64 of a PNG file."""
-    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1]
+    """Return an RGB or RGBA image as the base64 of a PNG file."""
+    swapped = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    data = cv2.imencode(".png", cv2.cvtColor(image, swapped))[1]
     return base64.b64encode(data.tobytes()).decode("ascii")

@@ -13,14 +13,15 @@ from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 FloatArray = NDArray[np.float64]
 
 
-def page_from_world(cameras: Sequence[Rigid3]) -> Rigid3:
+def page_from_world(cameras: Sequence[Rigid3], *, levelled: bool = False) -> Rigid3:
     """Return the transform into the frame of the page.
 
     Args:
-        cameras: the poses, cam_from_world. Up is the cameras' common up direction, or -y of the world if they were
+        cameras: the poses, cam_from_world.
+        levelled: whether up is -y of the world. Otherwise it is the cameras' common up direction, or -y if they were
             turned at random.
     """
-    common = mean_up_direction([camera.rotation for camera in cameras]) if cameras else None
+    common = mean_up_direction([camera.rotation for camera in cameras]) if cameras and not levelled else None
     up = np.array(WORLD_UP) if common is None else common
     ahead = cameras[0].rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     right = np.cross(ahead, up)

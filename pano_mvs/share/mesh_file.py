@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
+from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.up_direction import WORLD_UP
+from pano_mvs.scene.upright import world_up, y_up_from_world
+from pano_mvs.share.glb_file import read_glb
 
-TEXTURED = "mesh_textured/mesh.glb"
+TEXTURED = "mesh_textured.glb"
 COLORED = "mesh.ply"
-
-# glTF has y up and looks along +z; the world of the poses has y down.
-_GLB_FROM_WORLD = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +56,16 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
     Returns:
         The mesh, or None if there is none or it cannot be read; and what the reader of the page should know, or "".
     """
-    found = [name for name in (TEXTURED, COLORED) if _is_current(run, name)]
     notes = []
-    for name in found:
+    for name in (TEXTURED, COLORED):
+        if not is_current(run, name):
+            continue
         try:
-            mesh = _read_glb(run.out / name) if name == TEXTURED else _read_ply(run.out / name)
+            mesh = _textured(run) if name == TEXTURED else _colored(run)
         except InputError as error:
             notes.append(str(error))
-        else:
+            continue
+        if len(mesh.faces):
             return mesh, "; ".join(notes)
     return None, "; ".join(notes)
 
@@ -83,7 +83,7 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
     if mesh.texture is not None or not 0 < max_faces < len(mesh.faces):
         return mesh, ""
     try:
-        import fast_simplification  # type: ignore[import-untyped]
+        import fast_simplification  # type: ignore[import-untyped, unused-ignore]
     except ImportError:
         return mesh, f"all {len(mesh.faces):,} triangles are written; to thin them: pip install 'pano-mvs[mesh]'"
     from scipy.spatial import cKDTree
@@ -94,53 +94,32 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
     return SharedMesh(vertices.astype(np.float32), faces.astype(np.int32), colors), ""
 
 
-def _is_current(run: RunOutput, name: str) -> bool:
+def is_current(run: RunOutput, name: str) -> bool:
+    """Return whether a file is in the output folder and not left over from an earlier run."""
     return is_file(run.out / name) and name not in run.summary.left_over
 
 
-def _read_ply(path: Path) -> SharedMesh:
-    vertices, colors, faces = read_ply_mesh(path)
+def _colored(run: RunOutput) -> SharedMesh:
+    vertices, colors, faces = read_ply_mesh(run.out / COLORED)
     return SharedMesh(vertices, faces, colors_rgb=colors)
 
 
-def _read_glb(path: Path) -> SharedMesh:
-    """Return the mesh of a GLB file with one texture, in the world frame.
-
-    Raises:
-        InputError: if trimesh is not installed, or the file has no textured mesh.
-    """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise InputError(f"{path} was left out: to read it, pip install 'pano-mvs[mesh]'") from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            loaded = trimesh.load_scene(path)
-        parts = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh)]
-    except (ValueError, KeyError, IndexError, OSError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} was left out: not a GLB file that trimesh can read ({error})") from error
-    textured = [part for part in parts if _picture(part) is not None]
-    if len(textured) != 1:
-        raise InputError(f"{path} was left out: it has {len(textured)} textured meshes instead of 1")
-    part: Any = textured[0]
-    world_from_glb = _stated_rotation(loaded.metadata).T
+def _textured(run: RunOutput) -> SharedMesh:
+    made = read_glb(run.out / TEXTURED)
+    poses: Poses | None = split_groups(run.poses)[0] if run.poses is not None else None
+    file_from_world = y_up_from_world(world_up(poses) if poses is not None else WORLD_UP)
+    if _is_in_world(run):
+        file_from_world = np.eye(3)
     return SharedMesh(
-        (np.asarray(part.vertices) @ world_from_glb.T).astype(np.float32),
-        np.asarray(part.faces, np.int32),
-        uv=np.asarray(part.visual.uv, np.float32),
-        texture=_picture(part),
+        (made.positions.astype(np.float64) @ file_from_world).astype(np.float32),
+        made.faces,
+        uv=np.asarray(np.stack([made.uv[:, 0], 1 - made.uv[:, 1]], axis=-1), np.float32),
+        texture=made.texture,
     )
 
 
-def _picture(part: Any) -> NDArray[np.uint8] | None:
-    material = getattr(part.visual, "material", None)
-    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    return np.asarray(picture.convert("RGB"), np.uint8) if picture is not None else None
-
-
-def _stated_rotation(metadata: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return the rotation file_from_world (3, 3) that the file states, or that of a world with y down."""
-    stated: ArrayLike | None = metadata.get("file_from_world")
-    rotation = np.asarray(stated, np.float64).reshape(-1) if stated is not None else _GLB_FROM_WORLD.reshape(-1)
-    return rotation.reshape(3, 3) if rotation.size == 9 else _GLB_FROM_WORLD
+def _is_in_world(run: RunOutput) -> bool:
+    """Return whether the run was asked to write meshes in the frame of the poses instead of upright."""
+    return any(
+        stage.use == "export.mesh_textured" and stage.params.get("frame") == "world" for stage in run.summary.stages
+    )

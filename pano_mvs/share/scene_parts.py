@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,8 +28,9 @@ from pano_mvs.share.mesh_pieces import VertexFacts, mesh_pieces
 from pano_mvs.share.octree import octree
 from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
+from pano_mvs.share.plan_file import StoreyMap
 from pano_mvs.share.tiles import level_count, panorama_tiles
-from pano_mvs.share.top_view import top_view
+from pano_mvs.share.top_view import MapPlace, cut_height, place_around, top_view
 
 RANGES_HW = (256, 512)
 """Size of the range map that the page walks and measures on."""
@@ -115,23 +117,48 @@ def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_qual
     }
 
 
-def put_map(page: PageFolder, shown: ShownCloud, centers: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """Write the pictures from above; return where they are; nothing for an empty cloud."""
+def put_maps(
+    page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], centers: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    """Write the floor plans, or without them the cloud from above; return where they lie.
+
+    Args:
+        page: the page.
+        shown: the cloud, which also gives the coverage.
+        plans: of the storeys; may be empty.
+        centers: (N, 3) of the cameras in the page.
+    """
+    if plans:
+        return [
+            _put_map(page, number, plan.place, encode_png(plan.picture), shown, plan.heights)
+            for number, plan in enumerate(plans)
+        ]
     if not len(shown.cloud):
         return []
-    view = top_view(shown.cloud, centers)
-    page.put("map/0/colors", encode_png(view.colors))
-    if view.coverage is not None:
-        page.put("map/0/coverage", encode_png(view.coverage))
-    return [
-        {
-            "name": "",
-            "page_from_map": [*view.lower, view.upper[0] - view.lower[0], 0, 0, view.upper[1] - view.lower[1]],
-            "aspect": view.colors.shape[1] / view.colors.shape[0],
-            "coverage": view.coverage is not None,
-            "heights": None,
-        }
-    ]
+    place = place_around(shown.cloud.points_in_world, centers)
+    heights = (-np.inf, cut_height(shown.cloud.points_in_world, centers))
+    colors = encode_png(top_view(shown.cloud, place, heights)[0])
+    return [_put_map(page, 0, place, colors, shown, heights)]
+
+
+def _put_map(
+    page: PageFolder,
+    number: int,
+    place: MapPlace,
+    colors: str,
+    shown: ShownCloud,
+    heights: tuple[float, float],
+) -> dict[str, Any]:
+    page.put(f"map/{number}/colors", colors)
+    coverage = top_view(shown.cloud, place, heights)[1] if len(shown.cloud) else None
+    if coverage is not None:
+        page.put(f"map/{number}/coverage", encode_png(coverage))
+    return {
+        "page_from_map": [*place.corner.tolist(), *place.right.tolist(), *place.down.tolist()],
+        "aspect": float(np.linalg.norm(place.right) / np.linalg.norm(place.down)),
+        "coverage": coverage is not None,
+        "heights": list(heights) if np.isfinite(heights).all() else None,
+    }
 
 
 def put_camera(

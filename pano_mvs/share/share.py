@@ -17,11 +17,13 @@ from pano_mvs.results.run_output import RunOutput, RunView
 from pano_mvs.scene import Poses
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.upright import states_y_down
 from pano_mvs.share.frame import page_from_world
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.scene_parts import RANGES_HW, put_camera, put_cloud, put_map, put_mesh, shown_cloud
+from pano_mvs.share.plan_file import run_plans
+from pano_mvs.share.scene_parts import RANGES_HW, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
 
 Progress = Callable[[int, int], None]
 """Receives the number of panoramas that are written, and of all."""
@@ -88,20 +90,22 @@ def share_run(
     if len(run.summary.poses.by_group()) > 1:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
-    frame = page_from_world(cameras)
+    frame = page_from_world(cameras, levelled=poses is not None and states_y_down(poses.frame))
     page = PageFolder(folder)
     title = options.title or resolved(run.out).name
     scene: dict[str, Any] = {"title": title, "unit": "m" if _is_metric(run) else "units", "ranges": list(RANGES_HW)}
     shown = shown_cloud(cloud, frame, max_points=options.max_points)
     scene |= put_cloud(page, shown)
     mesh, note = run_mesh(run)
+    notes.append(note)
     scene["mesh"] = None
     if mesh is not None:
-        mesh, thinning = thinned(mesh, options.max_triangles)
+        mesh, note = thinned(mesh, options.max_triangles)
+        notes.append(note)
         scene["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
-        note = "; ".join(filter(None, (note, thinning)))
-    notes += [note] if note else []
-    scene["maps"] = put_map(page, shown, np.array([frame.apply(camera.center) for camera in cameras]))
+    plans, note = run_plans(run, frame)
+    notes.append(note)
+    scene["maps"] = put_maps(page, shown, plans, np.array([frame.apply(camera.center) for camera in cameras]))
     scene["cameras"] = _put_cameras(page, run, poses, frame, options=options, images=images, progress=progress)
     if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(
@@ -117,7 +121,7 @@ def share_run(
         panoramas=len(cameras) - len(missing),
         triangles=len(mesh.faces) if mesh is not None else 0,
         total_bytes=sum(page.written.values()),
-        notes=tuple(notes),
+        notes=tuple(filter(None, notes)),
     )
 
 
