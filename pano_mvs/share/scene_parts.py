@@ -96,6 +96,7 @@ def put_cloud(page: PageFolder, shown: ShownCloud) -> dict[str, Any]:
         ],
         "bounds": np.percentile(points, [1, 99], axis=0).astype(float).tolist() if len(points) else [],
         "sigmas": [shown.sigmas.low, shown.sigmas.high],
+        "coverage": bool(shown.cloud.view_counts.any()),
     }
 
 

@@ -35,6 +35,6 @@ def large_page(folder: Path, *, panoramas: int, levels: int, present: Sequence[i
         camera = {"name": f"{idx:03}.jpg", "center": center, "page_from_cam": np.diag([1.0, -1.0, -1.0]).tolist()}
         cameras.append({**camera, "levels": levels, "ranges": None, "sigmas": None})
     scene = {"title": "Many", "unit": "m", "cameras": cameras, "ranges": list(RANGES_HW), "nodes": [], "bounds": []}
-    page.put("scene", {**scene, "sigmas": [1, 2], "mesh": None, "maps": []})
+    page.put("scene", {**scene, "sigmas": [1, 2], "coverage": False, "mesh": None, "maps": []})
     page.finish("Many", max_single_file_bytes=0)
     return folder / "index.html"

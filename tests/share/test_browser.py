@@ -254,6 +254,9 @@ def test_everything_can_be_reached_on_small_and_large_windows(browser: Browser, 
     assert figure["bottom"] < min(box["top"] for box in buttons)
     browser.press("l")
     assert browser.evaluate("document.querySelectorAll('#panoramas button').length") == 3
+    browser.press("m")
+    said = browser.evaluate("document.getElementById('measured').getBoundingClientRect().toJSON()")
+    assert figure["bottom"] < said["top"] < said["bottom"] <= min(box["top"] for box in buttons)
 
 
 def test_all_controls_have_names_and_the_theme_can_be_changed(browser: Browser) -> None:
@@ -309,6 +312,22 @@ def test_nothing_but_the_files_of_the_page_can_be_loaded(browser: Browser) -> No
     assert not [name for name in names if not name.startswith(("file:", "data:", "https://example.org/"))]
     assert browser.evaluate("document.cookie + Object.keys(localStorage)") == ""
     assert len(browser.console()) >= 2
+
+
+def test_the_coarser_surface_of_motion_shows_the_same_with_fewer_triangles(browser: Browser) -> None:
+    before = browser.screenshot()
+    whole, coarse = browser.evaluate(
+        """PanoMvs.page.surface.group.children.reduce((sums, { geometry }) => {
+          const corners = coarser(geometry.index.array, geometry.attributes.position.array, 3);
+          const counts = [sums[0] + geometry.index.count, sums[1] + corners.length];
+          geometry.setIndex([...corners]);
+          PanoMvs.page.changed();
+          return counts;
+        }, [0, 0])"""
+    )
+    settle(browser)
+    assert 0 < coarse < 0.6 * whole
+    assert 0 < differing(before, browser.screenshot()) < 0.02
 
 
 def test_a_missing_file_is_named(browser: Browser, page: Path) -> None:

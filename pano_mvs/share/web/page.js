@@ -69,7 +69,7 @@ class Page {
     this.fillList();
     element("inside").disabled = !this.nearest();
     element("surface").hidden = !this.surface || !this.cloud.nodes.size;
-    element("coverage").hidden = !this.cloud.nodes.size;
+    element("coverage").hidden = !this.scene.coverage;
     element("plot").hidden = !this.scene.maps.length;
     this.placeMap();
     narrow.addEventListener("change", () => this.placeMap());
@@ -402,6 +402,7 @@ class Page {
     const smooth = t * t * (3 - 2 * t);
     if (this.mode === "inside" || this.move) this.lookFrom(smooth);
     this.draw(smooth, pace);
+    if (this.settled) this.firstComplete ??= performance.now(); // for measurements
     if (this.move && t >= 1) {
       this.move = null;
       if (this.mode !== "inside") this.enter("inside");

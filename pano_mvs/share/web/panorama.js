@@ -174,7 +174,8 @@ class Panorama {
     const part = (geometry, order, alpha, depthWrite) => {
       const material = new THREE.ShaderMaterial({
         defines: order === 200 ? { DOME: 1 } : {},
-        vertexShader: TILE_VERTEX, fragmentShader: TILE_FRAGMENT, side: THREE.DoubleSide, depthWrite,
+        vertexShader: TILE_VERTEX, fragmentShader: TILE_FRAGMENT, depthWrite,
+        side: alpha.value === TORN ? THREE.DoubleSide : THREE.FrontSide, // surfaces are seen from the side of the centre alone
         uniforms: { map: { value: texture }, ranges: { value: this.rangeTexture }, alpha, ...this.other },
       });
       const mesh = new THREE.Mesh(geometry, material);
@@ -212,7 +213,7 @@ class Panorama {
       for (let x = 0; x < across; x++) {
         const first = y * (across + 1) + x, below = first + across + 1;
         const torn = this.torn[(top + y) * COLUMNS + left + x];
-        (torn ? sheets : whole).push(first, first + 1, below + 1, first, below + 1, below);
+        (torn ? sheets : whole).push(first, below + 1, first + 1, first, below, below + 1);
         if (!torn) continue;
         const corners = [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]];
         const ranges = corners.map(([cx, cy]) => this.cornerRange(left + cx, top + cy));
@@ -221,7 +222,7 @@ class Panorama {
           const own = ranges.filter((range) => range < middle === near);
           const mean = own.reduce((sum, range) => sum + range, 0) / own.length;
           const [a, b, c, d] = corners.map(([cx, cy], i) => add(cx, cy, ranges[i] < middle === near ? ranges[i] : mean, (near ? 1 : -1) * Math.max(0.002, this.step(middle))));
-          whole.push(a, b, c, a, c, d);
+          whole.push(a, c, b, a, d, c);
         }
       }
     }
@@ -249,7 +250,7 @@ class Panorama {
         positions.push(ray.x * this.far, ray.y * this.far, ray.z * this.far);
         places.push(x / across, 1 - y / down);
         const first = y * (across + 1) + x, below = first + across + 1;
-        if (x < across && y < down) corners.push(first, first + 1, below + 1, first, below + 1, below);
+        if (x < across && y < down) corners.push(first, below + 1, first + 1, first, below, below + 1);
       }
     }
     const geometry = new THREE.BufferGeometry();

@@ -88,7 +88,7 @@ class Surface {
       await new Promise((resolve) => setTimeout(resolve));
       const indices = geometry.index.array, places = geometry.attributes.position.array;
       userData.whole = geometry.index;
-      userData.coarse = new THREE.BufferAttribute(coarser(indices, places, geometry.attributes.uv?.array, Math.sqrt(faces / COARSE_FACES)), 1);
+      userData.coarse = new THREE.BufferAttribute(coarser(indices, places, Math.sqrt(faces / COARSE_FACES)), 1);
     }
   }
 
@@ -133,27 +133,39 @@ class Surface {
 
 /** Return triangles with the vertices of one cell of a grid joined into one of them; those that collapse are left out.
  *
- * A cell is `factor` mean edges wide. Vertices that are far from each other in the texture are not joined.
+ * A cell is `factor` mean edges wide. Vertices at open edges stay, where other pieces or other parts of the texture
+ * continue the surface.
  */
-function coarser(indices, places, uv, factor) {
-  let sum = 0, count = 0;
-  for (let i = 0; i + 1 < indices.length; i += 3 * 16) { // a sample
-    const a = 3 * indices[i], b = 3 * indices[i + 1];
-    sum += Math.hypot(places[a] - places[b], places[a + 1] - places[b + 1], places[a + 2] - places[b + 2]);
-    count++;
+function coarser(indices, places, factor) {
+  const open = new Set();
+  let sum = 0;
+  for (let i = 0; i < indices.length; i++) {
+    const a = indices[i], b = indices[i % 3 === 2 ? i - 2 : i + 1], edge = Math.min(a, b) * 65536 + Math.max(a, b);
+    if (!open.delete(edge)) open.add(edge);
+    sum += Math.hypot(places[3 * a] - places[3 * b], places[3 * a + 1] - places[3 * b + 1], places[3 * a + 2] - places[3 * b + 2]);
   }
-  const cell = Math.max(1, (1.1 * factor * sum) / count);
-  const cells = Math.ceil(65536 / cell) + 1, chosen = new Map(), joined = new Uint16Array(places.length / 3);
+  const stays = new Uint8Array(places.length / 3);
+  for (const edge of open) stays[Math.floor(edge / 65536)] = stays[edge % 65536] = 1;
+  const cell = Math.max(1, (1.2 * factor * sum) / indices.length);
+  const cells = Math.ceil(65536 / cell) + 1, chosen = new Map(), joined = new Uint16Array(stays.length);
   for (let i = 0; i < joined.length; i++) {
-    let key = (Math.floor(places[3 * i] / cell) * cells + Math.floor(places[3 * i + 1] / cell)) * cells + Math.floor(places[3 * i + 2] / cell);
-    if (uv) key = key * 4096 + (uv[2 * i] >> 10) * 64 + (uv[2 * i + 1] >> 10);
-    if (!chosen.has(key)) chosen.set(key, i);
-    joined[i] = chosen.get(key);
+    const key = (Math.floor(places[3 * i] / cell) * cells + Math.floor(places[3 * i + 1] / cell)) * cells + Math.floor(places[3 * i + 2] / cell);
+    if (!stays[i] && !chosen.has(key)) chosen.set(key, i);
+    joined[i] = stays[i] ? i : chosen.get(key);
   }
   const kept = [];
   for (let i = 0; i < indices.length; i += 3) {
     const a = joined[indices[i]], b = joined[indices[i + 1]], c = joined[indices[i + 2]];
-    if (a !== b && b !== c && c !== a) kept.push(a, b, c);
+    if (a === b || b === c || c === a) continue;
+    const before = normalOf(places, indices[i], indices[i + 1], indices[i + 2]), after = normalOf(places, a, b, c);
+    if (before[0] * after[0] + before[1] * after[1] + before[2] * after[2] > 0) kept.push(a, b, c); // not turned over
   }
   return new Uint16Array(kept);
+}
+
+/** Return the normal of a triangle, as long as twice its area. */
+function normalOf(places, a, b, c) {
+  const ux = places[3 * b] - places[3 * a], uy = places[3 * b + 1] - places[3 * a + 1], uz = places[3 * b + 2] - places[3 * a + 2];
+  const vx = places[3 * c] - places[3 * a], vy = places[3 * c + 1] - places[3 * a + 1], vz = places[3 * c + 2] - places[3 * a + 2];
+  return [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
 }

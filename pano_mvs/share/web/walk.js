@@ -19,7 +19,7 @@ float weight(vec4 color) { return color.a > 0.9 ? 1.0 : color.a > 0.4 ? 0.12 : c
 void main() {
   vec4 b = texture2D(toColor, place), a = hasFrom ? texture2D(fromColor, place) : vec4(0.0);
   vec4 c = hasScene ? texture2D(sceneColor, place) : vec4(0.0);
-  float weightA = hasFrom ? (1.0 - t) * weight(a) : 0.0, weightB = (hasFrom ? t : 1.0) * weight(b);
+  float weightA = hasFrom ? (1.0 - t) * weight(a) : 0.0, weightB = hasFrom ? t * weight(b) : step(0.9, b.a);
   float weightC = 0.3 * t * (1.0 - t) * step(0.9, c.a); // at most 0.075
   if (min(a.a, b.a) > 0.9) {
     float za = along(texture2D(fromDepth, place).r), zb = along(texture2D(toDepth, place).r);
