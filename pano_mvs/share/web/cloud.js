@@ -41,6 +41,7 @@ class Cloud {
     this.changed = changed;
     this.loading = 0;
     this.sigmas = scene.sigmas;
+    this.bounds = scene.bounds;
     this.nodes = new Map();
     for (const node of scene.nodes) {
       const box = new THREE.Box3(new THREE.Vector3(...node.lower), new THREE.Vector3(...node.lower).addScalar(node.size));
@@ -56,10 +57,11 @@ class Cloud {
     });
   }
 
-  /** Return a typical distance between points: of the root's, spread over the surfaces of its cube. */
+  /** Return twice a typical distance between points, as if they lay on the sides of the box that holds most of them. */
   spacing() {
-    const root = this.nodes.get("r");
-    return root ? 1.6 * Math.sqrt((4 * root.size * root.size) / Math.max(1, Math.min(this.total, POINT_BUDGET))) : 0.01;
+    if (!this.total) return 0.01;
+    const [a, b, c] = [0, 1, 2].map((axis) => this.bounds[1][axis] - this.bounds[0][axis]);
+    return 2 * Math.sqrt((2 * (a * b + b * c + c * a)) / Math.min(this.total, POINT_BUDGET)) || 0.01;
   }
 
   /** Choose the nodes for a camera: nearest and largest first, until the budget is spent; load what is missing.
@@ -97,7 +99,7 @@ class Cloud {
       node.points.visible = true;
       node.points.geometry.setDrawRange(0, Math.ceil(node.count * share));
     }
-    this.material.uniforms.pointSize.value = this.spacing() * share ** -0.25;
+    this.material.uniforms.pointSize.value = this.spacing() * share ** -0.35;
   }
 
   load(node) {

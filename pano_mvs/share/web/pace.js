@@ -6,10 +6,10 @@
 const PACES = [
   { resolution: devicePixelRatio < 1.5 ? 1.5 : 1, points: 1, coarse: false },
   { resolution: 1, points: 0.5, coarse: false },
-  { resolution: 0.75, points: 0.25, coarse: true },
-  { resolution: 0.6, points: 0.12, coarse: true },
-  { resolution: 0.5, points: 0.06, coarse: true },
-  { resolution: 0.4, points: 0.04, coarse: true },
+  { resolution: 0.75, points: 0.3, coarse: true },
+  { resolution: 0.6, points: 0.2, coarse: true },
+  { resolution: 0.5, points: 0.14, coarse: true },
+  { resolution: 0.4, points: 0.09, coarse: true },
 ];
 const SLOW_MS = 31; // a frame that takes longer counts as slow
 const FAST_MS = 19;
