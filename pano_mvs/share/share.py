@@ -14,7 +14,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput, RunView
-from pano_mvs.scene import Poses
+from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import states_y_down
@@ -94,18 +94,10 @@ def share_run(
     page = PageFolder(folder)
     title = options.title or resolved(run.out).name
     scene: dict[str, Any] = {"title": title, "unit": "m" if _is_metric(run) else "units", "ranges": list(RANGES_HW)}
-    shown = shown_cloud(cloud, frame, max_points=options.max_points)
-    scene |= put_cloud(page, shown)
-    mesh, note = run_mesh(run)
-    notes.append(note)
-    scene["mesh"] = None
-    if mesh is not None:
-        mesh, note = thinned(mesh, options.max_triangles)
-        notes.append(note)
-        scene["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
-    plans, note = run_plans(run, frame)
-    notes.append(note)
-    scene["maps"] = put_maps(page, shown, plans, np.array([frame.apply(camera.center) for camera in cameras]))
+    centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
+    geometry, more = _put_geometry(page, run, cloud, frame, centers=centers, options=options)
+    scene |= geometry
+    notes += more
     scene["cameras"] = _put_cameras(page, run, poses, frame, options=options, images=images, progress=progress)
     if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(
@@ -113,16 +105,40 @@ def share_run(
             "with --images DIR"
         )
     page.put("scene", scene)
-    single = page.finish(title, max_single_file_bytes=options.max_single_file_bytes)
     return Shared(
         folder / "index.html",
-        single,
-        points=len(shown.cloud),
+        page.finish(title, max_single_file_bytes=options.max_single_file_bytes),
+        points=sum(node["count"] for node in scene["nodes"]),
         panoramas=len(cameras) - len(missing),
-        triangles=len(mesh.faces) if mesh is not None else 0,
+        triangles=sum(piece["faces"] for piece in scene["mesh"]["pieces"]) if scene["mesh"] else 0,
         total_bytes=sum(page.written.values()),
-        notes=tuple(filter(None, notes)),
+        notes=tuple(notes),
     )
+
+
+def _put_geometry(
+    page: PageFolder,
+    run: RunOutput,
+    cloud: PointCloud | None,
+    frame: Rigid3,
+    *,
+    centers: NDArray[np.float64],
+    options: ShareOptions,
+) -> tuple[dict[str, Any], list[str]]:
+    """Write cloud, mesh and maps; return what the page needs to know of them, and notes."""
+    shown = shown_cloud(cloud, frame, max_points=options.max_points)
+    described = put_cloud(page, shown)
+    mesh, note = run_mesh(run)
+    notes = [note]
+    described["mesh"] = None
+    if mesh is not None:
+        mesh, note = thinned(mesh, options.max_triangles)
+        notes.append(note)
+        described["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
+    plans, note = run_plans(run, frame)
+    notes.append(note)
+    described["maps"] = put_maps(page, shown, plans, centers)
+    return described, [note for note in notes if note]
 
 
 def _is_metric(run: RunOutput) -> bool:

@@ -43,7 +43,7 @@ def wall_range(center: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArra
 
 def wall_color(points: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return the colours of places (..., 3) on the walls, which differ from place to place."""
-    return np.asarray(np.rint(128 + 90 * points / HALF), np.uint8)
+    return np.asarray(np.rint(128 + 90 * np.sin(2 * points)), np.uint8)
 
 
 def box_mesh() -> MeshArrays:
