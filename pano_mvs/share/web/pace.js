@@ -19,6 +19,7 @@ class Pace {
   constructor() {
     this.step = 2; // for motion; corrected from the first frames on
     this.moved = -Infinity;
+    this.drawn = 0; // when the latest frame began
     this.last = 0;
     this.slow = this.fast = 0;
     this.floor = 0; // the step below which this motion was too slow
@@ -33,11 +34,14 @@ class Pace {
     this.moved = now;
   }
 
-  moving(now = performance.now()) { return now - this.moved < REST_MS; }
+  /** Return whether the view moves. What moved during a frame counts, however long the frame took. */
+  moving(now = performance.now()) { return now - this.moved < REST_MS || this.moved > this.drawn; }
 
   /** Return what to draw in a frame that is about to be drawn. */
   frame(now) {
-    if (!this.moving(now)) {
+    const moving = this.moving(now);
+    this.drawn = performance.now();
+    if (!moving) {
       this.last = 0;
       return PACES[0];
     }
