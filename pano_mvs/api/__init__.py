@@ -10,7 +10,6 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """
 
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
 from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
 from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
@@ -36,6 +35,7 @@ from pano_mvs.geometry import (
     roll_panorama,
     sample_panorama,
 )
+from pano_mvs.geometry.geodesy import lla_from_local
 from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
 from pano_mvs.io.clouds.thinning import SelectedPoints as KeptPoints
 from pano_mvs.io.clouds.thinning import Selection as PointSelection
@@ -59,6 +59,7 @@ from pano_mvs.scene import (
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
+from pano_mvs.scene.upright import world_up, y_up_from_world, z_up_from_world
 
 __all__ = [
     "CHUNK_POINTS",
@@ -127,5 +128,8 @@ __all__ = [
     "split_groups",
     "stage",
     "verify_pair",
+    "world_up",
     "write_png",
+    "y_up_from_world",
+    "z_up_from_world",
 ]

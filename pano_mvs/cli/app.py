@@ -31,6 +31,7 @@ from pano_mvs.cli.options import (
     OutOption,
     RefreshOption,
     SetOption,
+    TargetArgument,
     UntilOption,
     WorkflowArgument,
 )
@@ -111,8 +112,12 @@ def run(
     ] = False,
     min_free: MinFreeOption = "",
     durable: DurableOption = False,
+    dry_run: Annotated[
+        bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
+    ] = False,
 ) -> None:
     """Run a workflow; the same command resumes it."""
+    from pano_mvs.cli.plan.command import show_dry_run
     from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.engine.planning.run_options import RunOptions
     from pano_mvs.session.running import Execution
@@ -123,6 +128,9 @@ def run(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
     execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    if dry_run:
+        show_dry_run(session, execution, Console(), as_json=as_json)
+        return
     raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
 
@@ -195,14 +203,36 @@ def schema(
 
 @app.command()
 @guarded
-def status(
-    workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
+def show(
+    workflow: WorkflowArgument,
+    resolved: Annotated[
+        bool,
+        typer.Option("--resolved", help="Merge all files into one workflow, with every setting and its value."),
+    ] = False,
+    images: ImagesOption = None,
+    overrides: SetOption = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
-    """Show what the latest run did and what is cached now."""
-    from pano_mvs.cli.plan.command import show_status
+    """Print a workflow and the files that it extends, or one file with all settings."""
+    from pano_mvs.cli.show_command import show_workflow
     from pano_mvs.session.session import open_session
 
-    show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
+    show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
+
+
+@app.command()
+@guarded
+def status(
+    target: TargetArgument,
+    images: ImagesOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    cache: CacheOption = None,
+) -> None:
+    """Show what the latest run did and what is cached now."""
+    from pano_mvs.cli.plan.status import show_status
+
+    show_status(target, out, overrides=overrides or [], images=images, cache=cache, console=Console())
 
 
 @app.command()
@@ -269,6 +299,37 @@ def view_results(
     view_scene(out, options, Console())
 
 
+@app.command("scale", context_settings={"ignore_unknown_options": True})
+@guarded
+def scale_results(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
+    known: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[A B LENGTH]",
+            help="Two images, or two points x,y,z, and the distance between them, such as 3.42m, 342cm or 11.2ft.",
+        ),
+    ] = None,
+    camera_height: Annotated[
+        str,
+        typer.Option(
+            "--camera-height", metavar="LENGTH", help="Height of the cameras above the floor.", show_default=False
+        ),
+    ] = "",
+    group: Annotated[
+        int, typer.Option("--group", min=0, help="Group of the poses in which points or the height were measured.")
+    ] = 0,
+    cache: CacheOption = None,
+) -> None:
+    """Put a run into metres by a measured length; without one, print what a usual camera height would give."""
+    from pano_mvs.cli.scale_command import scale_output
+
+    code = scale_output(
+        out, tuple(known or ()), camera_height=camera_height, group=group, cache=cache, console=Console()
+    )
+    raise typer.Exit(code)
+
+
 @app.command()
 @guarded
 def share(
@@ -299,12 +360,7 @@ def share(
 @app.command("inspect")
 @guarded
 def inspect_pixel(
-    target: Annotated[
-        str,
-        typer.Argument(
-            metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the output folder of a run."
-        ),
-    ],
+    target: TargetArgument,
     image: Annotated[str, typer.Argument(help="Name of the image, or a unique part of it.")],
     x: Annotated[
         float,
@@ -329,9 +385,10 @@ def inspect_pixel(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Analyse one pixel: its ray, its range after each stage, and its cost for every depth hypothesis."""
-    from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
+    from pano_mvs.cli.inspect.command import PixelWanted, inspect
+    from pano_mvs.session.commands import reopen
 
-    session = open_run(target, overrides=overrides or [], images=images, cache=cache)
+    session = reopen(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)
 
 

@@ -97,7 +97,8 @@ def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
     from pano_mvs.session.session import presets_folder
 
     # After an option without its value, click does not process further arguments.
-    named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)
+    known = ctx.params.get("workflow") or ctx.params.get("target")
+    named = known or next((word for word in ctx.args if not word.startswith("-")), None)
     if not isinstance(named, str):
         return {}
     path, _ = find_workflow(named, presets_folder())

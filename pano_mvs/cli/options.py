@@ -15,6 +15,14 @@ WorkflowArgument = Annotated[
         metavar="WORKFLOW", help="A workflow file or the name of a preset.", autocompletion=complete_workflow
     ),
 ]
+TargetArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="WORKFLOW|OUT",
+        help="A workflow file, the name of a preset, or the output folder of a run.",
+        autocompletion=complete_workflow,
+    ),
+]
 ImagesOption = Annotated[
     Path | None, typer.Option("--images", help="Folder of panoramas; default: that of the workflow.")
 ]

@@ -43,6 +43,30 @@ def shortened_list(names: Iterable[str], count: int = 3) -> str:
     return ", ".join(listed[:count]) + (f" … ({len(listed)} in all)" if len(listed) > count else "")
 
 
+def duration_text(seconds: float) -> str:
+    """Return a duration as text, rounded.
+
+    >>> [duration_text(seconds) for seconds in (0.4, 5, 89, 600, 9000)]
+    ['0.4 s', '5 s', '89 s', '10 min', '2.5 h']
+    """
+    if seconds < 0.95:
+        return f"{seconds:.1f} s"
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def clock_text(seconds: float) -> str:
+    """Return a duration as a clock shows it, so that every second is seen.
+
+    >>> [clock_text(seconds) for seconds in (5, 75.8, 3675)]
+    ['0:05', '1:15', '1:01:15']
+    """
+    minutes, rest_s = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest_s:02d}" if hours else f"{minutes}:{rest_s:02d}"
+
+
 def without_controls(text: str) -> str:
     r"""Return a text with control characters escaped, so that a terminal shows them and does not execute them.
 

@@ -16,6 +16,7 @@ from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores
+from pano_mvs.scene.scores import NO_TRUTH
 
 KEPT = "psnr_db", "w_mae", "w_delta_105", "bad_5", "completeness", "median_relative_error"
 KEPT_OF_CONFIDENCE = "sparsification_area", "sparsification_oracle_area", "ause"
@@ -54,7 +55,7 @@ def score_capture(
         groups: group number of each estimated pose, if the groups have different worlds; None: all share one.
     """
     if len(true_poses) < 2:
-        return Scores({}, {}, ("there is no ground truth for these images",))
+        return Scores({}, {}, (NO_TRUTH,))
     group_of = groups or {}
     notes: list[str] = []
     errors = relative_pose_errors(estimated_poses, true_poses, groups=groups)

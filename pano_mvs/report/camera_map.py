@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.results.figures import significant
-from pano_mvs.results.records import PairLink, PosesSummary
+from pano_mvs.results.records import Direction, PairLink, PosesSummary
+from pano_mvs.scene.upright import states_y_down
 
 FloatArray = NDArray[np.float64]
 
-_WIDTH, _HEIGHT, _SIDE_HEIGHT = 480, 400, 200
-_BORDER = 44
+# In units of the drawing, which is about 310 px wide on a phone and 510 px on a desk. Labels are placed for the phone,
+# where text is larger in these units.
+_WIDTH, _HEIGHT, _SIDE_HEIGHT = 360, 320, 180
+_BORDER = 40
+_LETTER, _LINE = 8.6, 16.0
+_NEAR, _TINY_MAP = 9, 140
 _MAX_LABELS, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
 _ALONG_NORTH = re.compile(r"\bz north\b")
-_DOWN = re.compile(r"\by down\b")
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class CameraMap:
         dots: an SVG path of the cameras if there are too many to name.
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
+        marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
     """
 
     title: str
@@ -67,6 +72,7 @@ class CameraMap:
     bar: tuple[float, float, float, str]
     north: bool = False
     doubtful: tuple[tuple[float, float, str, str], ...] = ()
+    marks: tuple[tuple[float, float, int], ...] = ()
 
     @property
     def radius(self) -> float:
@@ -79,18 +85,27 @@ class CameraMap:
         return sum(link.rejected for link in self.links)
 
 
-def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | None = None) -> tuple[CameraMap, ...]:
+def camera_maps(
+    poses: PosesSummary,
+    reasons: Mapping[tuple[str, str], str] | None = None,
+    *,
+    marks: Sequence[tuple[int, Direction]] = (),
+) -> tuple[CameraMap, ...]:
     """Return the cameras from above and from the side; nothing if no centre is known.
 
     Args:
         poses: of one group of cameras.
         reasons: why pairs have no common geometry, if known.
+        marks: number and position in the world of places to stand, drawn from above. Those outside of the map are drawn
+            at its edge.
     """
     names = list(poses.registered)
     centers = np.array(poses.centers, dtype=np.float64).reshape(-1, 3)
     if not names or len(centers) != len(names) or not np.isfinite(centers).all():
         return ()
-    centers = centers @ rotation_from_two_vectors(up_of(poses), (0, -1, 0)).T
+    level_from_world = rotation_from_two_vectors(up_of(poses), (0, -1, 0))
+    centers = centers @ level_from_world.T
+    places = np.array([place for _, place in marks], np.float64).reshape(-1, 3) @ level_from_world.T
     unit = "m" if poses.metric else "scene units"
     labels = short_names(names)
     links = _chosen(poses.links, names, labels, reasons=reasons or {})
@@ -99,8 +114,11 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
     return tuple(
         _drawn(
             title,
-            np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1),
+            _flat(centers, axes),
             labels,
+            marks=[(number, at) for (number, _), at in zip(marks, _flat(places, axes), strict=True)]
+            if title == "From above"
+            else (),
             links=links,
             doubts=doubts,
             unit=unit,
@@ -111,6 +129,10 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
     )
 
 
+def _flat(points: FloatArray, axes: tuple[tuple[int, float], ...]) -> FloatArray:
+    return np.stack([sign * points[:, axis] for axis, sign in axes], axis=-1)
+
+
 def up_of(poses: PosesSummary) -> FloatArray:
     """Return the up direction in the world, a unit vector (3,).
 
@@ -119,7 +141,7 @@ def up_of(poses: PosesSummary) -> FloatArray:
     """
     up = np.array(poses.up or (0, -1, 0), np.float64)
     usable = np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
-    if not usable or _DOWN.search(poses.frame):
+    if not usable or states_y_down(poses.frame):
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
 
@@ -179,6 +201,7 @@ def _drawn(
     flat: FloatArray,
     labels: list[str],
     *,
+    marks: Sequence[tuple[int, FloatArray]],
     links: list[_Joined],
     doubts: Mapping[int, str],
     unit: str,
@@ -191,8 +214,15 @@ def _drawn(
     if not (high - low).any():
         extent = np.ones(2)
     scale = float(min((_WIDTH - 2 * _BORDER) / extent[0], (tallest - 2 * _BORDER) / extent[1]))
-    height = int(np.clip(extent[1] * scale + 2 * _BORDER, 150, tallest))
-    placed = np.round((flat - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1)
+    height = int(np.clip(extent[1] * scale + 2 * _BORDER, _TINY_MAP, tallest))
+
+    def on_map(points: FloatArray) -> FloatArray:
+        return np.asarray(np.round((points - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1), np.float64)
+
+    placed = on_map(flat)
+    edge = np.array([_WIDTH, height]) - 14.0
+    clipped = [(np.clip(on_map(at), 14.0, edge), number) for number, at in marks]
+    marked = tuple((float(at[0]), float(at[1]), number) for at, number in clipped)
     most = max((link.inliers for link in links), default=1) or 1
     at = [(float(x), float(y)) for x, y in placed]
     lines = tuple(
@@ -201,7 +231,7 @@ def _drawn(
     named = len(labels) <= _MAX_NAMED
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
-    length = _round_length(110 / scale)
+    length = _round_length(100 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
     wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
     cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
@@ -209,7 +239,8 @@ def _drawn(
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)
     text += f", {len(doubts)} of them doubtful" if doubts else ""
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())
-    return CameraMap(title, text, (_WIDTH, height), lines, tuple(cameras if named else ()), dots, bar, north, doubtful)
+    shown = tuple(cameras if named else ())
+    return CameraMap(title, text, (_WIDTH, height), lines, shown, dots, bar, north, doubtful, marked)
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:
@@ -222,8 +253,8 @@ def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, flo
     found: list[tuple[float, float] | None] = []
     taken: list[tuple[float, float, float]] = []
     for (x, y), label in zip(placed, labels, strict=True):
-        wide = 8.4 * len(label)
-        spots = [(float(x) + across, float(y) + down) for across in (9, -9 - wide) for down in (-7, 17, 32)]
+        wide = _LETTER * len(label)
+        spots = [(float(x) + across, float(y) + down) for across in (_NEAR, -_NEAR - wide) for down in (-7, 18, 34)]
         free = (spot for spot in spots if _fits(spot, wide, taken))
         found.append(next(free, None))
         if found[-1] is not None:
@@ -236,7 +267,7 @@ def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float
     left, y = spot
     if left < 2 or left + wide > _WIDTH - 2:
         return False
-    return all(left + wide < other or other + width < left or abs(y - line) >= 15 for other, line, width in taken)
+    return all(left + wide < other or other + width < left or abs(y - line) >= _LINE for other, line, width in taken)
 
 
 def _round_length(longest: float) -> float:

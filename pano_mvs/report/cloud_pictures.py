@@ -120,7 +120,7 @@ def _drawn(
         if images:
             return images, ""
     note = "" if software else "PyVista could not render (no graphics driver), so these images are simpler"
-    return [draw_cloud(*arrays, view, size_hw=_SIZE_HW) for view in seen_from], note
+    return [draw_cloud(*arrays, viewpoint=view, size_hw=_SIZE_HW) for view in seen_from], note
 
 
 def _drawn_apart(arrays: Arrays, seen_from: Sequence[Viewpoint], command: Sequence[str]) -> list[NDArray[np.uint8]]:

@@ -34,12 +34,12 @@ class Shares:
     @property
     def complete(self) -> float:
         """The share of the unmasked sphere that has a range; 0 if all is masked."""
-        return (self.consistent + self.weak + self.filled) / max(1e-9, 1 - self.masked)
+        return min(1.0, (self.consistent + self.weak + self.filled) / max(1e-9, 1 - self.masked))
 
     @property
     def confirmed(self) -> float:
         """The share of the unmasked sphere on which other views agree."""
-        return self.consistent / max(1e-9, 1 - self.masked)
+        return min(1.0, self.consistent / max(1e-9, 1 - self.masked))
 
 
 def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Shares:

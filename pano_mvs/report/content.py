@@ -7,22 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.report.advice import MAX_SUGGESTIONS, advice
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
+from pano_mvs.report.capture_facts import CaptureFacts, capture_facts
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
+from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.report.panorama_table import Row, panorama_rows
-from pano_mvs.report.static_pictures import static_pictures
+from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
+from pano_mvs.report.panorama_rows import Row, panorama_rows
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
-from pano_mvs.results.pictures import Picture
-from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
+from pano_mvs.results.next_time import Suggestion, marks_of
+from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.index import pair_name
+from pano_mvs.scene.pairs_and_views import pair_name
+from pano_mvs.scene.scores import NO_TRUTH
 
 _MAX_REASONS = 300
 
@@ -32,19 +36,23 @@ class Content:
     """The content of the page.
 
     Attributes:
+        capture: what the report is about.
         verdict: the head of the page.
+        advice: what to do next time, the most urgent first.
         groups: the poses of each group of cameras, the largest first.
         maps: the cameras of each group, from above and from the side.
         metric: images whose ranges are in metres.
         rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
         pairs: number of compared pairs.
         cloud: pictures of the cloud.
+        turnable: the cloud for the viewer in the page; None if there is none.
         cards: views shown in full.
         total_views: number of views.
-        static: (image, share, picture) of what moves with each camera.
+        masked: what is masked in the panoramas.
         rows: one for each panorama.
         total_rows: number of panoramas.
         mean_shares: of the sphere, over all measured views.
+        measured_views: number of these.
         residuals: of the points.
         pair_residuals: medians of the pairs' residuals.
         scores: (stage, tables) of each branch with scores.
@@ -53,19 +61,23 @@ class Content:
         facts: figures that the next page may reuse.
     """
 
+    capture: CaptureFacts
     verdict: Verdict
+    advice: tuple[Suggestion, ...]
     groups: tuple[PosesSummary, ...]
     maps: tuple[tuple[CameraMap, ...], ...]
     metric: frozenset[str]
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
     pairs: int
     cloud: CloudPictures
+    turnable: TurnableCloud | None
     cards: tuple[ViewCard, ...]
     total_views: int
-    static: tuple[tuple[str, float, Picture], ...]
+    masked: MaskedAreas
     rows: tuple[Row, ...]
     total_rows: int
     mean_shares: Shares | None
+    measured_views: int
     residuals: Residuals | None
     pair_residuals: Histogram | None
     scores: tuple[tuple[str, Mapping[str, Any]], ...]
@@ -89,27 +101,37 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
     reasons = {(first, second): why for first, second, _, why in rejected_pairs}
     record = values.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
+    chosen = [views[idx] for idx in chosen_views(views, always=poses.doubts)]
+    group_of = {name: number for number, group in enumerate(groups) for name in group.registered}
+    cards = view_cards(out_dir, chosen, values, kept=earlier, groups=group_of)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(
-        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, kept=earlier)
     )
-    scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
+    known = {stage: scored for stage, scored in summary.scores_by_stage.items() if not _without_truth(scored)}
+    scores = tuple((stage, score_tables(scored)) for stage, scored in known.items())
+    total_rows = len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected})
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
+    advised = advice(judged, values, earlier, chosen=[view.name for view in chosen])
+    marked = advised[:MAX_SUGGESTIONS]
     return Content(
+        capture=capture_facts(summary, values, panoramas=total_rows or len(values.refs.get("images", {}))),
         verdict=verdict(judged, residuals=residuals, image_width=_image_width(values)),
+        advice=advised,
         groups=groups,
-        maps=tuple(camera_maps(group, reasons) for group in groups),
+        maps=tuple(camera_maps(group, reasons, marks=marks_of(marked, number)) for number, group in enumerate(groups)),
         metric=frozenset(name for group in groups if group.metric for name in group.registered),
         rejected_pairs=rejected_pairs,
         pairs=len(poses.links),
         cloud=cloud_pictures(values, earlier, up=up_of(poses)),
+        turnable=turnable_cloud(values, groups[0], earlier, up=up_of(poses)),
         cards=cards,
         total_views=len(views),
-        static=static_pictures(values, earlier),
+        masked=masked_areas(values, earlier),
         rows=rows,
-        total_rows=len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected}),
+        total_rows=total_rows,
         mean_shares=_mean(list(shares.values())),
+        measured_views=len(shares),
         residuals=residuals,
         pair_residuals=histogram([link.residual_deg for link in poses.links if link.residual_deg is not None]),
         scores=scores,
@@ -117,6 +139,11 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         notes=tuple(sorted(set(values.notes))),
         facts=earlier.facts,
     )
+
+
+def _without_truth(scores: ScoresSummary) -> bool:
+    """Return whether there is nothing to say but that nobody has a ground truth."""
+    return not scores.poses and not scores.views and set(scores.notes) <= {NO_TRUTH}
 
 
 def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:

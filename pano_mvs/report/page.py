@@ -15,12 +15,15 @@ from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural
+from pano_mvs.report.advice import MAX_SUGGESTIONS
 from pano_mvs.report.content import Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
 from pano_mvs.results.records import Verdict
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+
+_SCRIPTS = ("report.js", "cloud_viewer.js")
 
 MAX_SHOWN = 200
 """Failures, rejected pairs and the like that the page lists; run.json has all of them."""
@@ -55,7 +58,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
     Raises:
         StoreError: if it cannot be written.
     """
-    script = _resource("report.js")
+    scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
     page = (
         _environment()
@@ -67,10 +70,11 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
             longest=max((stage.seconds for stage in summary.stages), default=0) or 1,
             content=content,
             most_shown=MAX_SHOWN,
+            most_advice=MAX_SUGGESTIONS,
             facts=content.facts,
-            script=Markup(script),  # noqa: S704  # ours
+            scripts=[Markup(script) for script in scripts],  # noqa: S704  # ours
             style=Markup(_resource("report.css")),  # noqa: S704  # ours
-            script_digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
+            script_sources=Markup(" ".join(map(_source, scripts))),  # noqa: S704  # digests
         )
     )
     write_text(out_dir / "report.html", page)
@@ -89,11 +93,18 @@ def _environment() -> Environment:
         "share": figures.share,
         "duration": figures.duration,
         "figure": figures.figure,
+        "short": figures.short,
         "words": figures.words,
         "degrees": figures.degrees,
         "plural": plural,
+        "pixels": lambda size_hw: f"{size_hw[1]} × {size_hw[0]} px",
     }
     return environment
+
+
+def _source(script: str) -> str:
+    """Return the expression by which a content security policy allows one inline script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')}'"
 
 
 def _resource(name: str) -> str:

@@ -17,14 +17,14 @@ from pano_mvs.results.stored_values import StoredValues
 
 MAX_THUMBNAILS = 1000
 MAX_MEASURED = 1000
-MAX_BYTES = 9_000
+MAX_BYTES = 6_000
 _WIDTH = 160
 _THREADS = 2
 _VERSION = 2
 
 
 def thumbnails(
-    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, *, kept: EarlierPage
 ) -> dict[str, Picture]:
     """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]

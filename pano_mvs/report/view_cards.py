@@ -13,32 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, scale_ticks
+from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits
+from pano_mvs.report.color_scales import (
+    Limits,
+    RangeScales,
+    Ticks,
+    common_limits,
+    confidence_colors,
+    range_ticks,
+    uncertainty_colors,
+)
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture, preview_panels, resized
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene import RangeMap
 
-VERSION = 3
+VERSION = 4
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 MAX_CARDS = 36
 WIDTH = 768
-MAX_BYTES = 80_000
-_TICKS_APART = 0.09
+MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}
+"""Largest size of each image, before base64 encoding."""
+
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
-# Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
-UNCERTAINTY_LIMITS = 0.001, 0.2
-# Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
-_CLASSES = (
-    (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
-    (WEAK_CONFIDENCE, (200, 130, 20), (245, 180, 60)),
-    (CONSISTENT_CONFIDENCE, (10, 90, 110), (60, 190, 190)),
-)
-_INVALID = (96, 96, 96)
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,22 @@ class ViewCard:
         name: of the image.
         pictures: the available images among `panorama`, `range`, `confidence` and `uncertainty`.
         shares: of the sphere, or None.
-        ticks: (position on the colour scale from 0 to 1, range).
+        ticks: (position on the colour scale from 0 to 1, range); the scale is common to all views of a group.
+        own_range: the range on a scale of this view alone; None if that would look the same.
+        own_ticks: of that scale.
     """
 
     name: str
     pictures: Mapping[str, Picture]
     shares: Shares | None
-    ticks: tuple[tuple[float, float], ...]
+    ticks: Ticks
+    own_range: Picture | None = None
+    own_ticks: Ticks = ()
+
+    @property
+    def has_uncertainty(self) -> bool:
+        """Whether it shows the uncertainty of the ranges."""
+        return "uncertainty" in self.pictures
 
 
 def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always: Collection[str] = ()) -> list[int]:
@@ -73,7 +83,12 @@ def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always:
 
 
 def view_cards(
-    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+    out_dir: Path,
+    views: Sequence[ViewSummary],
+    results: StoredValues,
+    *,
+    kept: EarlierPage,
+    groups: Mapping[str, int] | None = None,
 ) -> tuple[ViewCard, ...]:
     """Return the cards of views, reusing images of an earlier page that show the same values.
 
@@ -82,35 +97,28 @@ def view_cards(
         views: of the run.
         results: the values.
         kept: the earlier page's.
+        groups: number of the group of each image; the views of a group share a colour scale, those of different groups
+            do not, because their units of length differ. None: one group.
     """
-
-    def card(view: ViewSummary) -> ViewCard:
-        name = view.name
-        return _kept_card(results, kept, name) or _new_card(results, kept, name, out_dir=out_dir, preview=view.preview)
-
+    group_of = groups or {}
     with ThreadPoolExecutor(_DECODERS) as pool:
+        own = dict(
+            zip(
+                (view.name for view in views),
+                pool.map(lambda view: _own_limits(results, kept, view.name), views),
+                strict=True,
+            )
+        )
+        common = common_limits(own, group_of)
+
+        def card(view: ViewSummary) -> ViewCard:
+            name = view.name
+            scales = RangeScales(common.get(group_of.get(name, 0), (1.0, 2.0)), own[name])
+            return _kept_card(results, kept, name, scales=scales) or _new_card(
+                results, kept, view, out_dir=out_dir, scales=scales
+            )
+
         return tuple(pool.map(card, views))
-
-
-def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return RGB colours (H, W, 3) of confidences (H, W): a hue per class, brighter if higher; invalid is grey."""
-    table = np.empty((256, 3), np.uint8)
-    table[0] = _INVALID
-    for (low, high), dark, bright in _CLASSES:
-        share = np.linspace(0, 1, high - low + 1)[:, None]
-        table[low : high + 1] = np.rint((1 - share) * np.array(dark) + share * np.array(bright))
-    return table[confidence]
-
-
-def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return relative standard deviations (H, W) in colours (H, W, 3) RGB, from dark to bright; invalid is grey."""
-    low, high = np.log(UNCERTAINTY_LIMITS)
-    known = np.isfinite(uncertainty)
-    share = (np.log(np.where(known, uncertainty, 1).astype(np.float32)) - low) / (high - low)
-    colors = cv2.applyColorMap(np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
-    rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
-    rgb[~known] = _INVALID
-    return rgb
 
 
 def key_of(results: StoredValues, name: str, what: str, *, version: int) -> str:
@@ -123,28 +131,53 @@ def _quality(view: ViewSummary) -> float:
     return (view.completeness or 0.0) + (view.consistent or 0.0)
 
 
-def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard | None:
+def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits | None:
+    """Return the limits of the colour scale of one view, rounded to four digits; None if it has no ranges."""
+    key = key_of(results, name, "l", version=VERSION)
+    fact = kept.fact(key) if key else None
+    if isinstance(fact, list) and len(fact) == 2 and all(isinstance(end, float) and end > 0 for end in fact):
+        return fact[0], fact[1]
+    range_map = results.range_map(name)
+    if range_map is None:
+        return None
+    small = _shrunk(range_map.range)
+    if not np.isfinite(small).any():
+        return None
+    near, far = (float(f"{limit:.4g}") for limit in range_limits(small))
+    kept.keep(key, [near, far])
+    return near, far
+
+
+def _kept_card(results: StoredValues, kept: EarlierPage, name: str, *, scales: RangeScales) -> ViewCard | None:
     stem = key_of(results, name, "v", version=VERSION)
     fact = kept.fact(stem) if stem else None
     parts = fact.get("parts") if isinstance(fact, dict) else None
     if not isinstance(fact, dict) or not isinstance(parts, list):
         return None
-    found = {part: shown for part in parts if (shown := kept.picture(f"{stem}.{part}")) is not None}
-    if len(found) < len(parts):
+    files = {part: scales.range_part if part == "range" else part for part in parts}
+    found = {part: shown for part, file in files.items() if (shown := kept.picture(f"{stem}.{file}")) is not None}
+    own = kept.picture(f"{stem}.own") if scales.differ else None
+    if len(found) < len(parts) or (scales.differ and own is None):
         return None
-    try:
-        ticks = tuple((float(at), float(value)) for at, value in fact["ticks"])
-    except (KeyError, TypeError, ValueError):
-        return None
-    return ViewCard(name, found, shares_from_fact(fact.get("shares")), ticks)
+    return _card(name, found, shares_from_fact(fact.get("shares")), scales=scales, own_range=own)
 
 
-def _new_card(results: StoredValues, kept: EarlierPage, name: str, *, out_dir: Path, preview: str) -> ViewCard:
+def _card(
+    name: str, pictures: Mapping[str, Picture], shares: Shares | None, *, scales: RangeScales, own_range: Picture | None
+) -> ViewCard:
+    ticks = range_ticks(*scales.common) if scales.own else ()
+    own_ticks = range_ticks(*scales.own) if scales.own and own_range else ()
+    return ViewCard(name, pictures, shares, ticks, own_range, own_ticks)
+
+
+def _new_card(
+    results: StoredValues, kept: EarlierPage, view: ViewSummary, *, out_dir: Path, scales: RangeScales
+) -> ViewCard:
+    name = view.name
     range_map, panorama = results.range_map(name), results.panorama(name)
     stem = key_of(results, name, "v", version=VERSION)
     pictures: dict[str, Picture] = {}
-    shares, mask = None, None
-    ticks: tuple[tuple[float, float], ...] = ()
+    shares, mask, own_range = None, None, None
     if panorama is not None:
         try:
             pictures["panorama"] = _part(panorama.load(), stem, "panorama")
@@ -152,43 +185,47 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, *, out_dir: P
         except InputError as error:
             results.notes.append(str(error))
     if range_map is not None:
-        small = _shrunk(range_map.range)
-        near, far = range_limits(small)
-        confidence = _shrunk(range_map.confidence)
-        pictures["range"] = _part(mark_unconfirmed(color_mapped(small, near, far), confidence), stem, "range")
-        pictures["confidence"] = _part(confidence_colors(confidence), stem, "confidence")
-        if range_map.uncertainty is not None:
-            colors = uncertainty_colors(_shrunk(range_map.uncertainty.astype(np.float32)))
-            pictures["uncertainty"] = _part(colors, stem, "uncertainty")
-        fits = mask is not None and mask.shape == range_map.range.shape
-        kept_pixels = mask if fits else None
-        if range_map.sky is not None:
-            kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
-        shares = shares_of(range_map.confidence, kept_pixels)
-        ticks = _ticks(near, far)
+        ranges, own_range = _range_pictures(range_map, stem, scales)
+        pictures |= ranges
+        shares = _shares(range_map, mask)
     if stem and all(part in pictures for part in _PARTS):  # a missing image may be available for the next page
-        fact = {"ticks": ticks, "shares": fact_of(shares) if shares else None, "parts": list(pictures)}
-        kept.keep(stem, fact)
-    panels = () if all(part in pictures for part in _PARTS) else preview_panels(out_dir, preview)
+        kept.keep(stem, {"shares": fact_of(shares) if shares else None, "parts": list(pictures)})
+    panels = () if all(part in pictures for part in _PARTS) else preview_panels(out_dir, view.preview)
     for part, panel in zip(_PARTS, panels, strict=False):
         pictures.setdefault(part, _part(panel, "", part))
-    return ViewCard(
-        name, {part: pictures[part] for part in (*_PARTS, "uncertainty") if part in pictures}, shares, ticks
-    )
+    in_order = {part: pictures[part] for part in (*_PARTS, "uncertainty") if part in pictures}
+    return _card(name, in_order, shares, scales=scales, own_range=own_range)
 
 
-def _ticks(near: float, far: float) -> tuple[tuple[float, float], ...]:
-    """Return the ticks of the scale of a range map, spaced so that no two labels overlap."""
-    found: list[tuple[float, float]] = []
-    for value in scale_ticks(near, far):
-        at = round(float(np.log(value / near) / np.log(far / near)), 4)
-        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= _TICKS_APART):
-            found.append((at, value))
-    return tuple(found)
+def _range_pictures(range_map: RangeMap, stem: str, scales: RangeScales) -> tuple[dict[str, Picture], Picture | None]:
+    """Return the images of a range map, and its range on its own scale if that differs."""
+    ranges, confidence = _shrunk(range_map.range), _shrunk(range_map.confidence)
+
+    def colored(limits: Limits) -> NDArray[np.uint8]:
+        return mark_unconfirmed(color_mapped(ranges, *limits), confidence)
+
+    pictures = {
+        "range": _part(colored(scales.common), stem, "range", file=scales.range_part),
+        "confidence": _part(confidence_colors(confidence), stem, "confidence"),
+    }
+    if range_map.uncertainty is not None:
+        colors = uncertainty_colors(_shrunk(range_map.uncertainty.astype(np.float32)))
+        pictures["uncertainty"] = _part(colors, stem, "uncertainty")
+    differs = scales.own is not None and scales.differ
+    own = _part(colored(scales.own), stem, "own_range", file="own") if differs and scales.own else None
+    return pictures, own
 
 
-def _part(image: NDArray[np.uint8], stem: str, part: str) -> Picture:
-    return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MAX_BYTES, key=f"{stem}.{part}" if stem else "")
+def _shares(range_map: RangeMap, mask: NDArray[np.bool_] | None) -> Shares:
+    kept_pixels = mask if mask is not None and mask.shape == range_map.range.shape else None
+    if range_map.sky is not None:
+        kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
+    return shares_of(range_map.confidence, kept_pixels)
+
+
+def _part(image: NDArray[np.uint8], stem: str, part: str, *, file: str = "") -> Picture:
+    key = f"{stem}.{file or part}" if stem else ""
+    return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MAX_BYTES[part], key=key)
 
 
 def _shrunk(array: NDArray[Any]) -> NDArray[Any]:

@@ -70,6 +70,18 @@ def significant(value: float, digits: int = 2) -> str:
     return f"{value:z.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:z.{digits}g}"
 
 
+def short(count: int) -> str:
+    """Return a count in at most five characters, for an axis.
+
+    >>> [short(count) for count in (0, 950, 1500, 20_000, 2_500_000)]
+    ['0', '950', '1.5 k', '20 k', '2.5 M']
+    """
+    for size, letter in ((1_000_000, "M"), (1000, "k")):
+        if count >= size:
+            return f"{count / size:.3g} {letter}"
+    return str(count)
+
+
 def figure(value: Any) -> str:
     """Return a value with four significant digits and thousands separators."""
     if isinstance(value, bool) or value is None:

@@ -170,6 +170,8 @@ class PoseGroup(Entry):
         metric: whether lengths are in metres.
         points: number of triangulated points.
         up: mean of the cameras' up directions in the world, a unit vector; None if they do not agree.
+        z_up_from_world: rotation from the world to the axes of exports with `frame: upright`, by rows.
+        camera_height: median height of the cameras above the floor of the cloud, scene units; None if unknown.
         nearest_pair: of a smaller group, the pair that nearly joins it to the largest; None if none was compared.
     """
 
@@ -179,6 +181,8 @@ class PoseGroup(Entry):
     metric: bool = False
     points: int | None = None
     up: Direction | None = None
+    z_up_from_world: tuple[Direction, ...] = ()
+    camera_height: float | None = None
     nearest_pair: NearestPair | None = None
 
 

@@ -16,6 +16,7 @@ FloatArray = NDArray[np.float64]
 _MAX_OBSERVATIONS = 2_000_000
 _BLOCK = 250_000
 _BINS = 30
+_MAX_TICKS = 5
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,15 @@ class Histogram:
     def median_at(self) -> float:
         """Where the median lies between 0 and the end of the scale, as a share."""
         return min(1.0, self.median_deg / self.upper_deg)
+
+    @property
+    def count_ticks(self) -> tuple[int, ...]:
+        """Round counts for an axis: from 0 to at least the largest count, in three to six steps or in steps of 1."""
+        largest = max(1, *self.counts)
+        power = 10 ** (len(str(largest)) - 1)
+        steps = [step for step in (power // 5, power // 2, power, 2 * power) if step] or [1]
+        step = next(step for step in (*steps, 5 * power) if -(-largest // step) <= _MAX_TICKS)
+        return tuple(range(0, step * -(-largest // step) + 1, step))
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,11 @@ class StoredValues:
         """Return the final range map of a view."""
         return self._load("ranges", name, RangeMap)
 
+    def ranges(self, name: str) -> NDArray[np.float32] | None:
+        """Return the ranges (H, W) of the final range map of a view, without reading the rest of it."""
+        part = self._part("ranges", name, "range")
+        return part if isinstance(part, np.ndarray) else None
+
     def confidence(self, name: str) -> NDArray[np.uint8] | None:
         """Return the confidence (H, W) of the final range map of a view, without reading the rest of it."""
         part = self._part("ranges", name, "confidence")

@@ -4,7 +4,7 @@ from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features
 from pano_mvs.scene.files import Files
 from pano_mvs.scene.global_descriptor import GlobalDescriptor
-from pano_mvs.scene.index import Pairs, Views
+from pano_mvs.scene.pairs_and_views import Pairs, Views
 from pano_mvs.scene.panorama import Panorama
 from pano_mvs.scene.poses import Pose, Poses
 from pano_mvs.scene.range_map import RangeMap

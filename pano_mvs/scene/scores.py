@@ -7,6 +7,9 @@ from typing import Any, ClassVar
 
 from pano_mvs.scene.record import Axis, Record
 
+NO_TRUTH = "there is no ground truth for these images"
+"""The note of scores without figures if the truth of no image is known."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scores(Record):

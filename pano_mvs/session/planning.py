@@ -10,8 +10,12 @@ from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors.choose import shape
+from pano_mvs.engine.planning.forecast import StageForecast, forecast, makespan
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.planning.source_listing import SourceListing
+from pano_mvs.session.forecasting import expected_report_s
 from pano_mvs.session.python_errors import names_arguments
 from pano_mvs.session.session import Session, check_output, open_session
 from pano_mvs.session.settings import overrides_from_settings
@@ -19,13 +23,19 @@ from pano_mvs.session.settings import overrides_from_settings
 
 @dataclass(frozen=True, slots=True)
 class RunPlan:
-    """What a run would compute.
+    """What a run would compute, and what that is expected to take.
 
     Attributes:
         stages: in the order of the workflow.
+        forecasts: what each stage is expected to take, by earlier runs with this cache.
+        workers: number of units at a time for which `seconds` holds.
+        report_s: expected seconds for the report; 0 if unknown.
     """
 
     stages: tuple[StagePlan, ...]
+    forecasts: tuple[StageForecast, ...] = ()
+    workers: int = 1
+    report_s: float = 0.0
 
     def __getitem__(self, stage: str) -> StagePlan:
         """Return the plan of one stage.
@@ -39,6 +49,24 @@ class RunPlan:
     def units(self) -> int:
         """Number of units that would be computed for certain."""
         return sum(len(plan.run) for plan in self.stages)
+
+    @property
+    def seconds(self) -> float:
+        """Expected time of the run, without the stages in `unknown`."""
+        known = {one.stage: one.seconds or 0.0 for one in self.forecasts}
+        at_a_time = {one.stage: one.units or 1 for one in self.forecasts}
+        after = {one.stage: one.after for one in self.forecasts}
+        return makespan(known, at_a_time, after, workers=self.workers) + self.report_s
+
+    @property
+    def stored_bytes(self) -> float:
+        """Expected size of the results in the cache, without the stages in `unknown`."""
+        return sum(one.stored_bytes or 0.0 for one in self.forecasts)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """The stages that no earlier run with this cache has computed, so that nothing is known of their time."""
+        return tuple(one.stage for one in self.forecasts if one.seconds is None)
 
     @property
     def may_follow(self) -> bool:
@@ -81,15 +109,25 @@ def plan(
     return plan_session(session)
 
 
-def plan_session(session: Session) -> RunPlan:
-    """Return what the run of an open session would compute."""
+def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> RunPlan:
+    """Return what the run of an open session would compute.
+
+    Args:
+        session: the session.
+        workers: number of units at a time, for the estimate; 0 for the default.
+        threads: of each worker; 0 for the default.
+    """
     store = Store(session.store_root, for_reading=True)
     workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
+    listing = SourceListing()
     with without_collector():
-        plans = make_plan(workflow, graph, store, options=session.run_options)
+        plans = make_plan(workflow, graph, store, options=session.run_options, listing=listing)
     with suppress(StoreError):  # a cache of other users can be read, not written
         store.stat_cache.save()
-    return RunPlan(tuple(plans))
+    workers, threads = shape(workers, threads)
+    size, histories = listing.size(), (store.unit_times,)
+    forecasts = forecast(plans, workflow, graph, size=size, histories=histories, threads=threads)
+    return RunPlan(tuple(plans), forecasts, workers, expected_report_s(forecasts, size, histories))
 
 
 @contextmanager

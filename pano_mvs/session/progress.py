@@ -1,8 +1,8 @@
 """Events of a run, as typed records for a callback.
 
-A run reports `RunStarted`, then events of its stages and units, then `RunFinished`, which is always the last. Stages
-overlap. If a damaged file is found in the cache, the run starts over: `StageStarted` is repeated for every stage, and
-earlier counts no longer apply.
+A run reports `RunStarted` and `Forecast`, then events of its stages and units, and now and then `TimeLeft`, then
+`RunFinished`, which is always the last. Stages overlap. If a damaged file is found in the cache, the run starts over:
+`StageStarted` is repeated for every stage, and earlier counts no longer apply.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
+from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.engine.running.events import UnitStatus
 from pano_mvs.results.records import Verdict
 
 
@@ -36,6 +37,41 @@ class RunStarted:
     workers: int
     threads: int
     out: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What the run is expected to take, by earlier runs; this event is missing if the images cannot be listed.
+
+    Attributes:
+        stages: in the order of the workflow.
+        report_s: seconds for the report, after the last stage.
+    """
+
+    kind: ClassVar[str] = "forecast"
+    stages: tuple[StageForecast, ...]
+    report_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TimeLeft:
+    """How long the run is expected to go on. This event comes at most once a second, and only together with others.
+
+    Units that take minutes give no events except, every five seconds, this one; executor `serial` not even that. To
+    show the time left at any moment, pass all events to a `pano_mvs.session.time_estimator.TimeEstimator`, and ask it.
+
+    Attributes:
+        seconds_left: until the run ends.
+        at_least: whether this is a lower bound, because nothing is known of some stages yet.
+        done: share of the work that is done, 0 to 1.
+        unknown: the stages of which nothing is known.
+    """
+
+    kind: ClassVar[str] = "time_left"
+    seconds_left: float
+    at_least: bool = False
+    done: float = 0.0
+    unknown: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +137,7 @@ class StageFinished:
         cached: taken from the cache.
         failed: without a result.
         blocked: not run, because an input failed.
-        seconds: from the start of its first unit to the end of its last.
+        seconds: time during which at least one of its units was being computed.
         unit_seconds: sum over its computed units.
         metrics: mean over its units of each figure that the stage reports.
     """
@@ -157,43 +193,20 @@ class RunFinished:
     doubts: Mapping[str, str] = field(default_factory=dict)
 
 
-Event = RunStarted | StageStarted | UnitStarted | UnitFailed | UnitFinished | StageFinished | Warned | RunFinished
+Event = (
+    RunStarted
+    | Forecast
+    | StageStarted
+    | UnitStarted
+    | UnitFailed
+    | UnitFinished
+    | StageFinished
+    | TimeLeft
+    | Warned
+    | RunFinished
+)
 Progress = Callable[[Event], None]
 
 
 def ignore(_event: Event) -> None:
     """Do nothing with an event."""
-
-
-class EventObserver:
-    """An observer of the engine's run that passes everything on as events."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-
-    def stage_started(self, name: str, units: int) -> None:
-        """Pass the event on."""
-        self._progress(StageStarted(name, units))
-
-    def unit_started(self, name: str, item: str) -> None:
-        """Pass the event on."""
-        self._progress(UnitStarted(name, item))
-
-    def unit_failed(self, failure: Failure) -> None:
-        """Pass the event on."""
-        names = ("stage", "item", "cause", "consequence", "log", "said")
-        self._progress(UnitFailed(**{name: getattr(failure, name) for name in names}))
-
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        """Pass the event on."""
-        self._progress(UnitFinished(name, item, status, round(seconds, 6)))
-
-    def stage_finished(self, summary: StageSummary) -> None:
-        """Pass the event on."""
-        counts = {name: getattr(summary, name) for name in ("use", "units", "run", "cached", "failed", "blocked")}
-        times = {name: round(getattr(summary, name), 6) for name in ("seconds", "unit_seconds")}
-        self._progress(StageFinished(stage=summary.name, **counts, **times, metrics=dict(summary.metrics)))
-
-    def warn(self, text: str) -> None:
-        """Pass the event on."""
-        self._progress(Warned(text))

@@ -21,6 +21,8 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.forecasting import forecast_run, remember_report
+from pano_mvs.session.observer import EventObserver
 from pano_mvs.session.outputs import (
     INTERRUPTED,
     earlier_files,
@@ -28,7 +30,7 @@ from pano_mvs.session.outputs import (
     write_outputs,
     write_outputs_after_error,
 )
-from pano_mvs.session.progress import EventObserver, Progress, RunFinished, RunStarted, ignore
+from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
 from pano_mvs.session.python_errors import names_arguments
 from pano_mvs.session.session import Session, check_output, open_session
 from pano_mvs.session.settings import overrides_from_settings
@@ -144,7 +146,8 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
 def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
     """Run, and report the first and the last event."""
     clock = time.perf_counter()
-    progress(
+    observer = EventObserver(progress)
+    observer.report(
         RunStarted(
             workflow=session.workflow.name,
             stages=tuple(session.graph.order),
@@ -156,7 +159,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
     try:
-        output = _run_locked(session, store, executor, progress=progress)
+        output = _run_locked(session, store, executor, observer=observer)
         end = _finished(output.summary, end)
         return output
     except PanoMvsError as error:
@@ -169,7 +172,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
-def _run_locked(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
+def _run_locked(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> RunOutput:
     """Run while no other run writes into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
     run = Run(
@@ -177,11 +180,13 @@ def _run_locked(session: Session, store: Store, executor: Executor, *, progress:
         session.graph,
         store,
         out=session.out,
-        observer=EventObserver(progress),
+        observer=observer,
         executor=executor,
         options=session.run_options,
     )
     with output_lock(session.out):
+        if (forecast := forecast_run(run)) is not None:
+            observer.report(forecast)
         summary, values = _execute(run, started, clock)
     return RunOutput(session.out, summary, values, written=tuple(run.result.written))
 
@@ -197,7 +202,10 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
             write_outputs_after_error(run, error, started=started, clock=clock)
             raise
         try:
-            return write_outputs(run, started=started, clock=clock)
+            began = time.perf_counter()
+            outputs = write_outputs(run, started=started, clock=clock)
+            remember_report(run, time.perf_counter() - began)
+            return outputs
         except DamagedBlobError as error:  # it has been removed, so another round computes it
             repairs += 1
             if repairs > _MAX_REPAIRS:

@@ -74,17 +74,25 @@ def open_session(
         raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
     workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
-    variable = os.environ.get(CACHE_VARIABLE)
-    beside = resolved(Path()) if is_preset else path.parent
-    root = Path(cache or variable or beside / ".pano-mvs")
-    session = Session(workflow, graph, registry, root, Path(out or Path("out") / workflow.name), run_options)
+    root = Path(cache) if cache else default_cache(path, is_preset=is_preset)
+    session = Session(workflow, graph, registry, root, Path(out or default_out(workflow.name)), run_options)
     if name := _reader_of(root, session):
-        option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
+        option = "--cache" if cache or not os.environ.get(CACHE_VARIABLE) else f"${CACHE_VARIABLE}"
         raise UsageError(
             f"{option} {root}: stage {name!r} reads this folder, and the cache's files would be "
             "among its own. Choose another folder"
         )
     return session
+
+
+def default_cache(workflow: Path, *, is_preset: bool) -> Path:
+    """Return the cache of a workflow file: $PANO_MVS_CACHE, or `.pano-mvs` beside it, or for presets here."""
+    return Path(os.environ.get(CACHE_VARIABLE) or (resolved(Path()) if is_preset else workflow.parent) / ".pano-mvs")
+
+
+def default_out(workflow_name: str) -> Path:
+    """Return the output folder of a workflow: `out/NAME` in the current folder."""
+    return Path("out") / workflow_name
 
 
 def check_output(session: Session) -> None:

@@ -12,6 +12,9 @@ from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import pano_mvs
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
@@ -38,6 +41,8 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.up_direction import mean_up_direction
+from pano_mvs.scene.upright import world_up, z_up_from_world
+from pano_mvs.session.camera_height import camera_height, height_note
 from pano_mvs.session.final_stages import chain_of, final_stages, latest
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
@@ -55,9 +60,12 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
     scores = _scores(run)
     blocked = tuple(_blocked(failure) for failure in result.failures if failure.blocked)
     results = final_stages(run)
+    poses = _poses(run, blocked)
     return RunSummary(
         workflow=WorkflowSummary(
-            name=workflow.name, path=str(workflow.path or ""), overrides=tuple(workflow.overrides)
+            name=workflow.name,
+            path=str(resolved(workflow.path)) if workflow.path is not None else "",
+            overrides=tuple(workflow.overrides),
         ),
         cache=str(resolved(run.store.root)),
         version=pano_mvs.__version__,
@@ -74,9 +82,9 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         rejected=_reasons(result.rejected),
         doubts=_reasons(result.doubts),
         warnings=tuple(result.warnings),
-        notes=tuple(note for summary in result.stages for note in summary.notes),
+        notes=(*(note for summary in result.stages for note in summary.notes), *_scale_notes(poses)),
         results=results,
-        poses=_poses(run, blocked),
+        poses=poses,
         scores=next(iter(scores.values()), ScoresSummary()),
         all_scores=scores if len(scores) > 1 else {},
         views=_views(run, results.get("ranges", "")),
@@ -138,6 +146,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
             images = run.states[stage.name].members
             links = tuple(_link(images[pair], metrics) for pair, metrics in stage.unit_metrics.items())
     groups = split_groups(poses)
+    heights = _camera_heights(groups, latest(run, PointCloud))
     return PosesSummary(
         registered=tuple(poses.names),
         blocked=blocked,
@@ -158,6 +167,8 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
                 metric=group.metric,
                 points=len(group.points_in_world),
                 up=_up(group),
+                z_up_from_world=_rows(z_up_from_world(world_up(group))),
+                camera_height=heights.get(number),
                 nearest_pair=nearest_pair(groups[0].names, group.names, links) if number else None,
             )
             for number, group in enumerate(groups)
@@ -221,6 +232,23 @@ def _up(poses: Poses) -> Direction | None:
         return None
     x, y, z = (round(float(value), 6) for value in up)
     return x, y, z
+
+
+def _camera_heights(groups: Sequence[Poses], cloud: PointCloud | None) -> dict[int, float]:
+    """Return the height of the cameras above the floor, by group, where it is known."""
+    clouds = [] if cloud is None else cloud.groups()
+    found = {number: camera_height(*pair) for number, pair in enumerate(zip(groups, clouds, strict=False))}
+    return {number: float(f"{height:.4g}") for number, height in found.items() if height is not None}
+
+
+def _scale_notes(poses: PosesSummary) -> tuple[str, ...]:
+    """Return what to say about the unit of the largest group: nothing if it is the metre or no floor is known."""
+    height = poses.groups[0].camera_height if poses.groups else None
+    return () if height is None or poses.metric else (height_note(height),)
+
+
+def _rows(matrix: NDArray[np.float64]) -> tuple[Direction, ...]:
+    return tuple((float(x), float(y), float(z)) for x, y, z in matrix)
 
 
 def _scores(run: Run) -> dict[str, ScoresSummary]:

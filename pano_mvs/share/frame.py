@@ -13,15 +13,15 @@ from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 FloatArray = NDArray[np.float64]
 
 
-def page_from_world(cameras: Sequence[Rigid3], *, levelled: bool = False) -> Rigid3:
+def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:
     """Return the transform into the frame of the page.
 
     Args:
-        cameras: the poses, cam_from_world.
-        levelled: whether up is -y of the world. Otherwise it is the cameras' common up direction, or -y if they were
+        cameras: the poses, cam_from_world. Up is the cameras' common up direction, or -y of the world if they were
             turned at random.
+        is_level: whether y of the world points down along gravity, so that -y is up whatever the cameras say.
     """
-    common = mean_up_direction([camera.rotation for camera in cameras]) if cameras and not levelled else None
+    common = mean_up_direction([camera.rotation for camera in cameras]) if cameras and not is_level else None
     up = np.array(WORLD_UP) if common is None else common
     ahead = cameras[0].rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     right = np.cross(ahead, up)

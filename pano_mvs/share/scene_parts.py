@@ -119,7 +119,7 @@ def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_qual
 
 
 def put_maps(
-    page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], centers: NDArray[np.float64]
+    page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], *, centers: NDArray[np.float64]
 ) -> list[dict[str, Any]]:
     """Write the floor plans, or without them the cloud from above; return where they lie.
 
@@ -131,7 +131,7 @@ def put_maps(
     """
     if plans:
         return [
-            _put_map(page, number, plan.place, encode_png(plan.picture), shown, plan.heights)
+            _put_map(page, number, plan.place, colors=encode_png(plan.picture), shown=shown, heights=plan.heights)
             for number, plan in enumerate(plans)
         ]
     if not len(shown.cloud):
@@ -139,13 +139,14 @@ def put_maps(
     place = place_around(shown.cloud.points_in_world, centers)
     heights = (-np.inf, cut_height(shown.cloud.points_in_world, centers))
     colors = encode_png(top_view(shown.cloud, place, heights)[0])
-    return [_put_map(page, 0, place, colors, shown, heights)]
+    return [_put_map(page, 0, place, colors=colors, shown=shown, heights=heights)]
 
 
 def _put_map(
     page: PageFolder,
     number: int,
     place: MapPlace,
+    *,
     colors: str,
     shown: ShownCloud,
     heights: tuple[float, float],

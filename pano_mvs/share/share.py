@@ -90,15 +90,15 @@ def share_run(
     if len(run.summary.poses.by_group()) > 1:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
-    frame = page_from_world(cameras, levelled=poses is not None and states_y_down(poses.frame))
+    frame = page_from_world(cameras, is_level=states_y_down(run.summary.poses.by_group()[0].frame))
     page = PageFolder(folder)
     title = options.title or resolved(run.out).name
     scene: dict[str, Any] = {"title": title, "unit": "m" if _is_metric(run) else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
-    geometry, more = _put_geometry(page, run, cloud, frame, centers=centers, options=options)
+    geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
     scene |= geometry
     notes += more
-    scene["cameras"] = _put_cameras(page, run, poses, frame, options=options, images=images, progress=progress)
+    scene["cameras"] = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
     if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(
             f"{len(missing)} of {len(cameras)} panoramas could not be read, such as {missing[0]}; give their folder "
@@ -120,8 +120,8 @@ def _put_geometry(
     page: PageFolder,
     run: RunOutput,
     cloud: PointCloud | None,
-    frame: Rigid3,
     *,
+    frame: Rigid3,
     centers: NDArray[np.float64],
     options: ShareOptions,
 ) -> tuple[dict[str, Any], list[str]]:
@@ -137,7 +137,7 @@ def _put_geometry(
         described["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
     plans, note = run_plans(run, frame)
     notes.append(note)
-    described["maps"] = put_maps(page, shown, plans, centers)
+    described["maps"] = put_maps(page, shown, plans, centers=centers)
     return described, [note for note in notes if note]
 
 
@@ -149,8 +149,8 @@ def _put_cameras(
     page: PageFolder,
     run: RunOutput,
     poses: Poses | None,
-    frame: Rigid3,
     *,
+    frame: Rigid3,
     options: ShareOptions,
     images: Path | None,
     progress: Progress | None,

@@ -7,8 +7,10 @@ from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.files import ply, previews, ranges
+from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
+from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -19,17 +21,19 @@ from pano_mvs.stages.filters import (
     guided,
     median,
     planes,
+    scale_ranges,
     speckle,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.fusion import vote
-from pano_mvs.stages.masks import apply, color, static
+from pano_mvs.stages.fusion import scale_cloud, vote
+from pano_mvs.stages.masks import apply, color, operator, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
+from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
@@ -53,16 +57,19 @@ __all__ = [
     "exhaustive",
     "extend",
     "fill",
+    "floor_plan",
     "folder",
     "from_model",
     "gaussian",
     "guided",
     "level",
+    "localise",
     "median",
     "mesh",
     "nearest",
     "nerfstudio",
     "nerfstudio_frames",
+    "operator",
     "orb_tangent",
     "patchmatch",
     "planes",
@@ -73,12 +80,16 @@ __all__ = [
     "refine",
     "retrieval",
     "scale",
+    "scale_cloud",
+    "scale_ranges",
     "scaled_translation",
     "sequential",
     "sift_tangent",
     "sky",
     "speckle",
     "sphorb",
+    "splat_bundle",
+    "splat_frames",
     "static",
     "surface",
     "sweep",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Literal
 
 import numpy as np
@@ -116,12 +116,27 @@ def consistency(
         range_map,
         pose.cam_from_world,
         sources,
-        [other.cam_from_world for other in source_poses],
+        source_poses=[other.cam_from_world for other in source_poses],
         **settings,
     )
     for name, value in asdict(agreement).items():
         ctx.metric(name, value)
     return _measured(checked, ctx)
+
+
+class ScaleRangesParams(Params):
+    """Settings of filters.scale."""
+
+    factor: float = Field(default=1.0, gt=0, description="new units per unit of the range map, such as metres")
+    group: int = Field(default=0, ge=0, description="group of the poses whose views are scaled; 0 is the largest")
+
+
+@stage("filters.scale", memory=bytes_per_pixel(30))
+def scale_ranges(range_map: Each[RangeMap], pose: Each[Pose], params: ScaleRangesParams, ctx: Context) -> RangeMap:
+    """Multiply all ranges by a factor, for results whose scale is known only afterwards; see `pano-mvs scale`."""
+    if pose.group != params.group:
+        return _measured(range_map, ctx)
+    return _measured(replace(range_map, range=range_map.range * np.float32(params.factor)), ctx)
 
 
 @params_from(fast_bilateral_solver)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, find_vertical
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
 from pano_mvs.io.images.names import match_image_names
@@ -26,25 +28,38 @@ class LevelParams(Params):
     """Settings of poses.level."""
 
 
-@stage("poses.level")
+def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for the views of one panorama, whose decoding the engine counts."""
+    pixels = max(
+        (height * width for height, width in (image.size_hw for image in inputs["images"].values())), default=0
+    )
+    return 100_000_000 + 12 * pixels
+
+
+@stage("poses.level", memory=one_panorama_bytes)
 def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Context) -> Poses:
     """Rotate the world so that y points down along gravity, and z north if compass headings agree.
 
-    The origin is the first registered camera; the unit of length does not change. If the vertical cannot be determined,
-    the poses do not change and the report states why. Each group of poses is levelled on its own.
+    The origin is the first registered camera; the unit of length does not change. The frame states the evidence and its
+    uncertainty. If the vertical cannot be determined, or not well enough, the poses do not change and the report states
+    why. Each group of poses is levelled on its own.
     """
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
     for number, group in enumerate(groups):
-        level_group, vertical = level_poses(group, _up_in_cam(images), headings, **arguments_from(level_poses, params))
+        level_group, vertical = level_poses(
+            group, _up_in_cam(images), headings, pictures=_pictures(images), **arguments_from(level_poses, params)
+        )
         levelled.append(level_group)
         which = f"group {number}: " if len(groups) > 1 else ""
         if not vertical:
             ctx.note(f"{which}the world was not levelled: {vertical.reason}")
         else:
-            ctx.note(f"{which}levelled by {vertical.evidence}")
-            if np.isfinite(vertical.disagreement_deg) and not number:
-                ctx.metric("disagreement_deg", vertical.disagreement_deg)
+            ctx.note(f"{which}levelled by {vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°")
+            if not number:
+                ctx.metric("uncertainty_deg", vertical.uncertainty_deg)
+                if np.isfinite(vertical.disagreement_deg):
+                    ctx.metric("disagreement_deg", vertical.disagreement_deg)
     return join_groups(levelled, order=poses.names, rejected=poses.rejected)
 
 
@@ -69,6 +84,8 @@ class ScaleParams(Params):
     )
     gps: bool = Field(default=False, description="scale by the GPS positions in the images' metadata")
     factor: float | None = Field(default=None, gt=0, description="metres per unit of the poses")
+    group: int = Field(default=0, ge=0, description="group of the poses that `factor` applies to; 0 is the largest")
+    origin: str = Field(default="", description="where `factor` comes from, for run.json and the report")
     align: Literal["keep", "gps"] = Field(
         default="keep", description="gps also rotates the world: x east, y down, z north"
     )
@@ -90,7 +107,7 @@ class ScaleParams(Params):
         return self
 
 
-@stage("poses.scale")
+@stage("poses.scale", memory=one_panorama_bytes)
 def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Context) -> Poses:
     """Scale poses to metres by a known length.
 
@@ -113,8 +130,12 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
             poses, groups, [chosen or 0], scaled=lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx=ctx
         )
     if params.factor is not None:
-        origin, factor = f"the given factor {params.factor:g}", params.factor
-        return _scaled(poses, groups, [0], scaled=lambda group: scaled_poses(group, factor, origin=origin), ctx=ctx)
+        origin, factor = params.origin or f"the given factor {params.factor:g}", params.factor
+        if params.group >= len(groups):
+            raise InputError(f"group {params.group}: the poses have {len(groups)} groups, numbered from 0")
+        return _scaled(
+            poses, groups, [params.group], scaled=lambda group: scaled_poses(group, factor, origin=origin), ctx=ctx
+        )
     every = list(range(len(groups)))
     if params.camera_height_m is not None:
         return _scaled(poses, groups, every, scaled=lambda group: _by_camera_height(group, images, params), ctx=ctx)
@@ -215,7 +236,7 @@ def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, *, ctx: Co
 def _up(poses: Poses, images: All[Panorama], evidence: Literal[Evidence, "world"]) -> NDArray[np.float64]:
     if evidence == "world":
         return _UP_OF_WORLD
-    vertical = find_vertical(poses, _up_in_cam(images), evidence=evidence)
+    vertical = find_vertical(poses, _up_in_cam(images), _pictures(images), evidence=evidence)
     if not vertical:
         raise InputError(f"the vertical is not known: {vertical.reason}. Level the poses and set vertical: world")
     return vertical.up_in_world
@@ -223,3 +244,12 @@ def _up(poses: Poses, images: All[Panorama], evidence: Literal[Evidence, "world"
 
 def _up_in_cam(images: All[Panorama]) -> dict[str, tuple[float, float, float]]:
     return {name: image.up_in_cam for name, image in images.items() if image.up_in_cam is not None}
+
+
+def _pictures(images: All[Panorama]) -> dict[str, Picture]:
+    """Return functions that load the panoramas, since most of them may not be needed."""
+    return {name: partial(_picture, image) for name, image in images.items()}
+
+
+def _picture(image: Panorama) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    return image.load(), image.load_mask()

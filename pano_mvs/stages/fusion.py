@@ -4,11 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
 
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, RangeMap, params_from, settings_from, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    One,
+    Panorama,
+    Params,
+    PointCloud,
+    Pose,
+    RangeMap,
+    params_from,
+    settings_from,
+    stage,
+)
 
 
 @params_from(FusionSettings)
@@ -42,6 +58,30 @@ def vote(
     cloud = PointCloud.of_groups(clouds)
     ctx.metric("points", len(cloud))
     return cloud
+
+
+class ScaleCloudParams(Params):
+    """Settings of fusion.scale."""
+
+    factor: float = Field(default=1.0, gt=0, description="new units per unit of the cloud, such as metres")
+    group: int = Field(default=0, ge=0, description="group of the poses whose points are scaled; 0 is the largest")
+
+
+def cloud_memory_bytes(_: ScaleCloudParams, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for a copy of the cloud."""
+    return 100_000_000 + 100 * len(inputs["cloud"])
+
+
+@stage("fusion.scale", memory=cloud_memory_bytes)
+def scale_cloud(cloud: One[PointCloud], params: ScaleCloudParams, ctx: Context) -> PointCloud:
+    """Multiply all positions by a factor, for results whose scale is known only afterwards; see `pano-mvs scale`."""
+    clouds = cloud.groups()
+    if params.group < len(clouds):
+        chosen, factor = clouds[params.group], np.float32(params.factor)
+        uncertainty = None if chosen.uncertainty is None else chosen.uncertainty * factor
+        clouds[params.group] = replace(chosen, points_in_world=chosen.points_in_world * factor, uncertainty=uncertainty)
+    ctx.metric("points", len(cloud))
+    return PointCloud.of_groups(clouds)
 
 
 def _fused(

@@ -8,7 +8,8 @@ from pydantic import Field
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.one_color import areas_of_color
-from pano_mvs.algorithms.masks.static import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
+from pano_mvs.algorithms.masks.people import people
+from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, arguments_from, params_from, stage
 from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
 
@@ -70,6 +71,27 @@ def apply(image: Each[Panorama], static_masks: One[StaticMasks] | None, ctx: Con
     pixels = None if static_masks is None else static_masks.of(image)
     ctx.metric("masked", 0.0 if pixels is None else float(pixels.mean()))
     return image if pixels is None or not pixels.any() else image.with_mask(~pixels, ctx.scratch)
+
+
+@params_from(people, own_last=True)
+class OperatorParams(Params):
+    """Settings of masks.operator."""
+
+    enabled: bool = Field(default=True, description="false masks nothing")
+
+
+@stage("masks.operator", memory="250MB")
+def operator(image: Each[Panorama], params: OperatorParams, ctx: Context) -> Panorama:
+    """Mask people: the operator beside or below the camera, what they hold in front of them, and passers-by.
+
+    People are found in each image by itself, by neural networks that run on the CPU. The image should be upright to
+    within 20°.
+    """
+    if not params.enabled:
+        return image
+    found = people(image.load(), **arguments_from(people, params))
+    ctx.metric("masked", share_of_sphere(found))
+    return image.with_mask(~found, ctx.scratch) if found.any() else image
 
 
 def _static_content(panoramas: list[Panorama], params: StaticParams) -> StaticContent:

@@ -90,7 +90,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
-        ctx.note(f"some images have {trait}")
+        ctx.note(f"{{count}} images have {trait}")
     _check_pixels(path, data, info, max_pixels=params.max_pixels)
     del data
     panorama = Panorama(

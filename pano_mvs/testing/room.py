@@ -111,7 +111,7 @@ def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArr
     return _first_hit(room, origin_in_world, rays_in_world)[0]
 
 
-def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tuple[int, int]) -> None:
+def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, size_hw: tuple[int, int]) -> None:
     """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
 
     `pano_mvs.evaluation.inputs.truth.read_truth` reads the ground truth: poses are cam_from_world, ranges are float32

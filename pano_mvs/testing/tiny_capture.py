@@ -32,6 +32,7 @@ from pano_mvs.scene import (
 )
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.static_masks import StaticMasks, camera_of
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
@@ -122,6 +123,7 @@ class TinyCapture:
             TrackedPoints: self._tracked_points(),
             StaticMasks: self._static_masks(),
             Scores: Scores({"registered": 1.0}, {}),
+            Photographs: self._photographs(),
         }
 
     def each(self, kind: type[Frozen]) -> dict[Any, Frozen]:
@@ -260,6 +262,22 @@ class TinyCapture:
                 track_point_idx=poses.track_point_idx,
                 track_image_idx=poses.track_image_idx,
                 track_bearings=poses.track_bearings,
+            )
+        )
+
+    def _photographs(self) -> Photographs:
+        """Return a photograph that was taken from the place of the first image."""
+        pose = self.poses[0]
+        return frozen(
+            Photographs(
+                names=("phone/1.jpg",),
+                sizes_hw=np.array([[30, 40]], np.int32),
+                focals_px=np.array([35.0]),
+                radials=np.array([-0.05]),
+                rotations=pose.rotation[None].copy(),
+                translations=pose.translation[None].copy(),
+                inliers=np.array([50], np.int32),
+                errors_px=np.array([0.5], np.float32),
             )
         )
 

@@ -67,12 +67,13 @@ def drawn_cloud(cloud: PlyPoints, *, budget: int = POINT_BUDGET) -> DrawnCloud:
         jitter = np.random.default_rng(0).random(budget)
         chosen = np.minimum(((np.arange(budget) + jitter) * (count / budget)).astype(np.intp), count - 1)
     vertices = np.array(cloud.vertices[chosen])
-    points = np.stack([vertices[name].astype(np.float32) for name in "xyz"], axis=-1)
+    points = cloud.in_world(np.stack([vertices[name].astype(np.float32) for name in "xyz"], axis=-1))
     finite = np.isfinite(points).all(axis=-1)
     vertices, points = vertices[finite], points[finite]
     normals = None
     if set(_NORMALS) <= set(vertices.dtype.names or ()):
-        normals = np.nan_to_num(np.stack([vertices[name].astype(np.float32) for name in _NORMALS], axis=-1))
+        in_file = np.stack([vertices[name].astype(np.float32) for name in _NORMALS], axis=-1)
+        normals = cloud.in_world(np.nan_to_num(in_file))
     return DrawnCloud(points, normals, vertices, count)
 
 

@@ -255,6 +255,8 @@ class Tour:
         self.state = replace(self.state, picked=picked)
         distance = self.distance
         said = "click the second point" if distance is None else length_text(distance, self.scene.unit)
+        if distance is not None and self.scene.unit != "m":
+            said += f" from {_place_text(picked[0])} to {_place_text(picked[1])}"
         self.state = replace(self.state, message=said)
 
     def _camera_called(self, name: str) -> int:
@@ -264,3 +266,8 @@ class Tour:
             shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
             raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
         return names.index(matched[name])
+
+
+def _place_text(point: FloatArray) -> str:
+    """Return coordinates as `pano-mvs scale` takes them."""
+    return ",".join(f"{value:z.4g}" for value in point)

@@ -20,6 +20,7 @@ from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+from pano_mvs.scene.upright import states_y_down
 
 FloatArray = NDArray[np.float64]
 
@@ -123,7 +124,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         mesh=mesh_file,
         cameras=cameras,
         unit="m" if chosen.metric else "scene units",
-        **dict(zip(("up", "ahead"), _frame(cameras), strict=True)),
+        **dict(zip(("up", "ahead"), _frame(cameras, is_level=states_y_down(chosen.frame)), strict=True)),
         notes=tuple(notes),
     )
 
@@ -228,9 +229,9 @@ def _map_of(folder: Path, kind: str, name: str, *, suffix: str) -> Path | None:
     return next((path for path in candidates if is_file(path)), None)
 
 
-def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return the directions up and ahead: those of the cameras if they agree, else −y and z."""
-    common_up = mean_up_direction([camera.cam_from_world.rotation for camera in cameras])
+def _frame(cameras: tuple[ShownCamera, ...], *, is_level: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return the directions up and ahead: −y in a level world or if the cameras disagree, else that of the cameras."""
+    common_up = None if is_level else mean_up_direction([camera.cam_from_world.rotation for camera in cameras])
     up = np.array(WORLD_UP) if common_up is None else common_up
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     ahead = ahead - up * float(ahead @ up)

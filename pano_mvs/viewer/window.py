@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural
+from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.viewer.cloud_actor import CloudActor
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour, TourState
@@ -132,6 +133,7 @@ class SceneWindow:
         self._mesh: Any = None
         if self.tour.scene.mesh is not None:
             mesh = pyvista.read(self.tour.scene.mesh)
+            mesh.points = open_ply_points(self.tour.scene.mesh).in_world(np.asarray(mesh.points, np.float32))
             colored = "RGB" in mesh.array_names
             self._mesh = self.plotter.add_mesh(
                 mesh,

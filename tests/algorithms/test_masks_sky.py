@@ -171,7 +171,7 @@ def test_walls_disagree_at_infinity_and_agree_at_their_range() -> None:
         pictures[0],
         ranges[0],
         pictures[1],
-        np.ones(SIZE_HW, np.bool_),
+        source_valid=np.ones(SIZE_HW, np.bool_),
         source_from_reference=poses[1] @ poses[0].inverse(),
     )
     at_infinity, at_range = errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison])
@@ -185,7 +185,7 @@ def test_masked_sources_say_nothing(blue: Views) -> None:
         pictures[0],
         ranges[0],
         pictures[1],
-        np.zeros(SIZE_HW, np.bool_),
+        source_valid=np.zeros(SIZE_HW, np.bool_),
         source_from_reference=poses[1] @ poses[0].inverse(),
     )
     assert errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison]) == (float("inf"), float("inf"))

@@ -56,7 +56,7 @@ def refined(
 ) -> RangeMap:
     pictures, _, poses = views
     relative = [pose @ poses[0].inverse() for pose in poses[1:]]
-    return refine_range(range_map, pictures[0], pictures[1:], relative, **settings)
+    return refine_range(range_map, pictures[0], pictures[1:], source_from_reference=relative, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -276,13 +276,13 @@ def test_impossible_settings_are_named(
 def test_impossible_pictures_are_named(views: Views, swept: RangeMap) -> None:
     pictures, _, poses = views
     with pytest.raises(UsageError, match="one pose"):
-        refine_range(swept, pictures[0], pictures[1:], poses[1:2])
+        refine_range(swept, pictures[0], pictures[1:], source_from_reference=poses[1:2])
     with pytest.raises(UsageError, match="size of its range map"):
-        refine_range(swept, pictures[0][:80], pictures[1:], poses[1:])
+        refine_range(swept, pictures[0][:80], pictures[1:], source_from_reference=poses[1:])
     with pytest.raises(UsageError, match=r"source 0: refinement needs \(H, W, 3\) uint8"):
-        refine_range(swept, pictures[0], [pictures[1][..., 0]], poses[1:2])
+        refine_range(swept, pictures[0], [pictures[1][..., 0]], source_from_reference=poses[1:2])
     with pytest.raises(UsageError, match="same place"):
-        refine_range(swept, pictures[0], pictures[1:2], [Rigid3.identity()])
+        refine_range(swept, pictures[0], pictures[1:2], source_from_reference=[Rigid3.identity()])
 
 
 def test_planes_that_meet_their_rays_far_beyond_what_was_swept_are_not_believed() -> None:

@@ -110,7 +110,7 @@ def test_refinement_begins_at_the_reduced_size_and_keeps_what_has_no_range() -> 
         )
         for count in (0, 1)
     ]
-    plain = refine_range(given, pictures[0], pictures[1:], poses, source_masks=masks, rounds=2)
+    plain = refine_range(given, pictures[0], pictures[1:], source_from_reference=poses, source_masks=masks, rounds=2)
     np.testing.assert_array_equal(found[0].range, plain.range)
     assert not np.array_equal(found[1].range, plain.range)
     for one in found:

@@ -36,7 +36,7 @@ Command = Callable[..., Outcome]
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four rendered panoramas of the synthetic room with their truth; not to be changed."""
     folder = tmp_path_factory.mktemp("rendered")
-    write_capture(folder, default_room(), capture_poses(4, spread=0.4), SIZE_HW)
+    write_capture(folder, default_room(), capture_poses(4, spread=0.4), size_hw=SIZE_HW)
     return folder
 
 

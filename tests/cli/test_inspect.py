@@ -48,7 +48,7 @@ def inspected(*arguments: object) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inspected")
-    write_capture(folder / "capture", default_room(), capture_poses(3, spread=0.4), SIZE_HW)
+    write_capture(folder / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=SIZE_HW)
     (folder / "wf.yaml").write_text(WORKFLOW)
     poses = json.loads((folder / "capture" / "truth" / "poses.json").read_text())
     for view in poses["views"]:  # scene units of two metres

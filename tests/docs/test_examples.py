@@ -30,12 +30,14 @@ PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
+    "phone",
     "photos/lobby",
     "photos/flat",
     "photos/site",
     "masks",
     "out/site/colmap/sparse/0",
     "colmap/sparse/0",
+    "lobby/colmap/sparse/0",
     "truth",
     "videos",
 )

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from pano_mvs import api
+from pano_mvs.api import Context, RunStoppedError, TwoView
 from pano_mvs.cli.app import app
 from pano_mvs.cli.plugins.new import KINDS, rendered
 from pano_mvs.engine.stages.plugin_files import declared_names
 from pano_mvs.scene import Record
+from pano_mvs.testing.conformance import stage_contract_tests
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
 PAGE = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
 PLUGINS = {
@@ -52,6 +59,66 @@ def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_test_on_the_page_is_what_is_written() -> None:
     lines = block("test").splitlines()
     assert set(lines) <= set(rendered("filter", "any")[1].splitlines())
+
+
+@pytest.fixture
+def solver(tmp_path: Path) -> Path:
+    path = tmp_path / "directions.py"
+    path.write_text(block("solver"), encoding="utf-8")
+    return path
+
+
+def test_the_pose_solver_keeps_the_contract_and_finds_the_cameras(solver: Path) -> None:
+    """The pairs of the tiny capture are exact, and so are the poses, except for the world frame and the scale."""
+    for contract_test in stage_contract_tests(solver):
+        contract_test.check()
+    names: dict[str, Any] = {"__name__": "directions"}
+    exec(solver.read_text(encoding="utf-8").replace("@stage(", "@(lambda name: lambda function: function)("), names)
+    capture = tiny_capture(Variant((32, 64)))
+    pairs = dict(capture.items[TwoView])
+    ctx = Context(np.random.default_rng(0), solver.parent)
+    poses = names["directions"](list(capture.names), pairs, names["DirectionsParams"](), ctx)
+    assert poses.names == capture.names
+    first = capture.poses[0]
+    unit = np.linalg.norm(capture.poses[1].center - first.center)
+    for idx, truth in enumerate(capture.poses):
+        expected = truth @ first.inverse()
+        np.testing.assert_allclose(poses.rotations[idx], expected.rotation, atol=1e-9)
+        np.testing.assert_allclose(poses.translations[idx], expected.translation / unit, atol=1e-9)
+
+
+def test_the_pose_solver_names_images_without_pairs_and_refuses_a_line(solver: Path) -> None:
+    names: dict[str, Any] = {"__name__": "directions"}
+    exec(solver.read_text(encoding="utf-8").replace("@stage(", "@(lambda name: lambda function: function)("), names)
+    capture = tiny_capture(Variant((32, 64)))
+    params, ctx = names["DirectionsParams"](), Context(np.random.default_rng(0), solver.parent)
+    pairs = {pair: found for pair, found in capture.items[TwoView].items() if capture.names[-1] not in pair}
+    poses = names["directions"](list(capture.names), pairs, params, ctx)
+    assert list(poses.rejected) == [capture.names[-1]]
+    with pytest.raises(RunStoppedError, match="no pair has enough matches"):
+        names["directions"](list(capture.names), {}, params, ctx)
+    chain = dict(list(pairs.items())[:1])
+    chain[capture.names[1], capture.names[2]] = capture.items[TwoView][capture.names[1], capture.names[2]]
+    with pytest.raises(RunStoppedError, match="do not determine the positions"):
+        names["directions"](list(capture.names), chain, params, ctx)
+
+
+@pytest.mark.slow
+def test_the_pose_solver_runs_in_its_workflow(solver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = re.search(r"```yaml\n(pano_mvs: 1\nplugins: \[directions.py\]\n.*?)```", PAGE, re.DOTALL)
+    assert found
+    (tmp_path / "mine.yaml").write_text(found[1])
+    write_capture(tmp_path / "room", default_room(), capture_poses(4, spread=0.4), size_hw=(160, 320))
+    (tmp_path / "room" / "images").rename(tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
+    result = CliRunner().invoke(app, ["run", "mine.yaml", "--set", "depth.planes=16"])
+    assert result.exit_code == 0, result.output
+    scored = CliRunner().invoke(app, ["evaluate", "poses", "out/mine", "--truth", "room/truth", "--json"])
+    assert scored.exit_code == 0, scored.output
+    scores = json.loads(scored.output)
+    assert scores["registered"] == 4
+    assert scores["pair_deg_all"]["median"] < 0.5
 
 
 def test_the_kinds_on_the_page_are_those_of_the_api() -> None:

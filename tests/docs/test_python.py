@@ -79,7 +79,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_events_and_errors_that_the_page_names_are_there(capsys: pytest.CaptureFixture[str]) -> None:
-    for name in re.findall(r"`([A-Z]\w+(?:Started|Finished|Failed|Warned))`", PAGE):
+    for name in re.findall(r"`([A-Z]\w+(?:Started|Finished|Failed|Warned)|Forecast|TimeLeft)`", PAGE):
         assert hasattr(progress, name)
     for name in re.findall(r"`(\w+Error)`", PAGE):
         assert issubclass(getattr(pano_mvs, name), pano_mvs.PanoMvsError)
@@ -87,7 +87,17 @@ def test_events_and_errors_that_the_page_names_are_there(capsys: pytest.CaptureF
     exec(block("progress"), names)
     names["show"](progress.Warned("it is late"))
     names["show"](progress.UnitStarted("depth", "a.jpg"))
-    assert capsys.readouterr().out == "warning: it is late\n"
+    names["show"](progress.TimeLeft(70.0, at_least=True, done=0.25))
+    assert capsys.readouterr().out == "warning: it is late\n25 %, more than 70 s left\n"
+
+
+def test_the_examples_of_estimates_name_what_exists(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec(block("estimator"), names)
+    assert isinstance(names["left"], progress.TimeLeft)
+    assert capsys.readouterr().out == "0.0 0.0 ()\n"
+    for name in re.findall(r"plan\.(\w+)", block("plan").partition("\n")[2]):
+        assert hasattr(pano_mvs.RunPlan, name), name
 
 
 def test_fields_that_the_page_names_are_there() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
+from pano_mvs.evaluation.clouds.pictures import _top_view
+from pano_mvs.evaluation.drawing import WIDTH
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
 from pano_mvs.io.clouds.ply_reader import open_ply_points
 from tests.stored import read_picture
@@ -65,6 +68,19 @@ def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path: Path) -> None
     write_error_picture(tmp_path / "a.jpg", nothing, nothing, counted=np.zeros((8, 16), bool))
     picture = read_picture(tmp_path / "a.jpg")
     assert tuple(picture[200, 1500]) == GREY
+
+
+def test_a_cloud_of_any_width_fits_into_the_view_from_above() -> None:
+    """`width * ((WIDTH - 1) / width)` exceeds WIDTH - 1 for some widths; then a column beyond the last was drawn."""
+    widths = np.linspace(2, 9, 400).astype(np.float32).astype(np.float64)
+    rounded_up = widths[widths * ((WIDTH - 1) / widths) > WIDTH - 1]
+    assert len(rounded_up) > 5
+    for width in rounded_up[:5]:
+        points = np.zeros((1001, 3), np.float32)
+        points[10:996, 0] = np.linspace(0, width, 986)
+        points[996:, 0] = width * (1 + 0.6 / (WIDTH - 1))  # among the outermost 1 %
+        view = _top_view(points, np.zeros(1001, np.float32), SimpleNamespace(limits=(0.05, 0.1)))  # type: ignore[arg-type]
+        assert view.shape[1] == WIDTH
 
 
 def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ SIZE = (16, 32)
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_capture(folder, default_room(), capture_poses(3), SIZE)
+    write_capture(folder, default_room(), capture_poses(3), size_hw=SIZE)
     return folder
 
 
@@ -58,7 +58,7 @@ def test_images_are_found_by_the_names_that_a_capture_gives_them(capture: Path) 
 
 def test_where_there_is_no_surface_the_range_is_nan(tmp_path: Path) -> None:
     room = Room((Ball((0, 0, 3), 1.0, ((1, 1, 1), (1, 1, 1))),))
-    write_capture(tmp_path, room, [Rigid3.identity()], SIZE)
+    write_capture(tmp_path, room, [Rigid3.identity()], size_hw=SIZE)
     assert np.isinf(np.load(tmp_path / "truth" / "depth.npz")["000"]).any()
     truth = read_truth(tmp_path / "truth")
     expected = render(room, Rigid3.identity(), SIZE)[1]

@@ -90,7 +90,7 @@ def test_the_export_writes_quality_on_demand(tmp_path: Path) -> None:
     )
     context = Context(np.random.default_rng(0), tmp_path)
     for quality, confidence in ((False, None), (True, [130, 255])):
-        files = ply(cloud, PlyParams(quality=quality), context)
+        files = ply(cloud, None, PlyParams(quality=quality), context)
         back = read_ply(files.files["cloud.ply"])
         assert (None if back.confidence is None else back.confidence.tolist()) == confidence
 

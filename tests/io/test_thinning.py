@@ -134,9 +134,9 @@ def test_voxels_that_cannot_be_counted_are_refused(tmp_path: Path) -> None:
 def test_other_programs_read_the_points_with_their_qualities(tmp_path: Path) -> None:
     """VTK, by way of pyvista; it gives colours as an array RGB and keeps what else each point has."""
     cloud = surface_cloud(400)
-    params = PlyParams.model_validate({"quality": True, "min_views": 2, "voxel": 0.3})
+    params = PlyParams.model_validate({"quality": True, "min_views": 2, "voxel": 0.3, "frame": "world"})
     ctx = Context(np.random.default_rng(0), tmp_path)
-    path = ply(cloud, params, ctx).files["cloud.ply"]
+    path = ply(cloud, None, params, ctx).files["cloud.ply"]
     kept = plainly_kept(cloud, Selection(min_views=2, voxel=0.3))
     assert ctx.metrics == {"points": len(kept), "voxel": 0.3}
     read = pyvista.read(path)

@@ -130,13 +130,13 @@ def test_labels_stand_beside_their_cameras_and_cover_no_other() -> None:
     names = [f"R{number:07d}.jpg" for number in range(10210, 10240)]
     above, _ = camera_maps({"registered": names, "centers": [[0.3 * idx, 0, 0.02 * idx] for idx in range(30)]})
     spots = [(spot, (x, y)) for x, y, _, spot in above.cameras if spot is not None]
-    assert 8 <= len(spots) < 30
-    wide = 8.4 * 8
+    assert 6 <= len(spots) < 30
+    wide = 8.6 * 8
     for idx, ((left, line), (x, y)) in enumerate(spots):
-        assert abs(line - y) <= 32
+        assert abs(line - y) <= 34
         assert min(abs(left - x), abs(left + wide - x)) <= 9.5
         for (other, other_line), _ in spots[:idx]:
-            assert abs(left - other) > wide or abs(line - other_line) >= 15
+            assert abs(left - other) > wide or abs(line - other_line) >= 16
 
 
 @pytest.mark.parametrize(
@@ -150,3 +150,14 @@ def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers: Sequ
 @pytest.mark.parametrize("centers", [[[0, 0, 0]], [[0, 0, float("nan")]] * 3])
 def test_centres_that_do_not_fit_give_no_map(centers: Sequence[Sequence[float]]) -> None:
     assert camera_maps({"registered": NAMES, "centers": centers}) == ()
+
+
+def test_places_to_stand_are_marked_to_scale_and_within_the_map() -> None:
+    marks = [(1, (0.5, 0.0, 1.0)), (4, (90.0, 0.0, -90.0))]
+    above, side = camera_map.camera_maps(PosesSummary.model_validate(POSES), marks=marks)
+    first, _, third = places(above)
+    scale = np.linalg.norm(third - first) / np.linalg.norm([0.4, 2])
+    assert above.marks[0][:2] == pytest.approx(first + scale * np.array([0.5, -1]), abs=0.2)
+    assert [mark[2] for mark in above.marks] == [1, 4]
+    assert side.marks == ()
+    assert above.marks[1][:2] == (above.size_wh[0] - 14, above.size_wh[1] - 14)

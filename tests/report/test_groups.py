@@ -148,9 +148,14 @@ def test_the_page_draws_each_group_apart_and_says_its_frame(
     assert "Each group has its own frame and unit of length" in text
     assert sum(tag == "svg" and "cameras from" in str(values.get("aria-label")) for tag, values in page.elements) == 4
     labels = [
-        str(values["aria-label"]) for _, values in page.elements if "Colours of the" in str(values.get("aria-label"))
+        str(values["aria-label"])
+        for _, values in page.elements
+        if "scale of the range" in str(values.get("aria-label"))
     ]
-    assert sorted(label.rpartition(" in ")[2] for label in labels) == ["metres"] * 2 + ["scene units"] * 2
+    ends = {name: [label for label in labels if label.endswith(name)] for name in ("metres", "scene units")}
+    assert len(ends["metres"]) >= 2
+    assert len(ends["scene units"]) >= 2
+    assert [text.count(f"range in {unit}") for unit in ("m ", "scene units")] == [len(found) for found in ends.values()]
 
 
 def test_the_cloud_of_the_largest_group_is_shown_alone(rooms: tuple[dict[str, Any], StoredValues]) -> None:

@@ -18,6 +18,9 @@ from pano_mvs.report.view_cards import chosen_views
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene.scores import NO_TRUTH
+from pano_mvs.testing.tiny_capture import TinyCapture
+from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
@@ -213,18 +216,28 @@ def test_any_key_of_the_poses_may_be_missing(out_dir: Path, key: str) -> None:
 def test_only_our_own_script_may_run(out_dir: Path) -> None:
     """The policy names the script by its digest: one that a file name might smuggle in has another."""
     page = reported(out_dir, SUMMARY)
-    facts, script = page.scripts
+    facts, *scripts = page.scripts
     assert facts.strip() == "{}"
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     (policy,) = [attrs["content"] for attrs in page.all("meta") if attrs.get("http-equiv") == "Content-Security-Policy"]
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'; ")
-    assert f"script-src 'sha256-{digest}';" in policy
+    assert f"script-src 'sha256-{digests[0]}' 'sha256-{digests[1]}';" in policy
 
 
 def test_every_element_that_the_script_asks_for_is_there(out_dir: Path) -> None:
     page = reported(out_dir, SUMMARY)
     ids = {value for _, name, value in page.attributes if name == "id"}
     assert set(re.findall(r'getElementById\("(\w+)"\)', page.scripts[1])) <= ids
+
+
+def test_every_element_that_the_viewer_asks_for_is_there(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture
+) -> None:
+    page = reported(out_dir, summary_of(tiny), results)
+    ids = {value for _, name, value in page.attributes if name == "id"}
+    asked = set(re.findall(r'(?:getElementById|press)\("([\w-]+)"', page.scripts[2]))
+    assert len(asked) == 9
+    assert asked <= ids
 
 
 def test_names_and_causes_are_text_and_never_markup(out_dir: Path) -> None:
@@ -251,7 +264,7 @@ def test_names_and_causes_are_text_and_never_markup(out_dir: Path) -> None:
         "files": {evil: evil},
     }
     page = reported(out_dir, summary)
-    assert page.tags.count("script") == 2, "ours and the facts"
+    assert page.tags.count("script") == 3, "our two and the facts"
     assert_sound(page)
     assert page.words.count(evil) >= 24
 
@@ -284,6 +297,13 @@ def test_scores_of_all_branches_are_told_apart(out_dir: Path) -> None:
     assert beside.index("ours") < beside.index("30") < beside.index("papers") < beside.index("11.25")
     assert words.count("11.25") == 2, "and in the table of its branch"
     assert "Median over views" not in reported(out_dir, SUMMARY).words
+
+
+def test_nothing_is_said_of_a_ground_truth_that_nobody_has(out_dir: Path) -> None:
+    scores = {"poses": {}, "views": {}, "notes": [NO_TRUTH]}
+    assert "ground truth" not in reported(out_dir, SUMMARY | {"scores": scores}).words
+    other = reported(out_dir, SUMMARY | {"scores": scores | {"notes": [NO_TRUTH, "1.png is another image"]}})
+    assert "1.png is another image" in other.words
 
 
 def test_where_nothing_failed_nothing_is_said_of_failures(out_dir: Path) -> None:

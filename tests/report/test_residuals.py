@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.results.residuals import histogram, reprojection_residuals
+from pano_mvs.results.residuals import Histogram, histogram, reprojection_residuals
 from pano_mvs.scene import Poses
 from pano_mvs.testing.tiny_capture import TinyCapture
 
@@ -111,3 +111,14 @@ def test_what_is_masked_is_not_missed() -> None:
 def test_what_are_no_shares_are_none(fact: Any) -> None:
     assert shares_from_fact(fact) is None
     assert shares_from_fact(fact_of(Shares(1, 0, 0, 0, 0))) == Shares(1, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("largest", [1, 2, 3, 5, 6, 9, 10, 11, 19, 20, 21, 49, 51, 99, 101, 4321, 1_000_000])
+def test_the_axis_of_counts_has_few_round_ticks_and_reaches_the_largest(largest: int) -> None:
+    found = Histogram((0, largest), 1.0, 0.1, 0.2, largest).count_ticks
+    step = found[1] - found[0]
+    assert found[0] == 0
+    assert set(np.diff(found)) == {step}
+    assert found[-2] < largest <= found[-1]
+    assert 2 <= len(found) <= 6
+    assert str(step).rstrip("0") in ("1", "2", "5")

@@ -45,7 +45,7 @@ def test_views_are_shown_with_panorama_range_and_confidence(
     assert "From inside, where" in page.words
     assert "only 7 of 31 matches agree" in page.words
     assert "median reprojection residual" in page.words
-    assert "Median epipolar residual of each matched pair: 5 values" in page.words
+    assert "Median epipolar residual of each matched pair: 5 pairs" in page.words
     assert "Not shown" not in page.words
 
 
@@ -82,7 +82,7 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(
     end = text.index("</script>", facts)
     path.write_text(text[:facts] + "[1, {" + text[end:])
     assert_sound(reported(out_dir, summary_of(tiny), results))
-    path.write_text(text.replace('"ticks":', '"ticks": "<b>", "other":'))
+    path.write_text(text.replace('"shares":', '"shares": "<b>", "other":'))
     page = reported(out_dir, summary_of(tiny), results)
     assert_sound(page)
     assert "<b>" not in page.words

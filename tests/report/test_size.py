@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.report import cloud_pictures, thumbnails, view_cards, write_report
+from pano_mvs.report import cloud_pictures, cloud_points, masked_areas, thumbnails, view_cards, write_report
 from pano_mvs.results.pictures import picture, preview_panels
 from pano_mvs.results.summary import RunSummary
 from tests.report.html_page import Page
@@ -40,7 +40,7 @@ def large(count: int) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("width", "most_bytes"), [(768, 80_000), (160, 9_000), (960, 300_000)])
+@pytest.mark.parametrize(("width", "most_bytes"), [(768, 35_000), (160, 6_000), (960, 300_000)])
 def test_a_picture_takes_no_more_than_its_share_though_it_be_noise(width: int, most_bytes: int) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (width // 2, width, 3), np.uint8)
     made = picture(noise, width=width, most_bytes=most_bytes)
@@ -55,9 +55,11 @@ def test_five_thousand_views_fit_with_all_their_pictures(tmp_path: Path) -> None
     """The text of the largest page, and all pictures at the largest size that each may have, base64 and all."""
     write_report(tmp_path, RunSummary.from_json(large(5000)))
     text = (tmp_path / "report.html").stat().st_size
-    cards = view_cards.MAX_CARDS * 3 * view_cards.MAX_BYTES
+    cards = view_cards.MAX_CARDS * sum(view_cards.MAX_BYTES.values())
     small = thumbnails.MAX_THUMBNAILS * thumbnails.MAX_BYTES
-    assert text + (cards + small + 3 * cloud_pictures.MAX_BYTES) * 4 / 3 + 1000 * 300 < MOST_BYTES
+    cloud = 3 * cloud_pictures.MAX_BYTES + cloud_points.MAX_POINTS * cloud_points.POINT_BYTES
+    masked = masked_areas.MAX_PICTURES * masked_areas.MAX_BYTES
+    assert text + (cards + small + cloud + masked) * 4 / 3 + 1000 * 300 < MOST_BYTES
 
 
 def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def test_from_above_the_floor_is_seen_and_no_ceiling() -> None:
         shown = facing(points, normals, viewpoint)
         assert shown[normals[:, 1] < 0].all(), "the floor: y is down"
         assert not shown[normals[:, 1] > 0].any(), "the ceiling"
-    image = draw_cloud(points, normals, colors, above, size_hw=SIZE_HW)
+    image = draw_cloud(points, normals, colors, viewpoint=above, size_hw=SIZE_HW)
     seen = image[20:40, 38:58].reshape(-1, 3)
     seen = seen[(seen != (238, 241, 244)).any(axis=1)]
     assert len(seen) > 100
@@ -48,7 +48,7 @@ def test_from_above_it_is_true_to_scale_with_z_upwards() -> None:
     normals = np.tile(UP.astype(np.float32), (4, 1))
     colors = np.array([[9, 9, 9], [255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     above, _, _ = viewpoints(points, np.zeros((0, 3)), UP, aspect=1.6)
-    image = draw_cloud(points, normals, colors, above, size_hw=SIZE_HW).astype(int)
+    image = draw_cloud(points, normals, colors, viewpoint=above, size_hw=SIZE_HW).astype(int)
     places = {
         channel: np.argwhere((image[..., channel] == 255) & (image.sum(axis=-1) == 255)).mean(axis=0)
         for channel in range(3)
@@ -81,7 +81,7 @@ def test_whatever_lies_where_there_is_a_picture(
             assert np.isfinite(vector).all()
         assert np.linalg.norm(viewpoint.target - viewpoint.eye) > 0
         image = draw_cloud(
-            places, np.zeros_like(places), np.full(places.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
+            places, np.zeros_like(places), np.full(places.shape, 7, np.uint8), viewpoint=viewpoint, size_hw=SIZE_HW
         )
         assert image.shape == (*SIZE_HW, 3)
 
@@ -90,7 +90,7 @@ def test_the_nearer_point_hides_the_farther_one() -> None:
     ahead = Viewpoint("", np.zeros(3), np.array([0.0, 0, 1]), UP, fov_deg=60)
     points = np.array([[0, 0, 2], [0, 0, 1], [0, 0, 3], [0, 0, -1]], np.float32)
     colors = np.array([[1, 1, 1], [250, 0, 0], [2, 2, 2], [3, 3, 3]], np.uint8)
-    image = draw_cloud(points, np.zeros_like(points), colors, ahead, size_hw=SIZE_HW)
+    image = draw_cloud(points, np.zeros_like(points), colors, viewpoint=ahead, size_hw=SIZE_HW)
     drawn = np.unique(image.reshape(-1, 3), axis=0).tolist()
     assert drawn == [[238, 241, 244], [250, 0, 0]]
     assert (image[30, 48] == (250, 0, 0)).all()

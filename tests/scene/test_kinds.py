@@ -25,7 +25,7 @@ from pano_mvs.scene import (
 )
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.files import group_file, item_stems
-from pano_mvs.scene.index import pair_from_name, pair_name
+from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
 from pano_mvs.scene.scores import Scores
 from pano_mvs.scene.surface_samples import SurfaceSamples

@@ -50,8 +50,9 @@ class Chromium(Browser):
 
     def resize(self, width: int, height: int) -> None:
         """Set the size of the area that shows the page."""
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self._devtools("Emulation.setDeviceMetricsOverride", metrics)
+        self.command(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+        )
 
     def evaluate(self, script: str) -> Any:
         """Return the value of a JavaScript expression in the page."""
@@ -75,15 +76,16 @@ class Chromium(Browser):
         motion = "reduce" if reduced_motion else "no-preference"
         features = {"prefers-color-scheme": scheme, "prefers-reduced-motion": motion}
         given = [{"name": name, "value": value} for name, value in features.items()]
-        self._devtools("Emulation.setEmulatedMedia", {"features": given})
+        self.command("Emulation.setEmulatedMedia", features=given)
 
-    def _devtools(self, command: str, params: Mapping[str, Any]) -> None:
-        _call("POST", f"{self.root}/goog/cdp/execute", {"cmd": command, "params": params})
+    def command(self, name: str, **params: Any) -> Any:
+        """Run a command of the DevTools protocol, such as `Emulation.setEmulatedMedia`."""
+        return _call("POST", f"{self.root}/goog/cdp/execute", {"cmd": name, "params": params})
 
 
 @contextmanager
-def chromium() -> Iterator[Chromium]:
-    """Start Chromium and end it afterwards."""
+def chromium(*, width: int = 1280, height: int = 720) -> Iterator[Chromium]:
+    """Start Chromium with a window of a size, and end it afterwards."""
     installed("chromium", "google-chrome")
     driver, port = installed("chromedriver"), free_port()
     with TemporaryDirectory(prefix="pano-mvs-browser-", ignore_cleanup_errors=True) as profile:
@@ -97,6 +99,7 @@ def chromium() -> Iterator[Chromium]:
             wanted = {"goog:chromeOptions": {"args": arguments}, "goog:loggingPrefs": {"browser": "ALL"}}
             session = _call("POST", f"{root}/session", {"capabilities": {"alwaysMatch": wanted}})["sessionId"]
             browser = Chromium(f"{root}/session/{session}")
+            browser.resize(width, height)
             try:
                 yield browser
             finally:

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
@@ -51,6 +52,12 @@ def test_the_folder_has_the_cloud_the_cameras_and_the_panoramas(tmp_path: Path) 
     )
     assert tile is not None
     assert tile.shape == (512, 1024, 3)
+
+
+def test_a_level_world_is_upright_though_the_cameras_were_tilted() -> None:
+    tilted = [Rigid3(rotation_from_rotvec([0.3, 0.0, deg]), np.zeros(3)) for deg in (0.1, 0.2)]
+    assert page_from_world(tilted, is_level=True).rotation @ [0, -1, 0] == pytest.approx([0, 1, 0], abs=1e-12)
+    assert (page_from_world(tilted).rotation @ [0, -1, 0])[1] < 0.99
 
 
 def test_y_is_up_in_the_page_and_cameras_keep_their_distances(tmp_path: Path) -> None:

@@ -298,7 +298,9 @@ def test_the_sparse_model_has_the_form_that_is_asked_for(
     capture: Capture, tmp_path: Path, form: Literal["bin", "txt", "both"]
 ) -> None:
     ctx = context(tmp_path / "scratch")
-    files = colmap(poses=capture.poses, images=capture.images, params=ModelParams(format=form), ctx=ctx)
+    files = colmap(
+        poses=capture.poses, images=capture.images, photographs=None, params=ModelParams(format=form), ctx=ctx
+    )
     suffixes = {"bin": {"bin"}, "txt": {"txt"}, "both": {"bin", "txt"}}[form]
     assert {Path(target).suffix[1:] for target in files.files} == suffixes
     deliver(files, tmp_path, "")
@@ -313,7 +315,7 @@ def test_names_with_blanks_are_told_where_the_text_cannot_hold_them(
     """COLMAP itself writes such names into images.txt and reads them back as far as the blank."""
     poses = Poses.without_points({"a/1 b.png": capture.poses.cam_from_world(0)}, frame="", scale="", metric=False)
     images, ctx = {"a/1 b.png": capture.images[NAMES[0]]}, context(tmp_path / "scratch")
-    files = colmap(poses=poses, images=images, params=ModelParams(format=form), ctx=ctx)
+    files = colmap(poses=poses, images=images, photographs=None, params=ModelParams(format=form), ctx=ctx)
     assert bool(ctx.notes) == told
     deliver(files, tmp_path, "")
     model = pycolmap.Reconstruction(tmp_path / "colmap/sparse/0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
 from pano_mvs.io.poses.files import read_poses
@@ -44,6 +45,7 @@ def exported(
     settings: dict[str, Any] | None = None,
     cloud: PointCloud | None = None,
     seed_points: int = 100,
+    frame: Literal["upright", "world"] = "upright",
 ) -> Path:
     """Write both variants with true ranges everywhere, as a run would, and return the folder nerfstudio/."""
     images = images or capture.images
@@ -65,7 +67,7 @@ def exported(
     scratch = folder / "scratch"
     scratch.mkdir()
     poses = capture.whole(Poses)
-    seeds = NerfstudioParams(seed_points=seed_points)
+    seeds = NerfstudioParams(seed_points=seed_points, frame=frame)
     files = nerfstudio(frames, poses, cloud, seeds, Context(np.random.default_rng(0), scratch))
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
@@ -96,7 +98,9 @@ def test_depths_are_on_the_walls(plain: Path, variant: str) -> None:
     for frame in document["frames"]:
         points, known = world_points(folder, document, frame)
         assert known.mean() > 0.98
-        origin = np.array(frame["transform_matrix"])[:3, 3]
+        world_from_file = np.array(document["file_from_world"]).T
+        points = points @ world_from_file.T
+        origin = world_from_file @ np.array(frame["transform_matrix"])[:3, 3]
         length = np.linalg.norm(points - origin, axis=1)
         truth = range_along(default_room(), origin, (points - origin) / length[:, None])
         errors.append(np.abs(length - truth))
@@ -126,6 +130,28 @@ def test_poses_are_read_back_by_our_own_reader(plain: Path) -> None:
         np.testing.assert_allclose(poses.translations[idx], pose.translation, atol=1e-12)
 
 
+def test_cameras_and_points_have_z_up_together(plain: Path) -> None:
+    """A floor below the cameras is below along z, in the file of the points, too."""
+    document = json.loads((plain / "equirectangular" / "transforms.json").read_text())
+    assert document["file_from_world"] == [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    for frame, pose in zip(document["frames"], tiny_capture(PLAIN).poses, strict=True):
+        x, y, z = pose.center
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], [x, z, -y], atol=1e-12)
+    x, y, z = tiny_capture(PLAIN).points_in_world.T
+    seed = open_ply_points(plain / "equirectangular" / document["ply_file_path"])
+    in_file = np.stack([seed.vertices[name] for name in "xyz"], axis=-1)
+    assert np.max(cKDTree(np.stack([x, z, -y], axis=-1)).query(in_file)[0]) < 1e-5
+
+
+def test_the_world_frame_can_be_kept(tmp_path: Path) -> None:
+    folder = exported(tiny_capture(PLAIN), tmp_path, frame="world")
+    document = json.loads((folder / "equirectangular" / "transforms.json").read_text())
+    assert "file_from_world" not in document
+    center = tiny_capture(PLAIN).poses[1].center
+    np.testing.assert_allclose(np.array(document["frames"][1]["transform_matrix"])[:3, 3], center, atol=1e-12)
+    assert b"comment" not in (folder / "equirectangular" / "seed.ply").read_bytes()[:300]
+
+
 def test_faces_look_where_their_cameras_say(plain: Path) -> None:
     """A colour of a face is that of the panorama along the ray that the file describes."""
     capture = tiny_capture(PLAIN)
@@ -137,7 +163,7 @@ def test_faces_look_where_their_cameras_say(plain: Path) -> None:
         assert picture.shape[1::-1] == (document["w"], document["h"])
         rays = documented_rays(document, frame, picture.shape[1::-1])
         pose = capture.poses[capture.names.index(name)]
-        in_cam = rays @ pose.rotation.T
+        in_cam = rays @ np.array(document["file_from_world"]) @ pose.rotation.T
         column = ((np.arctan2(in_cam[..., 0], in_cam[..., 2]) / (2 * np.pi) + 0.5) * WIDTH).astype(int) % WIDTH
         row = (0.5 + np.arctan2(in_cam[..., 1], np.hypot(in_cam[..., 0], in_cam[..., 2])) / np.pi) * HEIGHT
         seen = capture.pictures[capture.names.index(name)][np.minimum(row.astype(int), HEIGHT - 1), column]
@@ -217,6 +243,7 @@ def test_nothing_unprojects_to_where_only_masked_pixels_look(masked: Path) -> No
         if name == "001.png":
             continue
         points, _ = world_points(masked / "faces", document, frame)
+        points = points @ np.array(document["file_from_world"])
         in_cam = capture.poses[capture.names.index(name)].apply(points)
         column = ((np.arctan2(in_cam[:, 0], in_cam[:, 2]) / (2 * np.pi) + 0.5) * 128).astype(int) % 128
         row = ((0.5 + np.arctan2(in_cam[:, 1], np.hypot(in_cam[:, 0], in_cam[:, 2])) / np.pi) * 64).astype(int)

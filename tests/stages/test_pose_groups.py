@@ -18,7 +18,7 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
@@ -37,6 +37,7 @@ from pano_mvs.stages.exports.colmap import (
 from pano_mvs.stages.exports.files import PlyParams, ply
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
+from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import FusionParams, vote
@@ -141,7 +142,7 @@ def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> N
 
 def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
     cloud = _fused(rooms)
-    files = ply(cloud=cloud, params=PlyParams(), ctx=ctx).files
+    files = ply(cloud=cloud, poses=None, params=PlyParams(), ctx=ctx).files
     assert list(files) == ["cloud.ply", "cloud_1.ply"]
     for path, group in zip(files.values(), cloud.groups(), strict=True):
         np.testing.assert_array_equal(read_ply(path).points_in_world, group.points_in_world)
@@ -150,7 +151,7 @@ def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
 
 @pytest.mark.slow
 def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context) -> None:
-    files = mesh(cloud=_fused(rooms), params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
+    files = mesh(cloud=_fused(rooms), poses=None, params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
     assert list(files) == ["mesh.ply", "mesh_1.ply"]
 
 
@@ -158,7 +159,9 @@ def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: C
     large = _fused(rooms).groups()[0]
     shorter: dict[str, Any] = {name: value[:5] for name, value in vars(large).items() if isinstance(value, np.ndarray)}
     few = replace(large, **shorter)
-    files = mesh(cloud=PointCloud.of_groups([large, few]), params=MeshParams(depth=4, trim=0), ctx=ctx).files
+    files = mesh(
+        cloud=PointCloud.of_groups([large, few]), poses=None, params=MeshParams(depth=4, trim=0), ctx=ctx
+    ).files
     assert list(files) == ["mesh.ply"]
     assert ctx.notes[0].startswith("no mesh_1.ply: 5 of 5 points are left")
 
@@ -176,7 +179,9 @@ def _model_images(folder: Path) -> dict[str, np.ndarray]:
 
 
 def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path)
+    out = _placed(
+        colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx), tmp_path
+    )
     assert sorted(path.name for path in (out / "colmap" / "sparse").iterdir()) == ["0", "1"]
     for number, group in enumerate(split_groups(rooms.poses)):
         centers = _model_images(out / "colmap" / "sparse" / str(number))
@@ -188,7 +193,10 @@ def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path)
 def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     rooms: Rooms, ctx: Context, tmp_path: Path
 ) -> None:
-    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
+    out = _placed(
+        colmap(poses=rooms.poses, images=rooms.images, photographs=None, params=ModelParams(), ctx=ctx),
+        tmp_path / "out",
+    )
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
     assert known.rejected["b0.png"].startswith(
@@ -256,17 +264,37 @@ def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tm
     assert any("group 1 (b0.png, b1.png) has its own frame" in note for note in ctx.notes)
 
 
-def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    frame = NerfstudioFrame(
-        "equirectangular",
-        "images/{name}",
-        "",
-        "",
-        (64, 32),
-        (32.0, 32.0),
-        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+_FRAME = NerfstudioFrame(
+    "equirectangular",
+    "images/{name}",
+    "",
+    "",
+    (64, 32),
+    (32.0, 32.0),
+    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+)
+
+
+def test_each_room_of_a_splat_bundle_has_its_own_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
+    frames = {name: SplatFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
+    files = splat_bundle(
+        frames=frames, poses=rooms.poses, cloud=_fused(rooms), points=None, params=SplatBundleParams(), ctx=ctx
     )
-    frames = {name: NerfstudioFrames({}, {}, (frame,), 0.001) for name in _ORDER}
+    out = _placed(files, tmp_path) / "splat_bundle"
+    manifest = json.loads((out / "manifest.json").read_text())
+    for number, names in enumerate((_LARGE, tuple(_SMALL))):
+        about = manifest["groups"][number]
+        assert about["world"] == rooms.poses.worlds[number].frame
+        model = pycolmap.Reconstruction(str(out / about["variants"]["equirectangular"]["colmap"]))
+        assert {image.name for image in model.images.values()} == set(names)
+        assert len(model.points3D) > 20
+        listed = json.loads((out / about["variants"]["equirectangular"]["transforms"]).read_text())
+        assert {entry["panorama"] for entry in listed["frames"]} == set(names)
+        assert {view["panorama"] for view in manifest["views"] if view["group"] == number} == set(names)
+
+
+def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
+    frames = {name: NerfstudioFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
     cloud = _fused(rooms)
     files = nerfstudio(frames=frames, poses=rooms.poses, cloud=cloud, params=NerfstudioParams(), ctx=ctx)
     out = _placed(files, tmp_path) / "nerfstudio" / "equirectangular"

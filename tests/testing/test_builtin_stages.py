@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.io.images.videos import tiny_video
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
+    "poses.localise": {"path": "{capture}/images"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
     "source.video": {"path": str(tiny_video())},
@@ -22,6 +23,7 @@ FRAME = NerfstudioFrame(
 )
 INPUTS: dict[str, dict[str, Any]] = {
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
+    "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 

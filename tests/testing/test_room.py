@@ -152,7 +152,7 @@ def test_the_cameras_of_a_capture_are_free_and_apart() -> None:
 
 def test_a_written_capture_is_the_same_bytes_twice(tmp_path: Path) -> None:
     for folder in ("a", "b"):
-        write_capture(tmp_path / folder, default_room(), capture_poses(2), SIZE)
+        write_capture(tmp_path / folder, default_room(), capture_poses(2), size_hw=SIZE)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
     assert [str(path) for path in files] == ["images/000.png", "images/001.png", "truth/depth.npz", "truth/poses.json"]
     for path in files:

@@ -12,6 +12,7 @@ from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.upright import z_up_from_world
 
 SIZE_HW = (64, 128)
 HALF = np.array([3.0, 1.5, 4.0])
@@ -63,7 +64,8 @@ def write_output(
         (images / name).parent.mkdir(parents=True, exist_ok=True)
         write_png(images / name, world_color(ray_grid(SIZE_HW) @ pose.rotation))
     if points:
-        write_ply(out / "cloud.ply", box_cloud(points, quality=quality), quality=quality)
+        cloud = box_cloud(points, quality=quality)
+        write_ply(out / "cloud.ply", cloud, quality=quality, file_from_world=z_up_from_world())
     if poses:
         known = Poses.without_points(poses, frame="box", scale="metres", metric=metric)
         write_colmap_model(out / "colmap" / "sparse" / "0", known, dict.fromkeys(poses, SIZE_HW))

@@ -9,6 +9,7 @@ import pytest
 from numpy.lib.recfunctions import drop_fields
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.images.preview import write_preview
@@ -131,6 +132,16 @@ def test_up_is_what_the_cameras_agree_on(tmp_path: Path) -> None:
         assert scene.ahead @ scene.up == pytest.approx(0, abs=1e-9)
 
 
+def test_up_is_minus_y_in_a_level_world(tmp_path: Path) -> None:
+    out = write_output(tmp_path, {"a.png": Rigid3(rotation_from_rotvec([0.3, 0.0, 0.1]), np.zeros(3))}, points=0)
+    tilted = open_scene(out)
+    assert tilted.up[1] > -0.97
+    run = json.loads((out / "run.json").read_text())
+    run["poses"]["frame"] = "origin at the first registered camera; y down along gravity, by the cameras"
+    (out / "run.json").write_text(json.dumps(run))
+    np.testing.assert_array_equal(open_scene(out).up, UP)
+
+
 def test_a_display_needs_few_points_and_they_are_spread(tmp_path: Path) -> None:
     out = write_output(tmp_path, {})
     cloud = open_ply_points(out / "cloud.ply")
@@ -156,7 +167,8 @@ def test_colours_mean_what_the_legend_says(tmp_path: Path) -> None:
     assert heights.colors_rgb[ceiling, 0].min() > heights.colors_rgb[floor, 0].max()  # red above
     assert heights.colors_rgb[floor, 2].min() > heights.colors_rgb[ceiling, 2].max()  # blue below
     normals = color_cloud(cloud, "normals", up=UP, unit="m").colors_rgb
-    upward = cloud.vertices["ny"] < -0.5
+    assert cloud.normals is not None
+    upward = cloud.normals[:, 1] < -0.5
     np.testing.assert_array_equal(np.unique(normals[upward], axis=0), [[128, 255, 128]])
     sure = color_cloud(cloud, "confidence", up=UP, unit="m").colors_rgb
     assert sure[cloud.vertices["confidence"] > 250, 0].min() > sure[cloud.vertices["confidence"] < 60, 0].max()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,7 @@ def test_two_clicks_measure_what_the_cloud_says(tour: Tour) -> None:
         clicked.append(tour.state.picked[-1])
     assert tour.distance == pytest.approx(np.linalg.norm(clicked[0] - clicked[1]))
     assert tour.state.message == f"{tour.distance:.3f} m"
+
     for point in clicked:
         assert np.isclose(np.abs(point), HALF).any()
     tour.click(*place_of(clicked[0], view), SIZE)  # a third click begins anew
@@ -161,6 +163,19 @@ def test_two_clicks_measure_what_the_cloud_says(tour: Tour) -> None:
     assert "no point there" in tour.state.message
     tour.key("Escape")
     assert (tour.state.measuring, tour.state.picked) == (False, ())
+
+
+def test_without_a_scale_the_points_are_shown_for_the_command_that_sets_it(tour: Tour) -> None:
+    tour.scene = replace(tour.scene, unit="scene units")
+    tour.key("m")
+    tour.key("x")
+    view = tour.state.viewpoint
+    for z in (-0.5, 0.5):
+        tour.click(*place_of(HALF * np.array([0.2, 1, z]), view), SIZE)
+    found = re.fullmatch(r"[\d.]+ scene units from (\S+) to (\S+)", tour.state.message)
+    assert found
+    ends = [np.array([float(word) for word in text.split(",")]) for text in found.groups()]
+    np.testing.assert_allclose(ends, tour.state.picked, atol=2e-3)
 
 
 def test_points_that_turn_their_back_are_not_picked(tour: Tour) -> None:

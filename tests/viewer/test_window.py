@@ -12,6 +12,7 @@ import pytest
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.mesh_writer import write_ply_mesh
+from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.display import quiet_vtk, require_drawing
@@ -246,7 +247,8 @@ def test_a_mesh_faces_the_side_that_was_seen_and_can_be_chosen(tmp_path: Path, w
     out = write_output(tmp_path, {}, points=5000)
     corners = np.array([[-3, 1.5, -4], [3, 1.5, -4], [3, 1.5, 4], [-3, 1.5, 4]], np.float32)
     red = np.tile(np.array([250, 10, 10], np.uint8), (4, 1))
-    write_ply_mesh(out / "mesh.ply", (corners, red, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+    triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    write_ply_mesh(out / "mesh.ply", (corners, red, triangles), file_from_world=z_up_from_world())
     window = window_on(out, windows, view="top")
 
     def share_of_red() -> float:

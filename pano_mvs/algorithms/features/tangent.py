@@ -71,17 +71,14 @@ def extract_sift(
     Raises:
         UsageError: if the shapes of image and mask do not match.
     """
-    # Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
-    detector = cv2.SIFT.create(
-        contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
-    )
+    detector = sift_detector(contrast_threshold)
 
     def detect(tile_image: NDArray[np.uint8], owned: NDArray[np.uint8]) -> _Found:
         # Descriptors take half of the time, and three of four key points belong to another tile.
         keypoints, descriptors = detector.detectAndCompute(tile_image, owned)
         pixels = np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
-        return _Found(pixels, *_sizes_and_scores(keypoints), _rooted(described) if root else described)
+        return _Found(pixels, *_sizes_and_scores(keypoints), root_sift(described) if root else described)
 
     return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=_SIFT_CLEARANCE)
 
@@ -198,7 +195,15 @@ def _sizes_and_scores(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.flo
     return np.array([k.size for k in keypoints]), np.array([k.response for k in keypoints], np.float32)
 
 
-def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+def sift_detector(contrast_threshold: float = 0.004) -> cv2.SIFT:
+    """Return OpenCV's detector with the settings of `extract_sift`."""
+    # Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
+    return cv2.SIFT.create(
+        contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
+    )
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return RootSIFT descriptors as integers: 512 √(d / Σd), whose squared length is 512²."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(512 * np.sqrt(descriptors / total)).astype(np.float32)

@@ -25,7 +25,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.confidence import confidence_weight
+from pano_mvs.algorithms.filters.data_term import data_term, require_guide
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain, MaxHoleDeg
@@ -115,21 +115,13 @@ def fast_bilateral_solver(
         UsageError: if guide and range map differ in size, or a parameter is out of bounds.
     """
     height, width = range_map.range.shape
-    if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(
-            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
-        )
+    require_guide(guide, range_map)
     if iterations < 0:
         raise UsageError(f"iterations must not be negative, got {iterations}")
     valid = range_map.valid
     if not valid.any():
         return range_map
-    target = np.zeros((height, width))
-    target[valid] = range_map.range[valid]
-    if domain == "inverse":
-        target[valid] = 1 / target[valid]
-    weight = np.where(valid, confidence_weight(range_map.confidence), 0.0)
-    weight /= weight.max()
+    target, weight = data_term(range_map, domain)
     cells = sphere_cells((height, width), sigma_spatial)
     colors = _color_bins(guide, sigma_luma, sigma_chroma)
     smooth, support = solve_bilateral(target, weight, colors, cells=cells, smoothness=smoothness, iterations=iterations)

@@ -34,6 +34,7 @@ def check_consistency(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
+    *,
     source_poses: Sequence[Rigid3],
     **settings: Any,
 ) -> RangeMap:
@@ -42,7 +43,7 @@ def check_consistency(
     See `checked_with_agreement`, which has the same settings and also returns the agreement of the sources with the
     view as a whole.
     """
-    return checked_with_agreement(reference, reference_pose, sources, source_poses, **settings)[0]
+    return checked_with_agreement(reference, reference_pose, sources, source_poses=source_poses, **settings)[0]
 
 
 @checks_settings
@@ -50,8 +51,8 @@ def checked_with_agreement(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
-    source_poses: Sequence[Rigid3],
     *,
+    source_poses: Sequence[Rigid3],
     max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
     max_reprojection_px: Annotated[float, Setting("maximum forward-backward reprojection error", gt=0)] = 1.0,
     max_reprojection_deg: Annotated[
@@ -209,7 +210,8 @@ def compare_with_sources(
         view = np.ascontiguousarray(moved.rotation), np.ascontiguousarray(moved.translation)
         known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
         arguments = ranges, rays, view, known, limits, verdicts, supports, motions
-        for_bands(partial(_judge, kernels.judge_rows, arguments), shape[0], threads=numba.get_num_threads())
+        judge = partial(_judge, kernel=kernels.judge_rows, arguments=arguments)
+        for_bands(judge, shape[0], threads=numba.get_num_threads())
         comparison.agreeing[...] += verdicts == kernels.AGREES
         comparison.contradicting[...] += verdicts == kernels.CONTRADICTS
         comparison.hiding[...] += verdicts == kernels.HIDDEN
@@ -241,7 +243,7 @@ def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
     return Agreement(total, *(share(part) / total if total else 0.0 for part in parts))
 
 
-def _judge(kernel: Callable[..., object], arguments: tuple[object, ...], first: int, rows: int) -> None:
+def _judge(first: int, rows: int, *, kernel: Callable[..., object], arguments: tuple[object, ...]) -> None:
     kernel(first, rows, *arguments)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.confidence import confidence_weight
+from pano_mvs.algorithms.filters.data_term import data_term, require_guide
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain
 from pano_mvs.algorithms.filters.sphere.box import box_spread, box_sum
@@ -56,21 +56,13 @@ def guided_range(
         UsageError: if guide and range map differ in size, or a setting is out of bounds.
     """
     height, width = range_map.range.shape
-    if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(
-            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
-        )
+    require_guide(guide, range_map)
     if radius >= height // 2:
         raise UsageError(f"radius must be less than half the height, {height // 2}, got {radius}")
     valid = range_map.valid
     if not valid.any():
         return range_map
-    target = np.zeros((height, width))
-    target[valid] = range_map.range[valid]
-    if domain == "inverse":
-        target[valid] = 1 / target[valid]
-    weight = np.where(valid, confidence_weight(range_map.confidence), 0.0)
-    weight /= weight.max()
+    target, weight = data_term(range_map, domain)
     smooth, support = guided_values(target, weight, guide.astype(np.float64), radius=radius, epsilon=epsilon)
     kept = support > 0 if fill else valid & (support > 0)
     smooth = np.clip(smooth, target[valid].min(), target[valid].max())

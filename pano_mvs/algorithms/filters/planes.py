@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.data_term import require_guide
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import MaxHoleDeg
-from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
@@ -77,10 +77,7 @@ def lay_planes(
         UsageError: if guide and range map differ in size, or a setting is out of bounds.
     """
     height, width = range_map.range.shape
-    if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(
-            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
-        )
+    require_guide(guide, range_map)
     labels, bare = plain_surfaces(guide, contrast)
     area = np.broadcast_to(pixel_solid_angle((height, width))[:, None], (height, width))
     trusted = range_map.valid & (range_map.confidence >= min_confidence)

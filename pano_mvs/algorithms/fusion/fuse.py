@@ -95,8 +95,8 @@ def fuse_reference(
     reference: FusionView,
     earlier: Sequence[FusionView],
     later: Sequence[FusionView],
-    settings: FusionSettings | None = None,
     *,
+    settings: FusionSettings | None = None,
     threads: int = 1,
 ) -> PointCloud:
     """Return the points that one view contributes to the cloud.

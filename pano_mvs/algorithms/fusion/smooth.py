@@ -89,12 +89,12 @@ def surface_heights(
         arrays = points[order], normals[order], sigmas[order]
         targets = np.flatnonzero(marked[order])
         arguments = arrays, radii[order], targets, cells, per_column, found
-        for_bands(partial(_find, find_heights, arguments), len(targets), threads=threads)
+        for_bands(partial(_find, kernel=find_heights, arguments=arguments), len(targets), threads=threads)
         heights[order[targets]] = found[targets]
     return heights
 
 
-def _find(kernel: Callable[..., object], arguments: tuple[object, ...], first: int, count: int) -> None:
+def _find(first: int, count: int, *, kernel: Callable[..., object], arguments: tuple[object, ...]) -> None:
     kernel(*arguments, (first, first + count))
 
 

@@ -126,9 +126,10 @@ def _view(range_map: RangeMap, picture: Picture, valid: Mask, *, sources: list[t
     rows, columns = (np.arange(new) * old // new for new, old in zip(small_valid.shape, valid.shape, strict=True))
     ranges = range_map.range[rows[:, None], columns]
     consistent = range_map.confidence[rows[:, None], columns] >= CONSISTENT_CONFIDENCE[0]
+    small_sources = [(*_reduced(source, mask), pose) for source, mask, pose in sources]
     comparisons = tuple(
-        compare_with_source(small, ranges, *_reduced(source, mask), source_from_reference=pose)
-        for source, mask, pose in sources
+        compare_with_source(small, ranges, source, source_valid=mask, source_from_reference=pose)
+        for source, mask, pose in small_sources
     )
     return _View(small, small_valid, ranges, consistent, comparisons)
 

@@ -40,8 +40,8 @@ def compare_with_source(
     reference: NDArray[np.uint8],
     ranges: NDArray[np.float32],
     source: NDArray[np.uint8],
-    source_valid: Mask,
     *,
+    source_valid: Mask,
     source_from_reference: Rigid3,
 ) -> Comparison:
     """Look a source up from a reference.

@@ -46,13 +46,14 @@ def match_features(
         )
     if len(first) == 0 or len(second) < 2:
         return np.zeros((0, 2), np.int32)
-    match_descriptors = _match_l2 if first.metric == "l2" else _match_hamming
+    match_descriptors = match_l2 if first.metric == "l2" else _match_hamming
     return match_descriptors(first.descriptors, second.descriptors, ratio=ratio, mutual=mutual)
 
 
-def _match_l2(
-    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float, mutual: bool
+def match_l2(
+    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = 0.8, mutual: bool = True
 ) -> NDArray[np.int32]:
+    """Match descriptors, (N, D) and (M, D), by Euclidean distance; see `match_features`."""
     whole = can_compare_as_integers(first) and can_compare_as_integers(second)
     found = nearest_two_integers(first, second) if whole else nearest_two(first, second)
     kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)

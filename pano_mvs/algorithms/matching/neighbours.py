@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
-from pano_mvs.algorithms.poses.frame.geodesy import local_from_lla
 from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry.geodesy import local_from_lla
 from pano_mvs.scene import GlobalDescriptor, Pairs
 
 FloatArray = NDArray[np.float64]

@@ -128,7 +128,7 @@ def exchange_ranges(
     best.score[wanted] += match.correlation(range_map.range, range_map.normals_in_cam, wanted)[wanted]
     for ranges, normals, agreeing, other in offers:
         scores = match.correlation(ranges, normals, other) + agreement * np.minimum(agreeing, _MOST_AGREEING)
-        best.take(other & (scores > best.score), scores, ranges, normals)
+        best.take(other & (scores > best.score), scores, ranges, normals=normals)
     share = float(best.taken.sum() / max(seen.sum(), 1))
     return RangeMap(best.ranges, range_map.confidence, best.normals, sky=range_map.sky), share
 
@@ -175,7 +175,7 @@ class _Best:
         return _Best(score, range_map.range.copy(), normals, np.zeros(score.shape, np.bool_))
 
     def take(
-        self, where: Mask, scores: NDArray[np.float64], ranges: FloatImage, normals: NDArray[np.float16] | None
+        self, where: Mask, scores: NDArray[np.float64], ranges: FloatImage, *, normals: NDArray[np.float16] | None
     ) -> None:
         """Take over ranges."""
         self.taken |= where

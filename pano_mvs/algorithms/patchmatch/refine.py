@@ -57,8 +57,8 @@ def refine_range(
     range_map: RangeMap,
     reference: Picture,
     sources: Sequence[Picture],
-    source_from_reference: Sequence[Rigid3],
     *,
+    source_from_reference: Sequence[Rigid3],
     rounds: Annotated[int, Setting("number of rounds of fitting and matching planes", ge=0, le=32)] = 4,
     window: Annotated[
         int, Setting("samples along each side of the window, two pixels apart, odd", ge=3, le=15, odd=True)

@@ -44,30 +44,16 @@ def refine_at_scale(
         rounds: number of rounds at the reduced size; at most two follow at the panorama's own size.
         settings: other settings of `refine_range`.
     """
-    poses = source_from_reference
+    settings = {**settings, "source_from_reference": source_from_reference}
     if not halvings:
-        return refine_range(range_map, reference, sources, poses, source_masks=source_masks, rounds=rounds, **settings)
+        return refine_range(range_map, reference, sources, source_masks=source_masks, rounds=rounds, **settings)
     everything = np.ones(reference.shape[:2], np.bool_)
     small, masks = reduced([reference, *sources], [everything, *source_masks], halvings=halvings)
-    coarse = refine_range(
-        reduced_range_map(range_map, halvings=halvings),
-        small[0],
-        small[1:],
-        poses,
-        source_masks=masks[1:],
-        rounds=rounds,
-        **settings,
-    )
+    reduced_map = reduced_range_map(range_map, halvings=halvings)
+    coarse = refine_range(reduced_map, small[0], small[1:], source_masks=masks[1:], rounds=rounds, **settings)
     height, width = range_map.range.shape
     enlarged = enlarged_range_map(coarse, (height, width)).range
     seen = (range_map.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(enlarged)
     start = RangeMap(np.where(seen, enlarged, range_map.range).astype(np.float32), range_map.confidence)
-    return refine_range(
-        start,
-        reference,
-        sources,
-        poses,
-        source_masks=source_masks,
-        rounds=min(rounds, _FINAL_ROUNDS),
-        **settings,
-    )
+    rounds = min(rounds, _FINAL_ROUNDS)
+    return refine_range(start, reference, sources, source_masks=source_masks, rounds=rounds, **settings)

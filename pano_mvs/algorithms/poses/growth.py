@@ -19,7 +19,12 @@ from pano_mvs.algorithms.poses.placement.placed_model import (
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.aliases import find_aliases
-from pano_mvs.algorithms.poses.verification.arbitration import PAIRS_POWER, Arbitration, arbitrate, judge
+from pano_mvs.algorithms.poses.verification.camera_checks import (
+    PAIRS_POWER,
+    CameraChecks,
+    check_cameras,
+    correct_cameras,
+)
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
@@ -45,22 +50,22 @@ class GrownModel:
     Attributes:
         model: the cameras.
         refused: position of each image that could not be added, to the reason.
-        arbitration: result of the check against the images; None if the images were not consulted.
+        checks: result of the check against the images; None if the images were not consulted.
         aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
     """
 
     model: PlacedModel
     refused: dict[int, str]
-    arbitration: Arbitration | None
+    checks: CameraChecks | None
     aliased: bool = False
 
     def is_satisfactory(self) -> bool:
         """Return whether no other model needs to be tried."""
         if self.refused or self.aliased:
             return False
-        if self.arbitration is None:
+        if self.checks is None:
             return self.model.explained_share() > _SATISFYING
-        return not self.arbitration.doubts and not self.arbitration.removed
+        return not self.checks.doubts and not self.checks.removed
 
     def rank(self) -> tuple[float, float]:
         """Return the sort key of models: the share of images and pairs that they explain, best first.
@@ -69,8 +74,8 @@ class GrownModel:
         better than one in which most are confirmed slightly more and one is hardly confirmed.
         """
         confirmed = 0.0
-        if self.arbitration is not None:
-            shares, doubts = self.arbitration.shares, self.arbitration.doubts
+        if self.checks is not None:
+            shares, doubts = self.checks.shares, self.checks.doubts
             confirmed = sum(np.nan_to_num(share) for image, share in shares.items() if image not in doubts)
         return -float(confirmed) * self.model.explained_share() ** PAIRS_POWER, -self.model.explained_weight()
 
@@ -98,17 +103,17 @@ def grown_models(
         if models[-1].is_satisfactory() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
             break
     models.sort(key=GrownModel.rank)
-    if models and models[0].arbitration is not None and confirmation is not None:
-        models[0] = _arbitrated(models[0], adjust=adjust, confirmation=confirmation)
+    if models and models[0].checks is not None and confirmation is not None:
+        models[0] = _corrected(models[0], adjust=adjust, confirmation=confirmation)
     return models
 
 
-def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
+def _corrected(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
     """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
-    arbitration = arbitrate(grown.model, confirmation)
-    if arbitration.moved:
+    checks = correct_cameras(grown.model, confirmation)
+    if checks.moved:
         settle(grown.model, adjust=adjust, confirmation=confirmation)
-    return replace(grown, refused=grown.refused | arbitration.removed, arbitration=arbitration)
+    return replace(grown, refused=grown.refused | checks.removed, checks=checks)
 
 
 def ranked_seeds(
@@ -188,11 +193,11 @@ def _grown(
             reasons[image] = reason
     settle(model, adjust=adjust, confirmation=confirmation)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
-    arbitration = None
+    checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
     if left or aliased or model.explained_share() < _CERTAIN:
-        arbitration = judge(model, confirmation)
-    return GrownModel(model, refused, arbitration, aliased)
+        checks = check_cameras(model, confirmation)
+    return GrownModel(model, refused, checks, aliased)
 
 
 def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:

@@ -15,7 +15,7 @@ from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
-from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_arbitration
+from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
@@ -93,6 +93,6 @@ def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
     if adjust:
         model.adjust()
     poses = normalised_poses(poses_of(model))
-    if grown.arbitration is not None:
-        poses = with_arbitration(poses, model.pairs, grown.arbitration)
+    if grown.checks is not None:
+        poses = with_camera_checks(poses, model.pairs, grown.checks)
     return poses

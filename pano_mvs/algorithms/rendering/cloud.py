@@ -15,8 +15,8 @@ def draw_cloud(
     points: NDArray[np.float32],
     normals: NDArray[np.float32],
     colors_rgb: NDArray[np.uint8],
-    viewpoint: Viewpoint,
     *,
+    viewpoint: Viewpoint,
     size_hw: tuple[int, int],
 ) -> NDArray[np.uint8]:
     """Return an image (H, W, 3) RGB of a cloud; points are squares, larger if there are fewer points.

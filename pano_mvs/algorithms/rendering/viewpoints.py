@@ -59,7 +59,7 @@ def viewpoints(
     towards = np.cos(_OUTSIDE_ELEVATION_RAD) * flat + np.sin(_OUTSIDE_ELEVATION_RAD) * up
     distance = 0.92 * radius / np.tan(np.deg2rad(_OUTSIDE_FOV_DEG) / 2)
     outside = Viewpoint("From outside", middle + towards * distance, middle, up, fov_deg=_OUTSIDE_FOV_DEG)
-    return above, outside, _inside(centers, middle, up, place)
+    return above, outside, _inside(centers, middle, up, place=place)
 
 
 def inside_camera(centers: FloatArray) -> int:
@@ -86,7 +86,7 @@ def facing(points: NDArray[np.float32], normals: NDArray[np.float32], viewpoint:
     return shown
 
 
-def _inside(centers: FloatArray, middle: FloatArray, up: FloatArray, place: str) -> Viewpoint:
+def _inside(centers: FloatArray, middle: FloatArray, up: FloatArray, *, place: str) -> Viewpoint:
     """Return the view from the outermost camera towards the others; forward if there is only one camera."""
     eye = centers[inside_camera(centers)] if len(centers) else middle
     _, forward = horizontal_axes(up)

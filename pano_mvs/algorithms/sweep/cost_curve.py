@@ -170,7 +170,7 @@ def _path_sums(work: SweepInput, row: int, column: int) -> FloatArray:
         start += len(line_rows)
         path = np.zeros((len(total), 1), np.int64)
         for i, penalty in enumerate(penalties):
-            path = path_step(line[:, i : i + 1], path, penalty, p1)
+            path = path_step(line[:, i : i + 1], path, penalty, p1=p1)
         total += path[:, 0]
     return total.astype(np.float64)
 

@@ -81,7 +81,7 @@ def limits_by_sweeping(
         maps[0],
         poses[0],
         maps[1:],
-        poses[1:],
+        source_poses=poses[1:],
         max_relative_error=0.1,
         max_reprojection_px=1.5,
         min_support=0,

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.five_point import essentials_from_five
-from pano_mvs.algorithms.two_view.hypotheses import draw_samples
+from pano_mvs.algorithms.two_view.minimal_solvers import essentials_from_five
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
+from pano_mvs.algorithms.two_view.sampling import draw_samples
 from pano_mvs.algorithms.two_view.significance import (
     MAX_LOG10_FALSE_ALARMS,
     chance_of_pose,
@@ -103,7 +103,7 @@ class _Search:
 
     def geometry(self, pose: Rigid3) -> _Geometry:
         """Return a pose with the matches that agree with it."""
-        return _Geometry(pose, agreement(pose, self.first, self.second, self.threshold_rad)[1])
+        return _Geometry(pose, agreement(pose, self.first, self.second, threshold_rad=self.threshold_rad)[1])
 
     def solutions(self, among: NDArray[np.intp], count: int) -> FloatArray:
         """Return the essential matrices of samples of five matches, (N, 3, 3)."""
@@ -119,10 +119,10 @@ class _Search:
         p, q = self.first[order], self.second[order]
         poses = [best]
         for essential in least_essentials(twins, p, q, threshold_rad=2 * self.threshold_rad, count=_PEAKS):
-            rough = facing_pose(essential, p, q, 2 * self.threshold_rad)
+            rough = facing_pose(essential, p, q, threshold_rad=2 * self.threshold_rad)
             if _differ(rough, best):
                 poses.append(self._settled(rough, p, q, widths=(2.0, 1.0)))
-        costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
+        costs = facing_costs(poses, self.first, self.second, threshold_rad=self.threshold_rad)
         return poses[int(np.argmin(costs))], twins
 
     def next_geometry(self, known: Sequence[_Geometry], pool: FloatArray) -> _Geometry | None:
@@ -136,9 +136,9 @@ class _Search:
         rough = [
             self._settled(pose, p, q, widths=(3.0, 2.0))
             for pose in self._candidates(known, pool, p=p, q=q)
-            if agreement(pose, p, q, 3 * self.threshold_rad)[1].sum() >= needed
+            if agreement(pose, p, q, threshold_rad=3 * self.threshold_rad)[1].sum() >= needed
         ]
-        support = [int(agreement(pose, p, q, 1.5 * self.threshold_rad)[1].sum()) for pose in rough]
+        support = [int(agreement(pose, p, q, threshold_rad=1.5 * self.threshold_rad)[1].sum()) for pose in rough]
         chosen: list[Rigid3] = []
         for idx in np.argsort(support, kind="stable")[::-1]:
             if support[idx] < needed or len(chosen) == _FINALISTS:
@@ -166,12 +166,12 @@ class _Search:
             directions, costs = direction_candidates(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
         finalists = least_essentials(pool, p, q, threshold_rad=wide_rad, count=_PEAKS)
-        return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]
+        return found + [facing_pose(essential, p, q, threshold_rad=wide_rad) for essential in finalists]
 
     def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, *, widths: Sequence[float]) -> Rigid3:
         """Refine on the matches within successively narrower bands, in units of the threshold."""
         for widen in widths:
-            near = agreement(pose, p, q, widen * self.threshold_rad)[1]
+            near = agreement(pose, p, q, threshold_rad=widen * self.threshold_rad)[1]
             if near.sum() < _MIN_REFINED:
                 break
             scale_rad = 0.5 * widen * self.threshold_rad

@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3:
+def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3:
     """Return the decomposition of an essential matrix with most inliers in front of both cameras.
 
     Args:
@@ -31,7 +31,7 @@ def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, th
 
 
 def agreement(
-    pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float
+    pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float
 ) -> tuple[FloatArray, BoolArray]:
     """Return the Sampson errors, (M,), and which matches agree with a pose, |t| = 1.
 
@@ -45,7 +45,7 @@ def agreement(
     return residuals, agreeing
 
 
-def facing_costs(poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
+def facing_costs(poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, *, threshold_rad: float) -> FloatArray:
     """Return Σ min(r² / threshold², 1) for each pose, where a match behind a camera costs 1.
 
     Matches on one plane fit two essential matrices exactly; only cheirality distinguishes these.

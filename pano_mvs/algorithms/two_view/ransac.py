@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.essential import essential_from_bearings
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, MinimalSolver, Solver, draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver, Solver
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
+from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
@@ -108,7 +109,7 @@ def estimate_two_view(
         pose = _refined(pose, first, second, threshold_rad=threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is supported by eight matches")
-    residuals, inliers = agreement(pose, first, second, threshold_rad)
+    residuals, inliers = agreement(pose, first, second, threshold_rad=threshold_rad)
     return RelativePose(pose, inliers, residuals, iterations)
 
 
@@ -119,7 +120,7 @@ def _none(count: int, reason: str) -> RelativePose:
 def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3 | None:
     """Minimise the angular error over the matches around the inliers; None if fewer than eight are left."""
     for _ in range(3):
-        residuals, near = agreement(pose, first, second, 2 * threshold_rad)
+        residuals, near = agreement(pose, first, second, threshold_rad=2 * threshold_rad)
         if near.sum() < _MIN_INLIERS:
             return None
         core = residuals[near & (residuals < threshold_rad)]
@@ -180,8 +181,10 @@ class _Search:
         )
         if not len(finalists):
             return None, np.inf, len(hypotheses)
-        poses = [facing_pose(essential, self.first, self.second, self.threshold_rad) for essential in finalists]
-        costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
+        poses = [
+            facing_pose(essential, self.first, self.second, threshold_rad=self.threshold_rad) for essential in finalists
+        ]
+        costs = facing_costs(poses, self.first, self.second, threshold_rad=self.threshold_rad)
         return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
 
     def _optimised(self, pose: Rigid3, cost: float) -> tuple[Rigid3, float]:
@@ -189,7 +192,7 @@ class _Search:
         candidates = self._polished(pose) if self.solver.sample == 5 else self._refitted(pose)
         if not candidates:
             return pose, cost
-        costs = facing_costs(candidates, self.first, self.second, self.threshold_rad)
+        costs = facing_costs(candidates, self.first, self.second, threshold_rad=self.threshold_rad)
         best = int(np.argmin(costs))
         return (candidates[best], float(costs[best])) if costs[best] < cost else (pose, cost)
 
@@ -217,9 +220,9 @@ class _Search:
                 break
             essential = essential_from_bearings(self.first[inliers], self.second[inliers])
             some = np.flatnonzero(inliers)[:: 1 + int(inliers.sum()) // _POLISH]
-            pose = facing_pose(essential, self.first[some], self.second[some], self.threshold_rad)
+            pose = facing_pose(essential, self.first[some], self.second[some], threshold_rad=self.threshold_rad)
             found.append(pose)
         return found
 
     def _residuals(self, pose: Rigid3) -> FloatArray:
-        return agreement(pose, self.first, self.second, self.threshold_rad)[0]
+        return agreement(pose, self.first, self.second, threshold_rad=self.threshold_rad)[0]

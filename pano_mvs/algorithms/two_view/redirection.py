@@ -39,7 +39,7 @@ def best_redirected(
         for _ in range(_ROUNDS if len(poses) > 1 else 1):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
-    costs = facing_costs(candidates, first, second, threshold_rad)
+    costs = facing_costs(candidates, first, second, threshold_rad=threshold_rad)
     return candidates[int(np.argmin(costs))]
 
 
@@ -50,12 +50,12 @@ def _redirected(
     p, q = first[chosen], second[chosen]
     directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
     directions = np.concatenate([pose.translation[None], directions])
-    costs = np.concatenate([facing_costs([pose], p, q, 2 * threshold_rad), costs])
+    costs = np.concatenate([facing_costs([pose], p, q, threshold_rad=2 * threshold_rad), costs])
     found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
     for widen in (2.0, 0.5):
         found = refine_relative_pose(found, p, q, scale_rad=widen * threshold_rad, max_iterations=_STEPS)
     opposite = Rigid3(found.rotation, -found.translation)
-    costs = facing_costs([found, opposite], p, q, threshold_rad)
+    costs = facing_costs([found, opposite], p, q, threshold_rad=threshold_rad)
     return found if costs[0] <= costs[1] else opposite
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver
+from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
@@ -106,7 +106,7 @@ def verify_pair(
         min_inliers=min_inliers,
         most=max_alternatives,
     )
-    costs = facing_costs(poses, p, q, threshold_rad)
+    costs = facing_costs(poses, p, q, threshold_rad=threshold_rad)
     views = [view for idx in np.argsort(costs, kind="stable") if (view := pair.judged(poses[idx]))]
     return views[0].with_alternatives(sorted(views[1:], key=len, reverse=True)) if views else best
 
@@ -122,7 +122,7 @@ class _Pair:
 
     def judged(self, pose: Rigid3) -> TwoView:
         """Return the geometry of a pose, or why its matches do not determine it."""
-        residuals, kept = agreement(pose, self.p, self.q, self.threshold_rad)
+        residuals, kept = agreement(pose, self.p, self.q, threshold_rad=self.threshold_rad)
         p, q, residuals = self.p[kept], self.q[kept], residuals[kept]
         noise_rad = max(float(np.sqrt(np.mean(residuals**2))), 0.1 * self.threshold_rad)
         # Clustered matches count as one.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,15 +13,15 @@ from rich.markup import escape
 
 from pano_mvs.cli.inspect.text import as_json_value, print_inspection
 from pano_mvs.core.errors import InputError, StoreError, UsageError
-from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.scene import RangeMap
-from pano_mvs.session.session import Session, open_session
+from pano_mvs.session.commands import run_command
+from pano_mvs.session.session import Session
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect.inspection import Inspection
 from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
@@ -66,32 +65,6 @@ def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Pa
     print_inspection(found, console)
     if plot is not None:
         console.print(f"plot in {escape(str(plot))}", highlight=False, soft_wrap=True)
-
-
-def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cache: Path | None) -> Session:
-    """Open a workflow, or that of an output folder with the settings, images and cache of its run.
-
-    Raises:
-        InputError: if the folder has no run.json, or its workflow file is missing.
-    """
-    out = Path(target)
-    if not is_folder(out):
-        return open_session(target, overrides=overrides, images=images, cache=cache)
-    summary = RunSummary.read(out)
-    workflow = Path(summary.workflow.path)
-    if not is_file(workflow):
-        raise InputError(
-            f"{out}: its workflow {workflow} is missing. Specify another: pano-mvs inspect WORKFLOW IMAGE X Y"
-        )
-    # A relative folder is relative to where the run was started; the settings contain the absolute path.
-    folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
-    given = [
-        f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
-        for one in summary.workflow.overrides
-    ]
-    if cache is None and summary.cache:
-        cache = cache_of(summary)
-    return open_session(str(workflow), overrides=[*given, *overrides], images=images, cache=cache, out=out)
 
 
 @dataclass
@@ -156,20 +129,9 @@ def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, *, session: Ses
         return (
             f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
             f"pictures and version. Inspect the output folder of a run in place of the workflow, or run the "
-            f"workflow with these settings first, or just that: {_run_command(session, f'{sweep}:{image}')}"
+            f"workflow with these settings first, or just that: {run_command(session, '--only', f'{sweep}:{image}')}"
         )
     return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
-
-
-def _run_command(session: Session, unit: str) -> str:
-    """Return the command that computes a unit with this session's settings, images and cache."""
-    words = ["pano-mvs", "run", str(session.workflow.path), "--cache", str(session.store_root), "--only", unit]
-    for override in session.workflow.overrides:
-        setting, _, _ = override.partition("=")
-        path = getattr(session.workflow.stages["images"].params, "path", None) if setting == "images.path" else None
-        # --images is stored as a setting, but in its original form, which may not be valid YAML.
-        words += ["--images", str(path)] if isinstance(path, Path) and is_folder(path) else ["--set", override]
-    return shlex.join(words)
 
 
 def _truth_of(session: Session, image: str) -> Path | None:

@@ -36,7 +36,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
     if not found:
         console.print(escape(f"{label}: {_why_not(plan, item)}"), highlight=False, soft_wrap=True)
         return
-    for line in _lines(*found[0], store):
+    for line in _lines(*found[0], store=store):
         console.print(escape(line), highlight=False, soft_wrap=True)
 
 
@@ -50,7 +50,7 @@ def _why_not(plan: StagePlan, item: str) -> str:
     raise UsageError(f"{plan.name} has no unit {item!r}; it has: {shown or 'none'}")
 
 
-def _lines(unit: Unit, record: UnitRecord | None, reason: str, store: Store) -> list[str]:
+def _lines(unit: Unit, record: UnitRecord | None, reason: str, *, store: Store) -> list[str]:
     spec = unit.entry.spec
     lines = [
         f"{unit.label}: {'cached' if record is not None else f'would run: {reason}'}",

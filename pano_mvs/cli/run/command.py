@@ -11,8 +11,8 @@ from types import FrameType
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.json_events import JsonEvents
-from pano_mvs.cli.run.printing import print_summary
-from pano_mvs.cli.run.progress import ProgressBars
+from pano_mvs.cli.run.printing import next_commands, print_summary
+from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session
@@ -27,9 +27,9 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
                 with redirect_stdout(sys.stderr):  # a plugin may print in this process
                     return run_session(session, execution, JsonEvents(stream)).summary.exit_code
             console = Console(file=stream)
-            with ProgressBars(console) as bars:
+            with ProgressDisplay(console) as bars:
                 output = run_session(session, execution, bars)
-            print_summary(output, console)
+            print_summary(output, console, following=next_commands(output, session))
             return output.summary.exit_code
     finally:
         if stream is not sys.stdout:

@@ -3,11 +3,13 @@
 Every object has `event` and `time` (seconds since 1970). The events, in the order in which they can come:
 
     run_started     schema (1), workflow, stages (names, in order), executor, workers, threads, out
+    forecast        stages (stage, after, cached, units, unit_s, unit_bytes; null if unknown), report_s
     stage_started   stage, units
     unit_started    stage, item                             only for units that are computed
     unit_failed     stage, item, cause, consequence, log (file or ""), said (the last lines that it printed)
     unit_finished   stage, item, outcome ("run" | "cached" | "failed" | "blocked"), seconds
     stage_finished  stage, use, units, run, cached, failed, blocked, seconds, unit_seconds, metrics
+    time_left       seconds_left, at_least, done (0 to 1), unknown (stages); at most once a second
     warning         text
     run_finished    exit_code, stopped, run, cached, failed, blocked, seconds, out; and of a run that was not broken off
                     verdict (mood, outcome, judgement, sentence, tiles, findings (mood, text, remedy), as in the

@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from statistics import median
 
 from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
+from pano_mvs.core.paths import resolved
 from pano_mvs.core.text import one_line, plural
 from pano_mvs.results.records import Number, ScoresSummary, Verdict
 from pano_mvs.results.run_output import RunOutput
-from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.summary import RunSummary, cache_of
+from pano_mvs.session.commands import run_command
+from pano_mvs.session.session import Session
 from pano_mvs.viewer.shown_scene import is_to_see
 
 _SHOWN_FAILURES = 20
 
 
-def print_summary(output: RunOutput, console: Console) -> None:
-    """Print the summary of a run: counts, failures, scores, the verdict, and where the results are."""
-    summary, out = output.summary, str(output.out)
+def print_summary(output: RunOutput, console: Console, *, following: Sequence[str] = ()) -> None:
+    """Print the summary of a run: counts, failures, scores, the verdict and its reasons, and what to type next.
+
+    Args:
+        output: the output of the run.
+        console: where to print.
+        following: the commands to type next; see `next_commands`.
+    """
+    summary = output.summary
     units = summary.units
     failed = f", {units.failed} failed" if units.failed else ""
-    cached = " (nothing to compute)" if not units.run and not units.failed else ""
+    is_idle = not (units.run or units.failed or summary.stopped)
+    cached = " (nothing to compute)" if is_idle else ""
     counts = f"{units.run} {plural(units.run, 'unit')} computed, {units.cached} cached{failed}"
     console.print(f"\n{counts} in {summary.seconds or 0:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
@@ -37,15 +48,39 @@ def print_summary(output: RunOutput, console: Console) -> None:
         count = len(summary.left_over)
         text = f"{count} {plural(count, 'file')} of an earlier run, which this run did not write,"
         console.print(f"{text} {plural(count, 'is', 'are')} still there", highlight=False)
-    _print_verdict(output.verdict, console)
-    look = f", or look around with pano-mvs view {escape(shlex.quote(out))}" if is_to_see(summary.files) else ""
+    print_verdict(output.verdict, console)
     count = len(summary.files)
     files = f"{count} {plural(count, 'file')}, {len(output.written)} written now"
-    console.print(
-        f"results in {escape(out)} ({files}): open report.html{look}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    report = f"; open {escape(str(output.out / 'report.html'))} in a browser"
+    console.print(f"results in {escape(str(output.out))} ({files}){report}", highlight=False, soft_wrap=True)
+    _print_next(following, console)
+
+
+def next_commands(output: RunOutput, session: Session) -> list[str]:
+    """Return the commands to type after a run, which can be pasted in the current folder.
+
+    A run that has failed units, or that ended early, can be repeated once the cause is removed. A partial run can be
+    continued with the rest. Results can be looked at and sent.
+    """
+    summary, out = output.summary, str(output.out)
+    commands = []
+    if summary.stopped or summary.failures or session.run_options.is_partial:
+        commands.append(run_command(session))
+    if is_to_see(summary.files):
+        commands.append(shlex.join(["pano-mvs", "view", out]))
+    if summary.cloud.points or summary.views:
+        words = ["pano-mvs", "share", out, "--to", f"{out}_page"]
+        if resolved(cache_of(summary)) != resolved(Path(summary.cache)):
+            words += ["--cache", summary.cache]
+        commands.append(shlex.join(words))
+    return commands
+
+
+def _print_next(commands: Sequence[str], console: Console) -> None:
+    if commands:
+        console.print("next:", highlight=False)
+    for command in commands:
+        console.print(f"  {escape(command)}", highlight=False, soft_wrap=True)
 
 
 def _print_failures(summary: RunSummary, console: Console) -> None:
@@ -71,7 +106,7 @@ def _print_poses(summary: RunSummary, console: Console) -> None:
         console.print(escape(text), highlight=False)
 
 
-def _print_verdict(verdict: Verdict, console: Console) -> None:
+def print_verdict(verdict: Verdict, console: Console) -> None:
     """Print the verdict of the report and its findings."""
     if verdict.judgement:
         console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)

@@ -1,119 +1,193 @@
-"""A progress bar per stage and one for the run on a terminal, plain lines elsewhere."""
+"""Show the progress of a run: live lines on a terminal, plain lines now and then elsewhere."""
 
 from __future__ import annotations
 
+import math
+import threading
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from types import TracebackType
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
-from pano_mvs.cli.run.estimate import Estimate
+from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
 from pano_mvs.session.progress import (
     Event,
+    Forecast,
     RunStarted,
     StageFinished,
-    StageStarted,
+    TimeLeft,
     UnitFailed,
-    UnitFinished,
     Warned,
 )
+from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
+_FIRST_LINE_S = 10.0
 _LINE_EVERY_S = 30.0
+_REFRESHES_PER_S = 4
 _SHOWN_LINES = 5
+_SHOWN_STAGES = 6
+_SHOWN_UNITS = 2
+_BAR_WIDTH = 20
+_NAME_WIDTH = 14
 
 
-class ProgressBars:
-    """A progress callback that draws the progress of a run."""
+class ProgressDisplay:
+    """A progress callback that shows the progress of a run; a context within which the display is live."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console
-        self._stages = 0
-        self._estimate = Estimate()
-        self._tasks: dict[str, TaskID] = {}
-        self._run: TaskID | None = None
-        self._progress: Progress | None = None
-        self._next_line_s = time.monotonic() + _LINE_EVERY_S
-        if console.is_terminal:
-            columns = (TextColumn("{task.description:<14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-            self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
+        self._clock = clock
+        self._estimator = TimeEstimator(clock)
+        self._countdown = Countdown()
+        self._began = clock()
+        self._lock = threading.RLock()  # the display is drawn by a thread of its own
+        self._open = ExitStack()
+        self._has_begun = False
 
-    def __enter__(self) -> ProgressBars:
-        """Start drawing."""
-        if self._progress is not None:
-            self._progress.start()
-            self._run = self._progress.add_task("[bold]all[/]", total=0, state="")
+    def __enter__(self) -> ProgressDisplay:
+        """Start to draw."""
+        if self.console.is_terminal:
+            self._open.enter_context(
+                Live(
+                    get_renderable=self.live_lines,
+                    console=self.console,
+                    refresh_per_second=_REFRESHES_PER_S,
+                    transient=True,
+                    redirect_stdout=False,
+                    redirect_stderr=False,
+                )
+            )
+        else:
+            self._open.enter_context(_Repeated(self.print_line, first_s=_FIRST_LINE_S, every_s=_LINE_EVERY_S))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop drawing."""
-        if self._progress is not None:
-            self._progress.stop()
+        self._open.close()
 
     def __call__(self, event: Event) -> None:
         """Show an event."""
+        with self._lock:
+            self._estimator(event)
         match event:
-            case RunStarted(stages=stages, workers=workers):
-                self._stages, self._estimate = len(stages), Estimate(workers)
-            case StageStarted():
-                self._start_stage(event.stage, event.units)
+            case RunStarted():
+                self._has_begun = True
+            case Forecast():
+                self._countdown = Countdown()  # begin with the forecast rather than glide to it
             case UnitFailed():
-                self._show_failure(event)
-            case UnitFinished():
-                self._count_unit(event)
+                self._print_failure(event)
             case StageFinished():
-                self._finish_stage(event)
+                self._print_stage(event)
             case Warned(text=text):
                 self.console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False)
             case _:
-                pass  # the bars show what is done
+                pass  # the live lines show it
 
-    def _start_stage(self, name: str, units: int) -> None:
-        """Add a bar, or reset it."""
-        self._estimate.start(name, units)
-        if self._progress is None or self._run is None:
-            return
-        if name in self._tasks:
-            self._progress.reset(self._tasks[name], total=units, state="")
-        else:
-            self._tasks[name] = self._progress.add_task(escape(name), total=units, state="")
-        known = self._estimate.stages.values()
-        self._progress.update(
-            self._run, total=sum(clock.units for clock in known), completed=sum(c.done for c in known)
-        )
+    def live_lines(self) -> Group:
+        """Return the stages that are being computed, and the state of the whole run."""
+        with self._lock:
+            now, left = self._clock(), self._estimator.estimate()
+            seconds_left = self._countdown.show(left.seconds_left, now)
+            stages = self._running()
+            table = Table.grid(padding=(0, 2))
+            for name, stage in stages[:_SHOWN_STAGES]:
+                bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=_BAR_WIDTH)
+                table.add_row(
+                    Text(one_line(name).ljust(_NAME_WIDTH)),
+                    bar,
+                    _count(stage),
+                    clock_text(stage.own_s(now)),
+                    _units(stage),
+                )
+            if len(stages) > _SHOWN_STAGES:
+                table.add_row(f"… and {len(stages) - _SHOWN_STAGES} more")
+            total = Table.grid(padding=(0, 2))
+            text = self._left_text(left, clock_text(math.ceil(seconds_left)), seconds_left)
+            total.add_row(
+                Text("all".ljust(_NAME_WIDTH), style="bold"),
+                ProgressBar(total=1.0, completed=left.done, width=_BAR_WIDTH),
+                f"{100 * left.done:.0f} %",
+                clock_text(now - self._began),
+                Text(text, overflow="ellipsis", no_wrap=True),
+            )
+            return Group(table, total)
 
-    def _show_failure(self, failure: UnitFailed) -> None:
+    def print_line(self) -> None:
+        """Print the state of the run in one line."""
+        with self._lock:
+            left = self._estimator.estimate()
+            text = self._left_text(left, duration_text(left.seconds_left), left.seconds_left)
+            stages = [f"{one_line(name)} {_count(stage)}" for name, stage in self._running()]
+        now = f" (now: {shortened_list(stages)})" if stages else ""
+        self.console.print(escape(f"{100 * left.done:.0f} %, {text}{now}"), highlight=False, soft_wrap=True)
+
+    def _running(self) -> list[tuple[str, StageProgress]]:
+        return [(name, stage) for name, stage in self._estimator.stages.items() if stage.running]
+
+    def _left_text(self, left: TimeLeft, shown: str, seconds: float) -> str:
+        if not self._has_begun:
+            return "starting"
+        if self._estimator.is_reporting:
+            return f"about {shown} left (writing the report)"
+        unknown = shortened_list(map(one_line, left.unknown))
+        if left.at_least and seconds < 1:
+            return f"time left not known yet: no earlier run has computed {unknown}"
+        return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
+
+    def _print_failure(self, failure: UnitFailed) -> None:
         """Print a failure and the last lines of the unit's output."""
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
         self.console.print(f"[red]failed[/] {escape(label)}", highlight=False, soft_wrap=True)
         for line in failure.said[-_SHOWN_LINES:]:
             self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
 
-    def _count_unit(self, unit: UnitFinished) -> None:
-        """Advance the bars, or print a line now and then."""
-        name = unit.stage
-        self._estimate.count(name, unit.seconds, computed=unit.outcome in ("run", "failed"))
-        if self._progress is not None and self._run is not None:
-            self._progress.update(self._tasks[name], advance=1, state=self._estimate.of_stage(name))
-            self._progress.update(self._run, advance=1, state=self._estimate.of_run(self._stages))
-        elif time.monotonic() > self._next_line_s:
-            self._next_line_s = time.monotonic() + _LINE_EVERY_S
-            clock = self._estimate.stages[name]
-            times = {"stage": self._estimate.of_stage(name), "run": self._estimate.of_run(self._stages)}
-            left = ", ".join(f"{whose}: {text}" for whose, text in times.items() if text)
-            self.console.print(f"{name:<14} {clock.done} of {clock.units}  {left}", highlight=False)
-
-    def _finish_stage(self, summary: StageFinished) -> None:
-        """Show what the stage did."""
+    def _print_stage(self, summary: StageFinished) -> None:
+        """Print what a stage did."""
         parts = [f"{summary.run} run", f"{summary.cached} cached"]
         parts += [
             f"{count} {what}" for what, count in (("failed", summary.failed), ("blocked", summary.blocked)) if count
         ]
-        text = ", ".join(parts)
-        if self._progress is not None:
-            self._progress.update(self._tasks[summary.stage], state=text)
-        else:
-            self.console.print(f"{summary.stage:<14} {text}  {summary.seconds:.1f} s", highlight=False)
+        name = one_line(summary.stage).ljust(_NAME_WIDTH)
+        self.console.print(escape(f"{name} {', '.join(parts)}  {summary.seconds:.1f} s"), highlight=False)
+
+
+def _count(stage: StageProgress) -> str:
+    return f"{stage.done} of {stage.units}"
+
+
+def _units(stage: StageProgress) -> Text:
+    """Return the units that are being computed; nothing for a stage with a single unit."""
+    names = [one_line(item) for item in stage.running if item]
+    more = f" and {len(names) - _SHOWN_UNITS} more" if len(names) > _SHOWN_UNITS else ""
+    return Text(", ".join(names[:_SHOWN_UNITS]) + more, overflow="ellipsis", no_wrap=True)
+
+
+class _Repeated:
+    """A context during which a function is called again and again by a thread."""
+
+    def __init__(self, function: Callable[[], None], *, first_s: float, every_s: float) -> None:
+        self._function, self._first_s, self._every_s = function, first_s, every_s
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _repeat(self) -> None:
+        pause_s = self._first_s
+        while not self._end.wait(pause_s):
+            self._function()
+            pause_s = self._every_s

@@ -93,8 +93,8 @@ def usage_of(store: Store) -> list[StageUsage]:
         total = totals.setdefault(_stage_of(record), [0, 0, 0.0])
         total[0] += 1
         total[2] += record.seconds
-        for ref in record.blobs():
-            if not ref.external and ref.digest not in seen:
+        for ref in record.own_blobs():
+            if ref.digest not in seen:
                 seen.add(ref.digest)
                 total[1] += ref.size_bytes
     found = [StageUsage(name, int(units), int(size), seconds) for name, (units, size, seconds) in totals.items()]
@@ -161,7 +161,7 @@ def _verify_record(
         found.removed.append(path)
         return None
     # A running workflow may have written other blobs after the blobs were checked.
-    blobs = (ref for ref in record.blobs() if not ref.external and f"{ref.digest}{ref.suffix}" not in intact)
+    blobs = (ref for ref in record.own_blobs() if f"{ref.digest}{ref.suffix}" not in intact)
     if all(_digest(store.blobs.path(ref)) == ref.digest for ref in blobs):
         found.records += 1
         return record

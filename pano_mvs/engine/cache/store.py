@@ -2,7 +2,8 @@
 
 Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (the key of each unit in
 the latest run of a workflow into a folder, for the reasons in plans and for garbage collection), `pins/` (protected
-runs), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder as a cache.
+runs), `stat-cache.json`, `unit-times.json` (for estimates), `tmp/`, `layout.json`, and an empty file that marks the
+folder as a cache.
 
 What is cached follows from the records alone: there is no status file that could be wrong, and no lock. A record is
 written after its blobs. Files get their names by renaming, are never changed, and are never links, so that any number
@@ -29,6 +30,7 @@ from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packed_refs import PackedRefs
 from pano_mvs.engine.cache.stat_cache import StatCache
+from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
 
 LAYOUT_VERSION = 2
@@ -176,6 +178,10 @@ class UnitRecord:
         for item in (self.output, *self.items.values()):
             yield from item.parts.values()
 
+    def own_blobs(self) -> Iterator[BlobRef]:
+        """Yield the blobs in the cache, without files of the user."""
+        return (ref for ref in self.blobs() if not ref.external)
+
 
 class Store:
     """The cache of one or many workflows."""
@@ -205,6 +211,7 @@ class Store:
         self._clear_abandoned()
         self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
+        self.unit_times = UnitTimes(root / FILE_NAME)
         self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
 
     def find(self, key: str) -> UnitRecord | None:

@@ -31,7 +31,6 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
     Raises:
         UsageError: if the arguments contradict each other, or the executor is not installed or cannot be reached.
     """
-    cores = available_threads()
     name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, "")) or "processes"
     if name not in EXECUTORS:
         raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS)}")
@@ -41,11 +40,21 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         if workers > 1:
             raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
         return SerialExecutor(store, threads=threads)
-    if not workers and not threads:
-        workers = max(1, min(cores, free_memory_bytes() // _WORKER_BYTES or cores))
-    workers, threads = share_cores(cores, workers=workers, threads=threads)
+    workers, threads = shape(workers, threads)
     if name == "processes":
         return ProcessExecutor(store, workers=workers, threads=threads)
     from pano_mvs.engine.executors.dask_cluster import DaskExecutor
 
     return DaskExecutor(store, workers=workers, threads=threads, scheduler=scheduler)
+
+
+def shape(workers: int = 0, threads: int = 0) -> tuple[int, int]:
+    """Return the number of workers on this host and the threads of each, as `make_executor` chooses them.
+
+    Raises:
+        UsageError: if there are not enough cores.
+    """
+    cores = available_threads()
+    if not workers and not threads:
+        workers = max(1, min(cores, free_memory_bytes() // _WORKER_BYTES or cores))
+    return share_cores(cores, workers=workers, threads=threads)

@@ -18,7 +18,7 @@ from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality, Names, Port
 from pano_mvs.scene import Axis
-from pano_mvs.scene.index import pair_from_name
+from pano_mvs.scene.pairs_and_views import pair_from_name
 
 # A process may open only about a thousand files, and a stage may read several kinds.
 _MAX_OPEN_FILES = 128

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.perform import perform
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
+from pano_mvs.engine.executors.unit_outcome import unit_outcome
 
 
 class SerialExecutor:
@@ -33,7 +33,7 @@ class SerialExecutor:
         if not self._jobs or timeout_s == 0:
             return None
         job = self._jobs.pop(0)
-        return job.number, perform(job.unit, self._store, threads=job.threads, log=job.log)
+        return job.number, unit_outcome(job.unit, self._store, threads=job.threads, log=job.log)
 
     def free_memory_bytes(self) -> int:
         """Return the free memory of this host."""

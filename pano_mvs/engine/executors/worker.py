@@ -22,7 +22,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles interrupts
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(requests_in, requests), daemon=True).start()
-    from pano_mvs.engine.executors.workplace import run_request  # after the streams, because imports may print
+    from pano_mvs.engine.executors.worker_requests import run_request  # after the streams, because imports may print
 
     _answer(answers_out, {"ready": True})
     while True:

@@ -9,6 +9,7 @@ from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.reasons import reason_to_run
 from pano_mvs.engine.planning.resolve import resolve
 from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
@@ -43,6 +44,7 @@ def make_plan(
     store: Store,
     *,
     options: RunOptions = DEFAULT_OPTIONS,
+    listing: SourceListing | None = None,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
 ) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
@@ -52,6 +54,7 @@ def make_plan(
         graph: likewise.
         store: the cache.
         options: of the run.
+        listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 
     Raises:
@@ -63,7 +66,7 @@ def make_plan(
     for name in graph.order:
         entry = workflow.stages[name]
         state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
-        units, resolution = resolve(entry, graph, states=states, store=store)
+        units, resolution = resolve(entry, graph, states=states, store=store, listing=listing)
         for unit in units:
             record = None
             if not options.refreshes(unit):

@@ -69,9 +69,14 @@ def resolve_source(
 
 
 def resolve(
-    entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store
+    entry: StageEntry,
+    graph: Graph,
+    *,
+    states: Mapping[str, StageState],
+    store: Store,
+    listing: SourceListing | None = None,
 ) -> tuple[Iterator[Unit], Resolution]:
-    """Return the units of a stage, given the states of the stages that feed it.
+    """Return the units of a stage, given the states of the stages that feed it; see `resolve_source` for `listing`.
 
     Returns:
         An iterator over the units whose inputs are all known, and a resolution that describes the others once the
@@ -79,7 +84,7 @@ def resolve(
         take more memory than everything else.
     """
     if entry.spec.list_items is not None:
-        resolution = resolve_source(entry, store, only=graph.only.get(entry.name))
+        resolution = resolve_source(entry, store, only=graph.only.get(entry.name), listing=listing)
         return iter(resolution.units), resolution
     resolver = Resolver(entry, graph, states=states, store=store)
     return resolver.resolve(), resolver.resolution

@@ -32,6 +32,11 @@ class RunOptions:
     accept_code: bool = False
     keep_going: bool = False
 
+    @property
+    def is_partial(self) -> bool:
+        """Whether the run is limited to some stages or units."""
+        return bool(self.until or self.only)
+
     def applied_to(self, workflow: Workflow, graph: Graph) -> tuple[Workflow, Graph]:
         """Return the workflow and the graph with the options applied.
 

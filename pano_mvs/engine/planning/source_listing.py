@@ -13,6 +13,7 @@ from pathlib import Path
 from pano_mvs.core.errors import ChangedFileError, InputError
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene.record import changed_text, vanished_text
@@ -47,6 +48,11 @@ class SourceListing:
         if entry.name not in self._items:
             self._items[entry.name] = tuple(entry.spec.list_items(entry.params))
         return self._items[entry.name]
+
+    def size(self) -> CaptureSize:
+        """Return the size of the capture: that of the source with the most images."""
+        files = [[tuple(item.files.values()) for item in items if not item.problem] for items in self._items.values()]
+        return CaptureSize.of_files(max(files, key=len, default=[]))
 
     def digest(self, path: Path, store: Store) -> str:
         """Return the digest of a listed file, and register the file with the store under it.

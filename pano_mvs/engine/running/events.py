@@ -8,6 +8,8 @@ from typing import Literal, Protocol
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
+_MIN_UNITS_WITHOUT_SLOWEST = 4
+
 UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
@@ -54,8 +56,10 @@ class StageSummary:
         run: number of units that were computed.
         failed: number of units that failed.
         blocked: number of units that did not run because an input failed.
-        seconds: time from the start of its first unit to the end of its last, while other stages may have run too.
+        seconds: time during which at least one of its units was being computed; other stages may have run too.
         unit_seconds: computing time of its units together.
+        slowest_s: computing time of its slowest unit.
+        stored_bytes: bytes of the results that its computed units stored in the cache.
         metrics: mean of each metric over the units.
         unit_metrics: unit to its own metrics.
         notes: what a user should know.
@@ -70,9 +74,18 @@ class StageSummary:
     blocked: int = 0
     seconds: float = 0.0
     unit_seconds: float = 0.0
+    slowest_s: float = 0.0
+    stored_bytes: int = 0
     metrics: dict[str, float] = field(default_factory=dict)
     unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def typical_unit_s(self) -> float:
+        """Mean time of its computed units; of four or more without the slowest, which may include compilation."""
+        if self.run >= _MIN_UNITS_WITHOUT_SLOWEST:
+            return max(0.0, self.unit_seconds - self.slowest_s) / (self.run - 1)
+        return self.unit_seconds / self.run if self.run else 0.0
 
 
 @dataclass(slots=True)
@@ -142,6 +155,9 @@ class Observer(Protocol):
     def stage_finished(self, summary: StageSummary) -> None:
         """A stage is complete."""
 
+    def waiting(self) -> None:
+        """Called every few seconds while units are being computed and nothing else happens, if the executor allows."""
+
     def warn(self, text: str) -> None:
         """There is a warning for the user; the run goes on."""
 
@@ -162,6 +178,9 @@ class SilentObserver:
         """Do nothing."""
 
     def stage_finished(self, summary: StageSummary) -> None:
+        """Do nothing."""
+
+    def waiting(self) -> None:
         """Do nothing."""
 
     def warn(self, text: str) -> None:

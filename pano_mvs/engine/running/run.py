@@ -25,8 +25,10 @@ from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.cache.unit_times import Sample
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.planning.forecast import settings_digest
 from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.planning.source_listing import SourceListing
@@ -42,6 +44,9 @@ from pano_mvs.scene import Axis, Files, Record
 
 GRACE_S = 10.0
 """Time for which running units may go on after an interrupt, so that their results are not lost."""
+
+WAIT_S = 5.0
+"""Time without an event after which observers are notified that the run is waiting for units."""
 
 _MAX_REPAIRS = 3
 _STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
@@ -184,15 +189,35 @@ class Run:
                 self._pass.drain()
 
     def _remember(self) -> None:
-        """Store the keys and file digests for the next run; the run does not fail if that is impossible."""
+        """Store keys, file digests and times for the next run; the run does not fail if that is impossible."""
         finished = self._has_passed and not self.result.stopped and not self.graph.is_part
         try:
             self.store.runs.remember(
                 self.workflow.id, self.keys, workflow=self.workflow.name, out=self.out, finished=finished
             )
             self.store.stat_cache.save()
+            self._remember_times()
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
+
+    def _remember_times(self) -> None:
+        """Store what the units of each stage took, for the estimates of later runs."""
+        computed = [summary for summary in self.result.stages if summary.run]
+        if not computed:
+            return
+        size = self.listing.size()
+        for summary in computed:
+            sample = Sample(
+                settings_digest(self.workflow.stages[summary.name]),
+                self.executor.threads,
+                images=size.images,
+                pixels=size.pixels,
+                units=summary.units,
+                seconds=summary.typical_unit_s,
+                stored_bytes=summary.stored_bytes / summary.run,
+            )
+            self.store.unit_times.add(summary.use, sample)
+        self.store.unit_times.save()
 
     def _list_files(self) -> None:
         """Enter into the result which files the run wrote and which ones of earlier runs are left."""
@@ -303,9 +328,11 @@ class RunPass:
                     raise DamagedBlobError(self.damaged[0])
                 return
             must_wait = none_ready or held is not None or not dispatcher.has_capacity
-            finished = dispatcher.next_finished(None if must_wait else 0)
+            finished = dispatcher.next_finished(WAIT_S if must_wait else 0)
             if finished is not None:
                 self._end(finished)
+            elif must_wait:
+                self._run.observer.waiting()
 
     def _take_from_cache(self, unit: Unit) -> bool:
         """Settle a unit that is in the cache; return whether it is, or is being computed for another unit."""

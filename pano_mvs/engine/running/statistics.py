@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -15,6 +15,7 @@ from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
 from pano_mvs.engine.running.packed_figures import PackedFigures
+from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 _MAX_SHOWN_CAUSES = 10
@@ -25,7 +26,8 @@ class _StageCount:
     """A stage's summary, and what its units reported, which goes into the summary once the stage is complete."""
 
     summary: StageSummary
-    began: float = 0.0
+    running: set[str] = field(default_factory=set)
+    began: float = 0.0  # since when at least one unit is being computed
     metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     rejected: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -66,7 +68,7 @@ class RunStatistics:
     def stage_opened(self, entry: StageEntry) -> None:
         """Begin to count a stage's units."""
         units = len(self._states(entry.name).pending)
-        self._counts[entry.name] = _StageCount(StageSummary(entry.name, entry.spec.name, units), time.perf_counter())
+        self._counts[entry.name] = _StageCount(StageSummary(entry.name, entry.spec.name, units))
         self._result.stages.append(self._counts[entry.name].summary)
         self._observer.stage_started(entry.name, units)
 
@@ -91,16 +93,20 @@ class RunStatistics:
     def unit_started(self, entry: StageEntry, item: str) -> None:
         """Record that a unit is being computed."""
         count = self._counts[entry.name]
-        if not count.summary.run + count.summary.failed + count.summary.cached:
+        if not count.running:
             count.began = time.perf_counter()
+        count.running.add(item)
         self._observer.unit_started(entry.name, item)
 
     def unit_done(self, entry: StageEntry, item: str, record: UnitRecord, *, status: UnitStatus) -> None:
         """Count a unit with a result."""
         count = self._counts[entry.name]
+        self._stop_clock(count, item)
         if status == "run":
             count.summary.run += 1
             count.summary.unit_seconds += record.seconds
+            count.summary.slowest_s = max(count.summary.slowest_s, record.seconds)
+            count.summary.stored_bytes += sum({ref.digest: ref.size_bytes for ref in record.own_blobs()}.values())
         else:
             count.summary.cached += 1
         if record.metrics:
@@ -116,7 +122,9 @@ class RunStatistics:
 
     def unit_failed(self, failure: Failure, seconds: float) -> None:
         """Count a unit without a result."""
-        self._counts[failure.stage].summary.failed += 1
+        count = self._counts[failure.stage]
+        self._stop_clock(count, failure.item)
+        count.summary.failed += 1
         self._result.failures.append(failure)
         self._observer.unit_failed(failure)
         self._observer.unit_finished(failure.stage, failure.item, status="failed", seconds=seconds)
@@ -141,7 +149,6 @@ class RunStatistics:
         """
         count, state = self._counts[entry.name], self._states(entry.name)
         summary = count.summary
-        summary.seconds = time.perf_counter() - count.began
         summary.unit_metrics = {item: count.metrics[item] for item in state.items if item in count.metrics}
         count.metrics = {}  # an emptied dict would keep its memory, that of a million entries
         values: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
@@ -151,13 +158,21 @@ class RunStatistics:
         summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
         notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
-        summary.notes = list(dict.fromkeys(notes))
+        summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
         self._observer.stage_finished(summary)
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_MAX_SHOWN_CAUSES])
             listed = len(state.members)
             raise InputError(f"{entry.name}: none of the {listed} {plural(listed, 'item')} can be used{shown}")
         _check_thresholds(entry, summary)
+
+    @staticmethod
+    def _stop_clock(count: _StageCount, item: str) -> None:
+        """Add the time since a unit began, unless others of its stage are still being computed."""
+        if item in count.running:
+            count.running.discard(item)
+            if not count.running:
+                count.summary.seconds += time.perf_counter() - count.began
 
     def put_in_order(
         self,
@@ -189,6 +204,11 @@ class RunStatistics:
         for name in (summary.name for summary in result.stages):
             enter(name, self._counts[name].rejected, result.rejected)
             enter(name, {} if name in replaced else self._counts[name].doubts, result.doubts)
+
+
+def _counted(note: str, units: int, total: int) -> str:
+    """Return a note with the number of units that gave it, if it asks for that; see `Context.note`."""
+    return note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
 
 
 def _check_thresholds(entry: StageEntry, summary: StageSummary) -> None:

@@ -10,6 +10,9 @@ import numpy as np
 
 from pano_mvs.core.text import shortened
 
+COUNT_IN_NOTES = "{count}"
+"""At the beginning of a note: the number of units that gave it, and of all; see `Context.note`."""
+
 
 @dataclass(slots=True)
 class Context:
@@ -39,7 +42,11 @@ class Context:
             self.metrics[name] = float(value)
 
     def note(self, text: str) -> None:
-        """Record what a user should know; the note is repeated if the unit is cached."""
+        """Record what a user should know; the note is repeated if the unit is cached.
+
+        Of equal notes of several units, one is shown. If it begins with `{count}`, that becomes the number of units
+        that gave it: "{count} images have no date" is shown as "3 of 12 images have no date".
+        """
         self.notes.append(shortened(text))
 
     def reject(self, image: str, reason: str) -> None:

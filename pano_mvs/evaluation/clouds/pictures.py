@@ -87,7 +87,7 @@ def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str
         colors = distance_colors(distances, evaluation.limits)
         for view in viewpoints(points, cameras, up, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
             parts.append(strip(_LINE, f"{title}, {view.title.lower()}"))
-            parts.append(draw_cloud(points, normals, colors, view, size_hw=_SIZE_HW))
+            parts.append(draw_cloud(points, normals, colors, viewpoint=view, size_hw=_SIZE_HW))
     write_stack(path, parts)
 
 
@@ -115,7 +115,7 @@ def _top_view(points: Points, distances: Points, evaluation: CloudEvaluation) ->
         return strip(_LINE)
     low, high = np.quantile(flat, [0.005, 0.995], axis=0)
     scale = (WIDTH - 1) / max(float((high - low).max()), 1e-9)
-    size = np.ceil((high - low) * scale).astype(int) + 1
+    size = np.minimum(np.ceil((high - low) * scale).astype(int) + 1, WIDTH)  # the product may round above WIDTH - 1
     pixel = np.rint((flat - low) * scale).astype(int)
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     order = np.flatnonzero(inside)[np.argsort(distances[inside], kind="stable")]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.clouds.ply_frame import FloatArray, stated_rotation, turned
 
 # PLY's names of number types, old and new.
 _NUMBERS = {
@@ -54,16 +55,22 @@ class PlyPoints:
         path: the file.
         count: number of vertices.
         has_normals: whether they have nx, ny, nz.
-        vertices: (N,) with a field for each property, memory-mapped if the file is binary.
+        vertices: (N,) with a field for each property, memory-mapped if the file is binary; as in the file.
+        world_from_file: rotation (3, 3) into the world of the run that wrote the file; None if the header states none.
     """
 
     path: Path
     count: int
     has_normals: bool
     vertices: NDArray[np.void]
+    world_from_file: FloatArray | None = None
+
+    def in_world(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return vectors (K, 3) of the file in the world frame."""
+        return turned(vectors, self.world_from_file)
 
     def chunks(self, size: int = 2_000_000) -> Iterator[NDArray[np.float32]]:
-        """Yield the positions, (K, 3) float32, of up to `size` vertices at a time.
+        """Yield the positions in the world, (K, 3) float32, of up to `size` vertices at a time.
 
         Raises:
             InputError: if a position is not finite.
@@ -72,7 +79,9 @@ class PlyPoints:
             yield self._positions(slice(start, start + size))
 
     def some(self, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the positions and normals, both (K, 3) float32, of every step-th vertex; unknown normals are 0.
+        """Return positions and normals in the world, both (K, 3) float32, of every step-th vertex.
+
+        Unknown normals are 0.
 
         Raises:
             InputError: if a position is not finite.
@@ -80,13 +89,13 @@ class PlyPoints:
         points = self._positions(slice(None, None, step))
         if not self.has_normals:
             return points, np.zeros_like(points)
-        return points, np.nan_to_num(self._stacked(("nx", "ny", "nz"), slice(None, None, step)))
+        return points, self.in_world(np.nan_to_num(self._stacked(("nx", "ny", "nz"), slice(None, None, step))))
 
     def _positions(self, part: slice) -> NDArray[np.float32]:
         points = self._stacked(("x", "y", "z"), part)
         if not np.isfinite(points).all():
             raise InputError(f"{self.path}: a point has no finite position. Remove such points")
-        return points
+        return self.in_world(points)
 
     def _stacked(self, names: tuple[str, ...], part: slice) -> NDArray[np.float32]:
         chosen = self.vertices[part]
@@ -95,7 +104,7 @@ class PlyPoints:
 
 
 def read_ply_points(path: Path) -> NDArray[np.float32]:
-    """Return the positions of the vertices, (N, 3) float32, in a PLY file; see `open_ply_points`.
+    """Return the positions in the world, (N, 3) float32, of the vertices in a PLY file; see `open_ply_points`.
 
     Raises:
         InputError: if the file cannot be read, is not such a PLY file, or ends early.
@@ -107,7 +116,8 @@ def open_ply_points(path: Path) -> PlyPoints:
     """Return the vertices of a PLY file of any program.
 
     The file is text or binary in either byte order. The vertices must be its first element and must not contain lists;
-    other properties and elements are ignored. Vertices of a binary file are memory-mapped.
+    other properties and elements are ignored. Vertices of a binary file are memory-mapped. If the header states the
+    rotation with which our exports turned the file, positions and normals are returned in the world of the run.
 
     Raises:
         InputError: if the file cannot be read, is not such a PLY file, or ends early.
@@ -124,7 +134,9 @@ def open_ply_points(path: Path) -> PlyPoints:
     vertices = _text_vertices(path, offset, layout) if layout.text else _binary_vertices(path, offset, layout)
     if vertices is None:
         raise InputError(f"{path}: its header states {layout.points} points, but it contains fewer. Write it again")
-    return PlyPoints(path, layout.points, {"nx", "ny", "nz"} <= set(layout.vertex.names or ()), vertices)
+    has_normals = {"nx", "ny", "nz"} <= set(layout.vertex.names or ())
+    rotation = stated_rotation(head, path)
+    return PlyPoints(path, layout.points, has_normals, vertices, None if rotation is None else rotation.T)
 
 
 def _binary_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void] | None:

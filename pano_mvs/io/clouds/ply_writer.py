@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.clouds.ply_frame import FloatArray, frame_comments, stated_rotation, turned, without_comments
 from pano_mvs.io.clouds.thinning import SelectedPoints, chunks
 from pano_mvs.scene import FilePart, PointCloud
 
@@ -38,6 +39,7 @@ def write_ply(
     quality: bool = False,
     uncertainty: bool = False,
     kept: SelectedPoints | None = None,
+    file_from_world: FloatArray | None = None,
 ) -> None:
     """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
 
@@ -50,20 +52,26 @@ def write_ply(
         uncertainty: also write `uncertainty`, the standard deviation of the position in scene units (float); NaN if
             unknown.
         kept: the points to write; all by default.
+        file_from_world: rotation (3, 3) that is applied to points and normals and stated in the header, so that
+            `read_ply` can undo it; None writes coordinates of the world.
     """
     layout = _LAYOUTS[quality + 2 * uncertainty]
     with path.open("wb") as stream:
-        stream.write(_header(len(cloud) if kept is None else kept.count, layout))
+        stream.write(_header(len(cloud) if kept is None else kept.count, layout, frame_comments(file_from_world)))
         for chunk in chunks(len(cloud)):
-            written = _vertices(cloud, chunk, layout)
+            written = _vertices(cloud, chunk, layout, file_from_world=file_from_world)
             stream.write((written if kept is None else written[kept.within(chunk)]).tobytes())
 
 
-def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDArray[np.void]:
+def _vertices(
+    cloud: PointCloud, chunk: slice, layout: np.dtype[np.void], *, file_from_world: FloatArray | None
+) -> NDArray[np.void]:
     vertices = np.zeros(chunk.stop - chunk.start, layout)
+    points = turned(cloud.points_in_world[chunk], file_from_world)
+    normals = turned(cloud.normals_in_world[chunk], file_from_world)
     for idx, name in enumerate("xyz"):
-        vertices[name] = cloud.points_in_world[chunk, idx]
-        vertices[f"n{name}"] = cloud.normals_in_world[chunk, idx]
+        vertices[name] = points[:, idx]
+        vertices[f"n{name}"] = normals[:, idx]
     for idx, name in enumerate(("red", "green", "blue")):
         vertices[name] = cloud.colors_rgb[chunk, idx]
     names = layout.names or ()
@@ -76,7 +84,7 @@ def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDA
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Return the cloud in a PLY file that `write_ply` wrote; missing view counts are 0.
+    """Return the cloud in a PLY file that `write_ply` wrote, in the world frame; missing view counts are 0.
 
     Raises:
         InputError: if the file cannot be read, has another layout, or ends early.
@@ -84,7 +92,8 @@ def read_ply(path: Path) -> PointCloud:
     head, mark, body = FilePart(path).read_bytes().partition(b"end_header\n")
     counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
     count = int(counted[1]) if counted else 0
-    layout = next((known for known in _LAYOUTS if head + mark == _header(count, known)), None)
+    plain = without_comments(head) + mark
+    layout = next((known for known in _LAYOUTS if plain == _header(count, known)), None)
     if layout is None:
         raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
     if len(body) != count * layout.itemsize:
@@ -92,6 +101,8 @@ def read_ply(path: Path) -> PointCloud:
             f"{path}: its header states {count} points, but it contains {len(body) // layout.itemsize}. Write it again"
         )
     vertices = np.frombuffer(body, layout)
+    rotation = stated_rotation(head, path)
+    world_from_file = None if rotation is None else rotation.T
     points, normals, colors = (
         np.stack([vertices[name] for name in names], axis=-1)
         for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
@@ -102,9 +113,16 @@ def read_ply(path: Path) -> PointCloud:
     if uncertainty is not None and not np.isfinite(uncertainty).all():
         uncertainty = None
     views = known.get("views", np.zeros(count, np.uint8))
-    return PointCloud(points, normals, colors, views, known.get("confidence"), uncertainty=uncertainty)
+    return PointCloud(
+        turned(points, world_from_file),
+        turned(normals, world_from_file),
+        colors,
+        views,
+        known.get("confidence"),
+        uncertainty=uncertainty,
+    )
 
 
-def _header(count: int, layout: np.dtype[np.void]) -> bytes:
+def _header(count: int, layout: np.dtype[np.void], comments: str = "") -> bytes:
     properties = "".join(f"property {_PLY_TYPES[layout[name].kind]} {name}\n" for name in layout.names or ())
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode()
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode()

@@ -25,13 +25,19 @@ from pano_mvs.io.colmap.sphere_sfm import has_sphere_cameras, read_sphere_model
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.poses.json_files import require_distinct
 from pano_mvs.scene import Poses
+from pano_mvs.scene.photographs import Photographs
 
 _MAX_QUAT_ERROR = 1e-3
 _MAX_ERROR_PX = 1e9
 
 
 def write_colmap_model(
-    folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]], *, form: ModelForm = "bin"
+    folder: Path,
+    poses: Poses,
+    sizes_hw: Mapping[str, tuple[int, int]],
+    *,
+    photographs: Photographs | None = None,
+    form: ModelForm = "bin",
 ) -> None:
     """Write poses, tracks and points as one COLMAP model: cameras, images, points3D, rigs and frames.
 
@@ -42,6 +48,7 @@ def write_colmap_model(
         folder: the folder of the files, which is created if necessary.
         poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each image by name.
+        photographs: ordinary photographs, in the same world; each has a SIMPLE_RADIAL camera and no key points.
         form: "bin" (COLMAP's default), "txt", or "both", of which COLMAP reads the binary files.
 
     Raises:
@@ -64,6 +71,8 @@ def write_colmap_model(
         rotation = pycolmap.Rotation3d(np.asarray(poses.rotations[idx]))
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.asarray(poses.translations[idx])))
         points.observe(idx + 1, observed, pixels_per_rad=sizes_hw[name][1] / (2 * np.pi))
+    if photographs is not None:
+        _add_photographs(model, photographs, first_camera=len(camera_ids) + 1, first_image=len(poses.names) + 1)
     points.add_to(model)
     write_model(model, folder, form)
 
@@ -71,13 +80,14 @@ def write_colmap_model(
 def read_colmap_model(folder: Path) -> Poses:
     """Return the registered images, points and tracks of a COLMAP model of panoramas, in its own world and unit.
 
-    From SphereSfM's models, whose cameras are SPHERE, only the poses are read.
+    Images of other cameras, such as localised photographs, are left out. From SphereSfM's models, whose cameras are
+    SPHERE, only the poses are read.
 
     Args:
         folder: contains cameras, images and points3D as .bin or .txt. Images are sorted in the natural order of names.
 
     Raises:
-        InputError: if the model cannot be read, has a camera that is not EQUIRECTANGULAR, or registers no image.
+        InputError: if the model cannot be read, has no EQUIRECTANGULAR camera, or registers no image.
     """
     if is_colmap_model(folder) and has_sphere_cameras(folder):
         return read_sphere_model(folder)
@@ -88,14 +98,19 @@ def read_colmap_model(folder: Path) -> Poses:
             ".bin or .txt (often sparse/0)"
         )
     cameras = read_cameras(files[0])
-    for camera_id, camera in sorted(cameras.items()):
-        if camera.model != "EQUIRECTANGULAR":
-            raise InputError(
-                f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models "
-                "of panoramas can be used"
-            )
+    panoramic = {camera_id for camera_id, camera in cameras.items() if camera.model == "EQUIRECTANGULAR"}
+    if cameras and not panoramic:
+        camera_id, camera = min(cameras.items())
+        raise InputError(
+            f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models of "
+            "panoramas can be used"
+        )
     by_id = read_images(files[1])
-    images = sorted(by_id.values(), key=lambda image: natural_key(image.name))
+    ordinary = cameras.keys() - panoramic
+    images = sorted(
+        (image for image in by_id.values() if image.camera_id not in ordinary),
+        key=lambda image: natural_key(image.name),
+    )
     if not images:
         raise InputError(f"{folder}: the model registers no image")
     require_distinct([image.name for image in images], folder)
@@ -107,7 +122,7 @@ def read_colmap_model(folder: Path) -> Poses:
             )
     points = read_points(files[2])
     tracks = [_observations(image, cameras[image.camera_id], points, path=files[2]) for image in images]
-    width_by_id = {image_id: cameras[image.camera_id].size_hw[1] for image_id, image in by_id.items()}
+    width_by_id = {i: cameras[image.camera_id].size_hw[1] for i, image in by_id.items() if image.camera_id in cameras}
     return Poses(
         names=tuple(image.name for image in images),
         rotations=np.array([pose.rotation for pose in poses]),
@@ -143,6 +158,23 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
             camera.camera_id = ids[height, width]
             model.add_camera_with_trivial_rig(camera)
     return ids
+
+
+def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int, first_image: int) -> None:
+    import pycolmap
+
+    for idx, name in enumerate(photographs.names):
+        height, width = photographs.sizes_hw[idx].tolist()
+        params = [photographs.focals_px[idx], width / 2, height / 2, photographs.radials[idx]]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+        camera.camera_id = first_camera + idx
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(
+            name=name, keypoints=np.zeros((0, 2)), camera_id=camera.camera_id, image_id=first_image + idx
+        )
+        rotation = pycolmap.Rotation3d(np.asarray(photographs.rotations[idx]))
+        pose = pycolmap.Rigid3d(rotation, np.asarray(photographs.translations[idx]))
+        model.add_image_with_trivial_frame(image, pose)
 
 
 def _pose(image: ModelImage) -> Rigid3:

@@ -1,7 +1,7 @@
-"""The position and the orientation in the EXIF metadata of an image.
+"""The position, the orientation and the focal length in the EXIF metadata of an image.
 
-EXIF 2.32: section 4.6.6 (GPS attributes) and the tag Orientation of section 4.6.4. EXIF is a TIFF without an image. See
-`containers` for why Pillow does not read it.
+EXIF 2.32: sections 4.6.4 (the tag Orientation), 4.6.5 (FocalLengthIn35mmFilm) and 4.6.6 (GPS attributes). EXIF is a
+TIFF without an image. See `containers` for why Pillow does not read it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pano_mvs.scene.image_files.tiff_directory import Entry, Tiff, open_tiff
 
 _ORIENTATION, _GPS_DIRECTORY = 0x0112, 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
+_EXIF_DIRECTORY, _FOCAL_35MM, _FILM_DIAGONAL_MM = 0x8769, 0xA405, 43.2666
 _DAMAGE = (struct.error, IndexError, ZeroDivisionError, OverflowError)
 
 
@@ -40,6 +41,24 @@ def orientation_from_exif(exif: bytes) -> int:
     except _DAMAGE:
         return 1
     return value if value is not None and 1 <= value <= 8 else 1
+
+
+def focal_from_exif(exif: bytes, size_hw: tuple[int, int]) -> float | None:
+    """Return the focal length in pixels, from that for 35 mm film (whose diagonal is 43.27 mm), or None if not stated.
+
+    Args:
+        exif: the metadata.
+        size_hw: (height, width) of the picture.
+    """
+    try:
+        tiff = open_tiff(exif)
+        offset = None if tiff is None else tiff.integer(tiff.directory(tiff.first).get(_EXIF_DIRECTORY))
+        if tiff is None or offset is None:
+            return None
+        focal_mm = tiff.integer(tiff.directory(offset).get(_FOCAL_35MM))
+    except _DAMAGE:
+        return None
+    return focal_mm / _FILM_DIAGONAL_MM * math.hypot(*size_hw) if focal_mm else None
 
 
 def _position(tiff: Tiff) -> tuple[float, float, float] | None:

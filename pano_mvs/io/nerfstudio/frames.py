@@ -1,4 +1,4 @@
-"""The frames, without poses, and the files that are exported to nerfstudio for one panorama."""
+"""The frames, without poses, and the files that are exported for one panorama to nerfstudio or in a splat bundle."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
+
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Axis, FilePart, Files
 from pano_mvs.scene.record import Parts
 
@@ -24,6 +27,8 @@ class NerfstudioFrame:
         size_wh: (width, height) in pixels.
         focal_xy: fl_x, fl_y in pixels; the principal point is the image centre.
         frame_from_cam: rotation from the panorama's camera frame (y down, z forward), as three rows.
+        normal: path of the normals; empty without any.
+        confidence: path of the confidence; empty without one.
     """
 
     variant: Variant
@@ -33,10 +38,17 @@ class NerfstudioFrame:
     size_wh: tuple[int, int]
     focal_xy: tuple[float, float]
     frame_from_cam: tuple[tuple[float, ...], ...]
+    normal: str = ""
+    confidence: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the frame as a JSON object."""
-        return asdict(self)
+        """Return the frame as a JSON object, without the paths of layers that nerfstudio does not read if empty."""
+        optional = ("normal", "confidence")
+        return {key: value for key, value in asdict(self).items() if value or key not in optional}
+
+    def cam_from_world(self, panorama_from_world: Rigid3) -> Rigid3:
+        """Return the pose of the frame, from that of its panorama."""
+        return Rigid3(np.array(self.frame_from_cam), np.zeros(3)) @ panorama_from_world
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> NerfstudioFrame:
@@ -47,8 +59,8 @@ class NerfstudioFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class NerfstudioFrames(Files):
-    """The frames of one panorama for nerfstudio, with their files.
+class PanoramaFrames(Files):
+    """The frames of one panorama, with their files.
 
     Attributes:
         pictures: target to source file of images that are exported unchanged.
@@ -87,3 +99,13 @@ class NerfstudioFrames(Files):
             tuple(NerfstudioFrame.from_json(frame) for frame in meta["frames"]),
             float(meta["depth_unit"]),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class NerfstudioFrames(PanoramaFrames):
+    """The frames of one panorama for nerfstudio."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFrames(PanoramaFrames):
+    """The frames of one panorama for a splat bundle."""

@@ -6,7 +6,9 @@ so that depth is the distance along the ray. The depth of a PINHOLE camera is z,
 `is-euclidean-depth`. Depths are 16-bit numbers times `depth_unit_scale_factor`, an option of the data parser (0.001 by
 default), in the unit of the camera positions; 0 is unknown. Masks are 0 where a pixel is ignored. Either all frames or
 none have masks; the same holds for depths. `applied_transform` is the identity. It must be stated, because nerfstudio
-assumes another one if a COLMAP model is in the same folder.
+assumes another one if a COLMAP model is in the same folder. The rotation from our world, if there is one, is
+`file_from_world` instead: some versions of nerfstudio also apply `applied_transform` to the initial points, others do
+not, so that only the identity means the same to all.
 """
 
 from __future__ import annotations
@@ -16,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, Variant
 from pano_mvs.scene.image_files.header import PNG_START
 from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
-_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
+CAMERA_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
 _OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
 _PNG_RGB_8_BIT = bytes([8, 2])
@@ -34,6 +37,7 @@ def transforms_document(
     *,
     depth_unit: float,
     about: Mapping[str, Any],
+    file_from_world: NDArray[np.float64] | None = None,
     seed: str = "",
 ) -> dict[str, Any]:
     """Return the contents of a transforms.json.
@@ -46,8 +50,12 @@ def transforms_document(
         frames: frames with their panorama's name and cam_from_world.
         depth_unit: scene units per step of the depths.
         about: further entries for readers, which nerfstudio ignores.
+        file_from_world: rotation (3, 3) of the cameras; None: they stay in the world frame.
         seed: path of the initial points relative to the file; empty without points.
     """
+    if file_from_world is not None:
+        world_from_file = Rigid3(file_from_world.T, np.zeros(3))
+        frames = [(name, cam_from_world @ world_from_file, frame) for name, cam_from_world, frame in frames]
     masked = any(frame.mask for _, _, frame in frames)
     with_depth = all(frame.depth for _, _, frame in frames)
     listed = [_listed(*each, masked=masked, with_depth=with_depth) for each in frames]
@@ -57,7 +65,7 @@ def transforms_document(
     else:
         common = {}
         listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
-    document = {"camera_model": _MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    document = {"camera_model": CAMERA_MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
     if with_depth:
         document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
     return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}
@@ -91,8 +99,7 @@ def _jpeg_channels(data: bytes) -> int:
 def _listed(
     name: str, cam_from_world: Rigid3, frame: NerfstudioFrame, *, masked: bool, with_depth: bool
 ) -> dict[str, Any]:
-    frame_from_cam = Rigid3(np.array(frame.frame_from_cam), np.zeros(3))
-    world_from_frame = (frame_from_cam @ cam_from_world).inverse()
+    world_from_frame = frame.cam_from_world(cam_from_world).inverse()
     matrix = np.eye(4)
     matrix[:3, :3] = world_from_frame.rotation @ _OPENGL_FROM_CAM
     matrix[:3, 3] = world_from_frame.translation

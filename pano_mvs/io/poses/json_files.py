@@ -95,7 +95,8 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
 def read_transforms(path: Path) -> dict[str, Rigid3]:
     """Return the poses of a nerfstudio transforms.json by image name (`panorama`, which we write, or `file_path`).
 
-    `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's.
+    `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's, or
+    that of our run if the file states the rotation `file_from_world` (3 × 3) with which our export turned it.
 
     Raises:
         InputError: if a key is missing or malformed, or a camera is not EQUIRECTANGULAR; it names the file and the key.
@@ -105,6 +106,8 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
     if not isinstance(frames, list):
         raise InputError(f"{path}: key 'frames' must be a list of frames, got {type(frames).__name__}")
     poses: list[tuple[str, Rigid3]] = []
+    turn = number_array(data, "file_from_world", (3, 3), where=str(path)) if "file_from_world" in data else np.eye(3)
+    file_from_world = rigid_from_arrays(turn, np.zeros(3), f"{path}: file_from_world")
     for idx, frame in enumerate(frames):
         where = f"{path}: frames[{idx}]"
         name = _name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
@@ -118,8 +121,8 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
-        world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], f"{where} ({name})")
-        poses.append((name, world_from_cam.inverse()))
+        file_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], f"{where} ({name})")
+        poses.append((name, file_from_cam.inverse() @ file_from_world))
     require_distinct([name for name, _ in poses], path)
     return dict(poses)
 

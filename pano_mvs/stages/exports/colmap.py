@@ -38,6 +38,7 @@ from pano_mvs.io.colmap.workspace import WORKSPACE, face_image_name, sparse_targ
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.tracked_points import TrackedPoints
 
@@ -49,12 +50,19 @@ class ModelParams(Params):
 
 
 @stage("export.colmap")
-def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
+def colmap(
+    poses: One[Poses],
+    images: All[Panorama],
+    photographs: One[Photographs] | None,
+    params: ModelParams,
+    ctx: Context,
+) -> Files:
     """COLMAP model with EQUIRECTANGULAR cameras, points and tracks, in colmap/sparse/0.
 
-    Further groups of poses, each in its own frame, are the models sparse/1, sparse/2 …
+    Further groups of poses, each in its own frame, are the models sparse/1, sparse/2 … Photographs that poses.localise
+    has placed are in sparse/0, with SIMPLE_RADIAL cameras.
     """
-    return _sparse_models(poses, images, params.format, ctx=ctx, target="colmap/sparse")
+    return _sparse_models(poses, images, params.format, photographs=photographs, ctx=ctx, target="colmap/sparse")
 
 
 class MasksParams(Params):
@@ -206,14 +214,20 @@ def _warn_about_spaces(names: Iterable[str], form: ModelForm, ctx: Context) -> N
 
 
 def _sparse_models(
-    poses: Poses, images: Mapping[str, Panorama], form: ModelForm, *, ctx: Context, target: str
+    poses: Poses,
+    images: Mapping[str, Panorama],
+    form: ModelForm,
+    *,
+    photographs: Photographs | None = None,
+    ctx: Context,
+    target: str,
 ) -> Files:
     """Write a model for each group of poses into the folders 0, 1 … of the target."""
     files: dict[str, Path] = {}
     for number, group in enumerate(split_groups(poses)):
         folder = ctx.scratch / f"model_{number}"
         sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
-        write_colmap_model(folder, group, sizes_hw, form=form)
+        write_colmap_model(folder, group, sizes_hw, photographs=photographs if number == 0 else None, form=form)
         files |= {f"{target}/{number}/{path.name}": path for path in children(folder)}
     _warn_about_spaces(poses.names, form, ctx)
     return Files(files)

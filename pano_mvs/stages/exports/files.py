@@ -19,6 +19,7 @@ from pano_mvs.api import (
     Panorama,
     Params,
     PointCloud,
+    Poses,
     RangeMap,
     params_from,
     settings_from,
@@ -36,10 +37,11 @@ from pano_mvs.io.ranges.files import (
     write_range_tiff,
 )
 from pano_mvs.scene.files import group_file
+from pano_mvs.stages.exports.axes import FrameParams, files_from_world
 
 
 @params_from(Selection)
-class PlyParams(Params):
+class PlyParams(FrameParams):
     """Settings of export.ply."""
 
     quality: bool = Field(
@@ -51,19 +53,24 @@ class PlyParams(Params):
 
 
 @stage("export.ply")
-def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
-    """Write the fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue.
+def ply(cloud: One[PointCloud], poses: One[Poses] | None, params: PlyParams, ctx: Context) -> Files:
+    """Write the fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue, z up.
 
-    The cloud is thinned and written in chunks: memory does not grow with its size. Further groups of poses, each in its
-    own frame, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
+    The header states the rotation from the world of the poses. The cloud is thinned and written in chunks: memory does
+    not grow with its size. Further groups of poses, each in its own frame, are cloud_1.ply, cloud_2.ply …; each file is
+    thinned on its own.
     """
     selection = settings_from(Selection, params)
+    groups = cloud.groups()
     files, points = {}, 0
-    for number, group in enumerate(cloud.groups()):
+    for number, (group, turn) in enumerate(
+        zip(groups, files_from_world(params, poses, groups=len(groups)), strict=True)
+    ):
         name = group_file("cloud.ply", number)
         kept = select_points(group, selection, ctx.scratch)
         files[name] = ctx.scratch / name
-        write_ply(files[name], group, quality=params.quality, uncertainty=params.uncertainty, kept=kept)
+        extra = {"quality": params.quality, "uncertainty": params.uncertainty}
+        write_ply(files[name], group, **extra, kept=kept, file_from_world=turn)
         points += len(group) if kept is None else kept.count
         if kept is not None and kept.voxel and not number:
             ctx.metric("voxel", kept.voxel)

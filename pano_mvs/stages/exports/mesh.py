@@ -9,15 +9,16 @@ from pydantic import Field
 
 from pano_mvs.algorithms.mesh.poisson import MIN_POINTS, poisson_depth, solve_poisson
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
-from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
+from pano_mvs.api import Context, Files, InputError, One, PointCloud, Poses, stage
 from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
+from pano_mvs.stages.exports.axes import FrameParams, files_from_world
 
 
-class MeshParams(Params):
+class MeshParams(FrameParams):
     """Settings of export.mesh."""
 
     depth: int = Field(
@@ -40,15 +41,17 @@ class MeshParams(Params):
 
 
 @stage("export.mesh", memory="2GB")
-def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
-    """Write the surface of the fused cloud as mesh.ply: coloured triangles from screened Poisson reconstruction.
+def mesh(cloud: One[PointCloud], poses: One[Poses] | None, params: MeshParams, ctx: Context) -> Files:
+    """Write the surface of the fused cloud as mesh.ply: coloured triangles from screened Poisson reconstruction, z up.
 
     The solver returns a closed surface; parts far from all points are cut off again. Triangles face the side that was
     seen. The solver uses one thread in any run, because the result would vary with more. Further groups of poses, each
     in its own frame, are mesh_1.ply, mesh_2.ply …
     """
     files, faces = {}, 0
-    for number, group in enumerate(cloud.groups()):
+    groups = cloud.groups()
+    turns = files_from_world(params, poses, groups=len(groups))
+    for number, group in enumerate(groups):
         folder = ctx.scratch / str(number)
         folder.mkdir()
         try:
@@ -60,7 +63,8 @@ def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
             continue
         name = group_file("mesh.ply", number)
         files[name] = ctx.scratch / name
-        write_ply_mesh(files[name], (solved.vertices_in_world, solved.colors_rgb, solved.faces))
+        arrays = (solved.vertices_in_world, solved.colors_rgb, solved.faces)
+        write_ply_mesh(files[name], arrays, file_from_world=turns[number])
         faces += len(solved.faces)
         if not number:
             ctx.metric("depth", depth)

@@ -1,20 +1,18 @@
-"""From the world of a run (y down) to the coordinates of a survey (z up), on a map where GPS says where it is."""
+"""From the world of a run to the coordinates of a survey (z up), on a map where GPS says where it is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import Poses, UsageError, lla_from_local, origin_of_frame
+from pano_mvs.api import Poses, UsageError, lla_from_local, origin_of_frame, world_up, z_up_from_world
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 FloatArray = NDArray[np.float64]
 
-# x east, y north, z up from x right, y down, z forward: a turn, no mirror.
-_UP_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _WGS84_3D = 4979
 
 
@@ -25,22 +23,24 @@ class Placement:
     Attributes:
         origin_lla: latitude, longitude (degrees) and altitude (m) of the world's origin; None: not known.
         crs: of the written coordinates; None: they are the world's own, turned so that z is up.
+        file_from_world: that turn, (3, 3): x east, y north, z up from x east, y down, z north on a map.
     """
 
     origin_lla: tuple[float, float, float] | None = None
     crs: CRS | None = None
+    file_from_world: FloatArray = field(default_factory=z_up_from_world)
 
     def points(self, points_in_world: NDArray[np.float32]) -> FloatArray:
         """Return points (N, 3) as coordinates of the file."""
         world = points_in_world.astype(np.float64)
         if self.crs is None or self.origin_lla is None:
-            return np.asarray(world @ _UP_FROM_WORLD.T)
+            return np.asarray(world @ self.file_from_world.T)
         latitude, longitude, altitude = lla_from_local(world, self.origin_lla).T
         return np.stack(self._on_map.transform(longitude, latitude, altitude), axis=-1)
 
     def directions(self, directions_in_world: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return unit vectors (N, 3) along east, north and up, which a map's axes differ from by a degree or two."""
-        turned: NDArray[np.float32] = directions_in_world @ _UP_FROM_WORLD.T.astype(np.float32)
+        turned: NDArray[np.float32] = directions_in_world @ self.file_from_world.T.astype(np.float32)
         return turned
 
     @cached_property
@@ -62,7 +62,7 @@ def placement_of(poses: Poses, epsg: int | None) -> Placement:
     """
     origin = origin_of_frame(poses.frame)
     if epsg == 0 or (origin is None and epsg is None):
-        return Placement(origin)
+        return Placement(origin, file_from_world=z_up_from_world(world_up(poses)))
     if origin is None:
         raise UsageError(
             f"epsg: {epsg} needs cameras that GPS has placed: a stage poses.scale with `gps: true` and "

@@ -52,6 +52,14 @@ def test_keeps_the_contract(contract_test: ContractTest) -> None:
     contract_test.check()
 
 
+def test_a_world_that_has_z_up_already_is_not_turned(tmp_path: Path) -> None:
+    """Such as a COLMAP model that another program aligned."""
+    cam_from_world = Rigid3(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros(3))
+    poses = Poses.without_points({"a.jpg": cam_from_world}, frame="of a file", scale="", metric=False)
+    read = laspy.read(written(las, tmp_path, a_cloud(), poses, LasParams()))
+    np.testing.assert_allclose(np.asarray(read.xyz), a_cloud().points_in_world, atol=0.0001)
+
+
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_a_las_file_holds_the_cloud_with_z_up(tmp_path: Path, suffix: Literal["las", "laz"]) -> None:
     cloud = a_cloud()

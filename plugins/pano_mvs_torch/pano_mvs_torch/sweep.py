@@ -14,8 +14,8 @@ from pano_mvs.api import SweepInput, Winners
 from pano_mvs.api.sweep import source_weights
 from torch import Tensor
 
+from pano_mvs_torch.batch import Batch, batch_for
 from pano_mvs_torch.costs import BandCost
-from pano_mvs_torch.device import Batch, batch_for
 from pano_mvs_torch.lookup import Lookup
 from pano_mvs_torch.paths import sum_of_paths
 

@@ -21,7 +21,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import CASES, agreement, sweep_case
 
 from pano_mvs_torch import sweep
-from pano_mvs_torch.device import Batch, batch_for
+from pano_mvs_torch.batch import Batch, batch_for
 from pano_mvs_torch.lookup import _blend, packed_patches
 from pano_mvs_torch.paths import path_step
 
@@ -98,7 +98,7 @@ def test_a_step_of_a_path_is_that_of_the_definition() -> None:
     )
     found = path_step(bytes_, sums, steps, 5000)
     for k in range(3):
-        np.testing.assert_array_equal(found[k].numpy(), plain_path_step(costs[k], before[k], penalty[k], 5000))
+        np.testing.assert_array_equal(found[k].numpy(), plain_path_step(costs[k], before[k], penalty[k], p1=5000))
 
 
 def test_of_equal_planes_the_nearest_wins() -> None:

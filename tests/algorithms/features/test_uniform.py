@@ -22,7 +22,7 @@ PIXEL = 2 * np.pi / SIZE[1]
 EXTRACTORS: dict[str, Callable[..., Features]] = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 # Share of key points found again, share of key points matched rightly, share of right matches, their median error.
 LIMITS = {"sift": (0.65, 0.5, 0.99, 0.15), "orb": (0.7, 0.2, 0.93, 0.5), "sphorb": (0.8, 0.35, 0.93, 0.4)}
-TURNS = {"tilt": (np.pi / 2, 0.0, 0.0), "roll": (0.0, 0.0, np.pi / 2), "any": (1.2, 0.3, -0.8)}
+TURNS = {"tilt": (np.pi / 2, 0.0, 0.0), "any": (1.2, 0.3, -0.8)}
 
 
 @lru_cache

@@ -30,7 +30,7 @@ def true_maps() -> list[RangeMap]:
 
 
 def checked(maps: Sequence[RangeMap], **settings: Any) -> RangeMap:
-    return check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], **LIMITS | settings)
+    return check_consistency(maps[0], POSES[0], maps[1:], source_poses=POSES[1:], **LIMITS | settings)
 
 
 @pytest.mark.kernel("filters.kernels_reprojection")
@@ -89,7 +89,7 @@ def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true
 
 def test_along_the_baseline_nothing_is_consistent_however_well_it_agrees(true_maps: list[RangeMap]) -> None:
     """Forward and backward meet at the epipoles whatever the range is."""
-    result = check_consistency(true_maps[0], POSES[0], true_maps[1:2], POSES[1:2], min_motion_px=0.1)
+    result = check_consistency(true_maps[0], POSES[0], true_maps[1:2], source_poses=POSES[1:2], min_motion_px=0.1)
     rays = ray_grid(SIZE)
     baseline = (POSES[1] @ POSES[0].inverse()).center
     sine = np.linalg.norm(np.cross(rays, baseline / np.linalg.norm(baseline)), axis=-1)
@@ -149,7 +149,11 @@ def test_min_views_is_the_number_that_must_confirm(true_maps: list[RangeMap]) ->
 def test_the_order_of_the_sources_does_not_matter(true_maps: list[RangeMap]) -> None:
     order = [2, 0, 1]
     turned = check_consistency(
-        true_maps[0], POSES[0], [true_maps[1:][i] for i in order], [POSES[1:][i] for i in order], **LIMITS
+        true_maps[0],
+        POSES[0],
+        [true_maps[1:][i] for i in order],
+        source_poses=[POSES[1:][i] for i in order],
+        **LIMITS,
     )
     np.testing.assert_array_equal(turned.confidence, checked(true_maps).confidence)
 
@@ -157,7 +161,7 @@ def test_the_order_of_the_sources_does_not_matter(true_maps: list[RangeMap]) -> 
 def test_the_world_frame_does_not_matter(true_maps: list[RangeMap]) -> None:
     world_from_other = Rigid3(POSES[3].rotation, np.array([5.0, -3, 2]))
     poses = [pose @ world_from_other for pose in POSES]
-    turned = check_consistency(true_maps[0], poses[0], true_maps[1:], poses[1:], **LIMITS)
+    turned = check_consistency(true_maps[0], poses[0], true_maps[1:], source_poses=poses[1:], **LIMITS)
     np.testing.assert_allclose(turned.confidence, checked(true_maps).confidence, atol=1)
 
 
@@ -165,7 +169,7 @@ def test_the_world_frame_does_not_matter(true_maps: list[RangeMap]) -> None:
 def test_rolling_the_reference_rolls_the_result(true_maps: list[RangeMap], columns: int) -> None:
     _, new_from_old = roll_panorama(true_maps[0].range, columns)
     pose = Rigid3(new_from_old, np.zeros(3)) @ POSES[0]
-    result = check_consistency(rolled(true_maps[0], columns), pose, true_maps[1:], POSES[1:], **LIMITS)
+    result = check_consistency(rolled(true_maps[0], columns), pose, true_maps[1:], source_poses=POSES[1:], **LIMITS)
     expected = rolled(checked(true_maps), columns).confidence
     # Rays of a rolled picture differ by rounding, which tips pixels that lie between two surfaces.
     assert (np.abs(result.confidence.astype(int) - expected) > 1).mean() < 1e-3
@@ -176,7 +180,7 @@ def test_rolling_a_source_changes_nothing(true_maps: list[RangeMap], columns: in
     _, new_from_old = roll_panorama(true_maps[1].range, columns)
     maps = [true_maps[0], rolled(true_maps[1], columns), *true_maps[2:]]
     poses = [POSES[0], Rigid3(new_from_old, np.zeros(3)) @ POSES[1], *POSES[2:]]
-    result = check_consistency(maps[0], poses[0], maps[1:], poses[1:], **LIMITS)
+    result = check_consistency(maps[0], poses[0], maps[1:], source_poses=poses[1:], **LIMITS)
     assert (np.abs(result.confidence.astype(int) - checked(true_maps).confidence) > 1).mean() < 1e-3
 
 
@@ -188,7 +192,7 @@ def test_filled_pixels_neither_vote_nor_are_promoted(true_maps: list[RangeMap]) 
 
 
 def test_what_was_consistent_before_is_weak_when_nobody_confirms_it(true_maps: list[RangeMap]) -> None:
-    alone = check_consistency(RangeMap(true_maps[0].range, np.full(SIZE, 250, np.uint8)), POSES[0], [], [])
+    alone = check_consistency(RangeMap(true_maps[0].range, np.full(SIZE, 250, np.uint8)), POSES[0], [], source_poses=[])
     np.testing.assert_array_equal(alone.confidence, 127)
 
 
@@ -205,6 +209,6 @@ def test_any_number_of_threads_gives_the_same_bytes(true_maps: list[RangeMap]) -
 
 def test_impossible_calls_are_named(true_maps: list[RangeMap]) -> None:
     with pytest.raises(UsageError, match="one pose per source"):
-        check_consistency(true_maps[0], POSES[0], true_maps[1:], POSES[2:])
+        check_consistency(true_maps[0], POSES[0], true_maps[1:], source_poses=POSES[2:])
     with pytest.raises(UsageError, match="min_views must be at least 1"):
         checked(true_maps, min_views=0)

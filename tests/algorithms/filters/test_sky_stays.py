@@ -42,8 +42,10 @@ FILTERS: dict[str, Callable[[RangeMap], RangeMap]] = {
     "gaussian": gaussian_range,
     "guided": lambda found: guided_range(found, PICTURE),
     "speckle": lambda found: remove_speckles(found, max_size_px=3, max_relative_step=0.3),
-    "consistency": lambda found: checked_with_agreement(found, Rigid3.identity(), [known(None)], [ASIDE])[0],
-    "patchmatch": lambda found: refine_range(found, PICTURE, [OTHER], [ASIDE]),
+    "consistency": lambda found: checked_with_agreement(found, Rigid3.identity(), [known(None)], source_poses=[ASIDE])[
+        0
+    ],
+    "patchmatch": lambda found: refine_range(found, PICTURE, [OTHER], source_from_reference=[ASIDE]),
 }
 
 

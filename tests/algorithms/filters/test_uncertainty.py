@@ -32,7 +32,7 @@ def checked() -> RangeMap:
 
 
 def checked_of(maps: list[RangeMap]) -> RangeMap:
-    result = check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], min_motion_px=0.01)
+    result = check_consistency(maps[0], POSES[0], maps[1:], source_poses=POSES[1:], min_motion_px=0.01)
     result.check()
     return result
 
@@ -58,7 +58,7 @@ def test_it_grows_with_the_scatter_of_the_views(checked: RangeMap) -> None:
 
 def test_it_grows_towards_the_epipoles_and_with_fewer_confirmed_neighbours(checked: RangeMap) -> None:
     maps = noisy_maps(0.002)
-    single = check_consistency(maps[0], POSES[0], maps[1:2], POSES[1:2], min_motion_px=0.01)
+    single = check_consistency(maps[0], POSES[0], maps[1:2], source_poses=POSES[1:2], min_motion_px=0.01)
     baseline = (POSES[1] @ POSES[0].inverse()).center
     sine = np.linalg.norm(np.cross(ray_grid(SIZE), baseline / np.linalg.norm(baseline)), axis=-1)
     sigma, confirmed = uncertainty_of(single), single.confidence >= 128

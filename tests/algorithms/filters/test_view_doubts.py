@@ -39,7 +39,11 @@ def true_maps() -> list[RangeMap]:
 def agreement_of(maps: list[RangeMap], poses: list[Rigid3], view: int) -> Agreement:
     others = [idx for idx in range(len(poses)) if idx != view]
     return checked_with_agreement(
-        maps[view], poses[view], [maps[idx] for idx in others], [poses[idx] for idx in others], **LIMITS
+        maps[view],
+        poses[view],
+        [maps[idx] for idx in others],
+        source_poses=[poses[idx] for idx in others],
+        **LIMITS,
     )[1]
 
 

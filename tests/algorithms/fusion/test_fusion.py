@@ -135,7 +135,7 @@ class TestFusion:
 
     def test_each_surface_is_written_once_and_none_is_lost(self, views: list[FusionView]) -> None:
         cloud = fuse_views(views, ONCE)
-        alone = [len(fuse_reference(view, [], [], FusionSettings(min_views=1))) for view in views]
+        alone = [len(fuse_reference(view, [], [], settings=FusionSettings(min_views=1))) for view in views]
         assert 0.4 * np.mean(alone) < len(cloud) < 1.3 * np.mean(alone)
         truth = views[0].range_map.range
         points = (ray_grid(SIZE) * truth[..., None])[::4, ::8].reshape(-1, 3)
@@ -152,8 +152,8 @@ class TestFusion:
             along = -(rays @ pose.center)
             ranges = along + np.sqrt(along**2 - pose.center @ pose.center + 4)
             views.append(FusionView(as_map(ranges), pose, np.zeros((*SIZE, 3), np.uint8)))
-        left = fuse_reference(views[0], [], views[1:], ONCE)
-        right = fuse_reference(views[1], views[:1], [], ONCE)
+        left = fuse_reference(views[0], [], views[1:], settings=ONCE)
+        right = fuse_reference(views[1], views[:1], [], settings=ONCE)
         assert (left.points_in_world[:, 0] < 0.15).mean() > 0.99
         assert (right.points_in_world[:, 0] > -0.15).mean() > 0.99
         cloud = fuse_views(views, ONCE)
@@ -291,7 +291,7 @@ class TestOutliers:
             return np.where((np.arange(SIZE[1]) > 128) & (idx == 1), np.nan, ranges)
 
         views = ball_views(2, partly)
-        strict = fuse_reference(views[0], [], views[1:], FusionSettings(min_support=None))
+        strict = fuse_reference(views[0], [], views[1:], settings=FusionSettings(min_support=None))
         cloud = fuse_reference(views[0], [], views[1:])
         assert strict.view_counts.min() == 2
         added = cloud.view_counts == 1

@@ -9,8 +9,8 @@ import pytest
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
-from pano_mvs.algorithms.poses.verification import arbitration
-from pano_mvs.algorithms.poses.verification.arbitration import arbitrate, judge
+from pano_mvs.algorithms.poses.verification import camera_checks
+from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
@@ -232,8 +232,8 @@ def test_a_group_whose_pairs_contradict_one_another_is_doubted(
 ) -> None:
     """Regression: the limit was defined and nothing read it."""
     assert verified(displaced(), matches).doubts == {}
-    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_IN_ALL", 1.01)
-    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
+    monkeypatch.setattr(camera_checks, "_MIN_EXPLAINED_IN_ALL", 1.01)
+    monkeypatch.setattr(camera_checks, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
     found = verified(displaced(), matches)
     assert set(found.doubts) == set(NAMES)
     assert all("agree with a common arrangement" in reason for reason in found.doubts.values())
@@ -259,7 +259,7 @@ def test_the_same_bytes_again(matches: Matches) -> None:
 def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
     model = model_of(displaced("2.png"), pairs_of(*matches))
     before = dict(model.cameras)
-    found = arbitrate(model, Confirmation(lambda image: (PICTURES[image], WHOLE)), fixed=[2])
+    found = correct_cameras(model, Confirmation(lambda image: (PICTURES[image], WHOLE)), fixed=[2])
     assert 2 in found.doubts
     assert model.cameras[2] == before[2]
     assert not found.removed
@@ -268,7 +268,7 @@ def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
 def test_judging_changes_nothing(matches: Matches) -> None:
     model = model_of(displaced("2.png"), pairs_of(*matches))
     before, chosen = dict(model.cameras), dict(model.chosen)
-    found = judge(model, Confirmation(lambda image: (PICTURES[image], WHOLE)))
+    found = check_cameras(model, Confirmation(lambda image: (PICTURES[image], WHOLE)))
     assert model.cameras == before
     assert model.chosen == chosen
     assert set(found.doubts) == {2}

@@ -275,7 +275,7 @@ def test_one_step_of_many_paths_equals_each_alone() -> None:
     rng = np.random.default_rng(11)
     costs, before = rng.integers(0, 200, (2, 5, 30))
     penalty = rng.integers(20, 90, 30)
-    together = path_step(costs, before, penalty, 9)
+    together = path_step(costs, before, penalty, p1=9)
     for k in range(30):
         p2, floor = int(penalty[k]), int(before[:, k].min())
         for d in range(5):

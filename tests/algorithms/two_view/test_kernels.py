@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.five_point import essentials_from_five
+from pano_mvs.algorithms.two_view.minimal_solvers import essentials_from_five
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
@@ -67,7 +67,7 @@ def test_five_point_kernel_takes_any_memory_layout() -> None:
 def test_agreement_kernel_equals_the_oracle() -> None:
     p, q, pose, _ = paired("agreement")
     for candidate in (pose, Rigid3(pose.rotation, -pose.translation)):
-        residuals, agreeing = agreement(candidate, p, q, THRESHOLD_RAD)
+        residuals, agreeing = agreement(candidate, p, q, threshold_rad=THRESHOLD_RAD)
         expected = plain.agreement(candidate, p, q, THRESHOLD_RAD)
         np.testing.assert_allclose(residuals, expected[0], atol=1e-12)
         np.testing.assert_array_equal(agreeing, expected[1])
@@ -79,14 +79,16 @@ def test_facing_kernels_equal_the_oracle() -> None:
     p, q, pose, rng = paired("facing kernels")
     poses = [pose, Rigid3(pose.rotation, -pose.translation), Rigid3(random_rotation(rng), pose.translation)]
     np.testing.assert_allclose(
-        facing_costs(poses, p, q, THRESHOLD_RAD), plain.facing_costs(poses, p, q, THRESHOLD_RAD), atol=1e-6
+        facing_costs(poses, p, q, threshold_rad=THRESHOLD_RAD),
+        plain.facing_costs(poses, p, q, THRESHOLD_RAD),
+        atol=1e-6,
     )
     for expected in (pose, poses[2]):
         essential = skew(expected.translation) @ expected.rotation
-        found = facing_pose(-3 * essential, p, q, THRESHOLD_RAD)
+        found = facing_pose(-3 * essential, p, q, threshold_rad=THRESHOLD_RAD)
         oracle = plain.facing_pose(essential, p, q, THRESHOLD_RAD)
         assert max(errors_deg(found.rotation, found.translation, oracle)) < 1e-5
-    found = facing_pose(skew(pose.translation) @ pose.rotation, p, q, THRESHOLD_RAD)
+    found = facing_pose(skew(pose.translation) @ pose.rotation, p, q, threshold_rad=THRESHOLD_RAD)
     assert max(errors_deg(found.rotation, found.translation, pose)) < 1e-5
 
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
 from pano_mvs.algorithms.two_view.essential import sampson_angles
-from pano_mvs.algorithms.two_view.five_point import essentials_from_five
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver, draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver, essentials_from_five
+from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
 from tests.algorithms.poses.synthetic_capture import (
@@ -123,8 +123,8 @@ def test_what_lies_behind_tells_the_two_matrices_of_a_plane_apart() -> None:
     found, _ = essentials_from_five(p[:1], q[:1])
     fitting = [e for e in found if sampson_angles(e, flat_p, flat_q).max() < 1e-6]
     assert len(fitting) == 2
-    poses = [facing_pose(e, flat_p, flat_q, 0.0035) for e in fitting]
-    costs = facing_costs(poses, flat_p, flat_q, 0.0035)
+    poses = [facing_pose(e, flat_p, flat_q, threshold_rad=0.0035) for e in fitting]
+    costs = facing_costs(poses, flat_p, flat_q, threshold_rad=0.0035)
     best = poses[int(np.argmin(costs))]
     assert max(errors_deg(best.rotation, best.translation, pose)) < 1e-3
     assert costs.min() < 1e-3

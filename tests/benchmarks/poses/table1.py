@@ -32,7 +32,7 @@ from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_s
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.two_view import verify_pair
-from pano_mvs.algorithms.two_view.hypotheses import Solver
+from pano_mvs.algorithms.two_view.minimal_solvers import Solver
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings, rotation_from_rotvec
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.testing.room import Room, render

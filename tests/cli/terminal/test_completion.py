@@ -45,7 +45,8 @@ def test_presets_and_workflow_files_are_offered(pano_mvs: Command) -> None:
 
 
 def test_settings_of_the_workflow_and_their_values_are_offered() -> None:
-    assert offered("run", "quickstart", "--set", "depth.pl") == ["depth.planes="]
+    for command in ("run", "status", "show", "inspect"):
+        assert offered(command, "quickstart", "--set", "depth.pl") == ["depth.planes="]
     found = offered("run", "quickstart", "--set", "images.")
     assert {"images.path=", "images.nadir_deg=", "images.masks="} <= set(found)
     assert all(text.startswith("images.") for text in found)

@@ -14,9 +14,8 @@ from tests.cli.conftest import SMALL, deliverables
 
 WAYS = {
     "serial": ("--executor", "serial", "--threads-per-worker", "2"),
-    "one": ("--executor", "processes", "--workers", "1", "--threads-per-worker", "1"),
     "two": ("--executor", "processes", "--workers", "2"),
-    "four": ("--executor", "processes", "--workers", "4", "--threads-per-worker", "1"),
+    "three": ("--executor", "processes", "--workers", "3", "--threads-per-worker", "1"),
     "dask": ("--executor", "dask", "--workers", "2"),
 }
 

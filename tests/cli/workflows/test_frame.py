@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
 from pano_mvs.geometry import Rigid3, Similarity3
+from pano_mvs.geometry.geodesy import lla_from_local
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.algorithms.poses.synthetic_capture import random_rotation

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
+import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -53,16 +51,30 @@ def test_second_run_computes_nothing(finished: Path) -> None:
     assert "0 units computed" in done.stdout
 
 
-@pytest.mark.parametrize("finished_units", [20, 24])  # while matching, and in the middle of the sweep
-def test_killed_in_the_middle_it_resumes_to_the_same_bytes(finished: Path, tmp_path: Path, finished_units: int) -> None:
-    process = subprocess.Popen(command(tmp_path), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    records = tmp_path / "cache" / "records"
-    while len(list(records.rglob("*.json"))) < finished_units:
-        assert process.poll() is None
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    kept = len(list(records.rglob("*.json")))
-    done = subprocess.run(command(tmp_path), check=True, capture_output=True, text=True)
-    assert f"{kept} cached" in done.stdout
+def kill_in(stage: str, folder: Path) -> None:
+    """Run until the first unit of a stage is computed, and kill the run while the others are in work."""
+    process = subprocess.Popen([*command(folder), "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    events = (json.loads(line) for line in process.stdout)
+    assert any((event["event"], event.get("stage")) == ("unit_finished", stage) for event in events)
+    process.kill()
+    process.communicate()
+
+
+def times_of_records(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in (folder / "cache" / "records").rglob("*.json")}
+
+
+def test_killed_in_the_middle_it_resumes_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
+    """The run is killed twice: while it matches, and in the middle of the sweep."""
+    whole = len(times_of_records(finished))
+    kill_in("matches", tmp_path)
+    matched = times_of_records(tmp_path)
+    kill_in("depth", tmp_path)
+    swept = times_of_records(tmp_path)
+    assert 0 < len(matched) < len(swept) < whole
+    subprocess.run(command(tmp_path), check=True)
+    resumed = times_of_records(tmp_path)
+    assert len(resumed) == whole
+    assert matched.items() <= swept.items() <= resumed.items()  # what was computed is not computed again
     assert deliverables(tmp_path / "out") == deliverables(finished / "out")

@@ -45,9 +45,9 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
     result = pano_mvs("run", *arguments)
     assert result.code == 0, result.text
     solved = read_poses(out / "colmap/sparse/0")
-    document = json.loads((out / "nerfstudio/equirectangular/transforms.json").read_text())
+    document = json.loads((out / "splat_bundle/equirectangular/transforms.json").read_text())
     assert [frame["file_path"] for frame in document["frames"]] == [f"images/{name}.jpg" for name in solved.names]
-    read = read_poses(out / "nerfstudio/equirectangular")
+    read = read_poses(out / "splat_bundle/equirectangular/transforms.json")
     assert read.names == solved.names  # though the pictures are written anew, under other names
     np.testing.assert_allclose(read.translations, solved.translations, atol=1e-9)
     for name, frame in zip(solved.names, document["frames"], strict=True):
@@ -56,22 +56,27 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
             read_range_tiff(out / f"range/{stem}.tiff"),
             read_confidence_png(out / f"confidence/{stem}.png"),
         )
-        depth = read_picture(out / "nerfstudio/equirectangular" / frame["depth_file_path"], cv2.IMREAD_UNCHANGED)
+        depth = read_picture(out / "splat_bundle/equirectangular" / frame["depth_file_path"], cv2.IMREAD_UNCHANGED)
         np.testing.assert_allclose(depth[confidence >= 64] / 1000, ranges[confidence >= 64], atol=0.000501)
         assert not depth[confidence < 64].any()
-        mask = read_picture(out / "nerfstudio/equirectangular" / frame["mask_path"], cv2.IMREAD_UNCHANGED)
+        mask = read_picture(out / "splat_bundle/equirectangular" / frame["mask_path"], cv2.IMREAD_UNCHANGED)
         assert not mask[-15:].any()
         assert not depth[mask == 0].any()
-    faces = json.loads((out / "nerfstudio/faces/transforms.json").read_text())
+    faces = json.loads((out / "splat_bundle/faces/transforms.json").read_text())
     assert len(faces["frames"]) == 6 * len(document["frames"])
     assert all(
-        (out / "nerfstudio/faces" / frame[key]).is_file()
+        (out / "splat_bundle/faces" / frame[key]).is_file()
         for frame in faces["frames"]
         for key in ("file_path", "mask_path", "depth_file_path")
     )
-    assert len(read_ply(out / "nerfstudio/faces/seed.ply")) > 5000
+    assert len(read_ply(out / "splat_bundle/faces/seed.ply")) > 5000
     assert len(pycolmap.Reconstruction(str(out / "colmap_dense_init/sparse/0")).points3D) > 1000
-    (out / "nerfstudio/faces/images/000.png.front.jpg").unlink()
+    assert len(pycolmap.Reconstruction(str(out / "splat_bundle/faces/sparse/0")).points3D) > 1000
+    manifest = json.loads((out / "splat_bundle/manifest.json").read_text())
+    assert len(manifest["views"]) == 7 * len(document["frames"])
+    layers = ("image", "mask", "depth", "normal", "confidence")
+    assert all((out / "splat_bundle" / view[layer]).is_file() for view in manifest["views"] for layer in layers)
+    (out / "splat_bundle/faces/images/000.png.front.jpg").unlink()
     again = pano_mvs("run", *arguments)
     assert "0 units computed" in again.flat
-    assert (out / "nerfstudio/faces/images/000.png.front.jpg").is_file()
+    assert (out / "splat_bundle/faces/images/000.png.front.jpg").is_file()

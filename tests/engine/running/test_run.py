@@ -279,6 +279,16 @@ def test_metric_that_is_not_finite_passes_no_gate(toy: Toy) -> None:
     assert toy.run("scaled.gate={value: 1}").exit_code == RunStoppedError.exit_code
 
 
+def test_a_note_says_how_many_units_gave_it(toy: Toy) -> None:
+    """Notes of several units spoke of "some images"."""
+    noted = """ctx.note("{count} are dark") if x.value > 25 else ctx.note("a {count} in braces")
+    ctx.metric("value", x.value)"""
+    toy.edit("plug.py", lambda text: text.replace('ctx.metric("value", x.value)', noted))
+    for _ in range(2):
+        notes = {stage.name: stage.notes for stage in toy.run().stages}
+        assert sorted(notes["scaled"]) == ["3 of 5 are dark", "a {count} in braces"]
+
+
 @pytest.mark.parametrize("where", ["    if x.value == 13:", "class ScaleParams"])
 def test_plugin_that_exits_is_a_failure(toy: Toy, where: str) -> None:
     indent = where[: len(where) - len(where.lstrip())]

@@ -18,6 +18,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.io.colmap.model_writer import read_colmap_model, write_colmap_model
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import Poses
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.testing.room import capture_poses
 
 NAMES = ("b/1.jpg", "b/2.jpg", "b/10.jpg", "c.png")
@@ -147,6 +148,31 @@ def test_the_same_poses_are_the_same_bytes_in_another_process(model_folder: Path
 def test_a_size_that_is_not_given_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"the size of c\.png is not given"):
         write_colmap_model(tmp_path, noisy_poses(), dict.fromkeys(NAMES[:3], (8, 16)))
+
+
+def test_photographs_are_in_the_model_and_left_out_of_the_poses(tmp_path: Path) -> None:
+    poses, pose = noisy_poses(), capture_poses(5, seed=4)[4]
+    photographs = Photographs(
+        names=("phone/7.jpg",),
+        sizes_hw=np.array([[3000, 4000]], np.int32),
+        focals_px=np.array([3100.0]),
+        radials=np.array([0.05]),
+        rotations=pose.rotation[None],
+        translations=pose.translation[None],
+        inliers=np.array([50], np.int32),
+        errors_px=np.array([0.5], np.float32),
+    )
+    write_colmap_model(tmp_path, poses, SIZES, photographs=photographs)
+    model = pycolmap.Reconstruction(tmp_path)
+    image = next(image for image in model.images.values() if image.name == "phone/7.jpg")
+    assert image.camera.model.name == "SIMPLE_RADIAL"
+    point = pose.inverse().apply(np.array([0.3, -0.2, 1.0]))
+    expected = 3100 * (1 + 0.05 * 0.13) * np.array([0.3, -0.2]) + [2000, 1500]
+    np.testing.assert_allclose(image.project_point(point), expected, atol=1e-6)
+    back = read_colmap_model(tmp_path)
+    assert back.names == NAMES
+    np.testing.assert_allclose(back.translations, poses.translations, atol=1e-12)
+    assert len(back.points_in_world) == len(poses.points_in_world)
 
 
 def test_other_cameras_are_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.exif import orientation_from_exif, position_from_exif
+from pano_mvs.io.images.containers import read_container
+from pano_mvs.io.images.exif import focal_from_exif, orientation_from_exif, position_from_exif
 from tests.io.images.pictures import app1, exif, write_jpeg
 
 
@@ -63,3 +66,15 @@ def test_an_entry_that_points_outside_of_the_data_hides_no_others() -> None:
     description = struct.pack("<HHII", 0x010E, 2, 40, 1_000_000)
     damaged = data[:10] + description + data[22:]
     assert position_from_exif(damaged) == pytest.approx((47.51, 8.25, 123.4))
+
+
+def test_the_focal_length_is_that_of_35_mm_film(tmp_path: Path) -> None:
+    """24 mm on film is a diagonal field of view of 84°."""
+    metadata = Image.Exif()
+    metadata.get_ifd(0x8769)[0xA405] = 24
+    Image.new("RGB", (400, 300)).save(tmp_path / "a.jpg", exif=metadata)
+    focal_px = focal_from_exif(read_container((tmp_path / "a.jpg").read_bytes()).exif, (300, 400))
+    assert focal_px is not None
+    assert math.degrees(2 * math.atan(250 / focal_px)) == pytest.approx(84.06, abs=0.05)
+    assert focal_from_exif(exif(), (300, 400)) is None
+    assert focal_from_exif(b"", (300, 400)) is None

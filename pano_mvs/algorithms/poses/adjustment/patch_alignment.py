@@ -194,15 +194,14 @@ def _patches(
         panorama, mask = load(poses.names[image])
         rays = sightings.middles[seen], sightings.first_axes[seen], sightings.second_axes[seen]
         sample_patches(smoothed_gray(panorama), _PAD_PX, *rays, sampled)
-        sampled[_masked(mask, *rays)] = 0.0  # patches without contrast do not align
+        sampled[_masked(mask, rays)] = 0.0  # patches without contrast do not align
         patches[own] = sampled
     return patches
 
 
-def _masked(
-    mask: NDArray[np.bool_], middles: FloatArray, first_axes: FloatArray, second_axes: FloatArray
-) -> NDArray[np.bool_]:
+def _masked(mask: NDArray[np.bool_], rays: tuple[FloatArray, FloatArray, FloatArray]) -> NDArray[np.bool_]:
     """Return which patches, (M,), extend into the masked part of an image; 5 × 5 rays of each patch are tested."""
+    middles, first_axes, second_axes = rays
     masked = np.zeros(len(middles), np.bool_)
     if mask.all():
         return masked

@@ -60,14 +60,14 @@ def write_database(
             sensors: dict[tuple[int, int], tuple[int, list[int]]] = {}
             images: dict[int, DatabaseImage] = {}
             for idx, (name, found) in enumerate(features.items()):
-                images |= write(database, sensors, idx, name, found)
+                images |= write(database, sensors, idx=idx, name=name, found=found)
             _write_pairs(database, tuple(features), two_views, images=images)
     finally:
         database.close()
     return images
 
 
-def _write_sphere(database: Any, sensors: dict[Any, Any], idx: int, name: str, found: Features) -> dict[int, Any]:
+def _write_sphere(database: Any, sensors: dict[Any, Any], *, idx: int, name: str, found: Features) -> dict[int, Any]:
     import pycolmap
 
     height, width = found.size_hw
@@ -81,7 +81,7 @@ def _write_sphere(database: Any, sensors: dict[Any, Any], idx: int, name: str, f
     return {image_id: DatabaseImage(idx, np.arange(len(found), dtype=np.int32), np.eye(3))}
 
 
-def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, found: Features) -> dict[int, Any]:
+def _write_faces(database: Any, sensors: dict[Any, Any], *, idx: int, name: str, found: Features) -> dict[int, Any]:
     import pycolmap
 
     size = face_size(found.size_hw)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local, local_from_lla
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses
 
 FloatArray = NDArray[np.float64]

@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from pano_mvs.algorithms.poses.frame.vertical_lines import directions_around
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import angle_between
 
 FloatArray = NDArray[np.float64]
 
 # Search around a given up direction: half width and step in degrees, layer thickness relative to the typical range.
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
 _MIN_POINTS = 100
+_PARTS = 4
 # Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms, 200
 # to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
 _MIN_CONTRAST = 1.3
@@ -36,11 +38,13 @@ class Layers:
         up: (3,) unit vector.
         contrast: sharpness of the layers relative to the median direction within 8°.
         reason: why there is none; else "".
+        uncertainty_deg: standard deviation of the direction, from four parts of the points.
     """
 
     up: FloatArray
     contrast: float
     reason: str = ""
+    uncertainty_deg: float = float("nan")
 
     def __bool__(self) -> bool:
         """Return whether there are layers."""
@@ -87,14 +91,27 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
     near = offsets[ranges < 3 * typical] / typical
     best, width = up, 0.0
     for half_deg, step_deg, width in _ROUNDS:
-        candidates = _directions_around(best, half_deg, step_deg)
+        candidates = directions_around(best, half_deg, step_deg)
         best = candidates[int(np.argmax([_concentration(near @ candidate, width) for candidate in candidates]))]
-    others = _directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
+    others = directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
     usual = np.median([_concentration(near @ other, width) for other in others])
     contrast = float(_concentration(near @ best, width) / usual)
     if contrast < _MIN_CONTRAST:
         return Layers(up, contrast, f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
-    return Layers(best, contrast)
+    return Layers(best, contrast, uncertainty_deg=_scatter_deg(near, best))
+
+
+def _scatter_deg(points: FloatArray, up: FloatArray) -> float:
+    """Return the standard deviation of the mean of the directions of four parts of the points."""
+    offs = []
+    for part in range(_PARTS):
+        found = up
+        for half_deg, step_deg, width in _ROUNDS[1:]:
+            candidates = directions_around(found, half_deg, step_deg)
+            sharpness = [_concentration(points[part::_PARTS] @ candidate, width) for candidate in candidates]
+            found = candidates[int(np.argmax(sharpness))]
+        offs.append(float(np.rad2deg(angle_between(found, up))))
+    return float(np.hypot(np.sqrt(np.mean(np.square(offs)) / _PARTS), _ROUNDS[-1][1]))
 
 
 def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floor:
@@ -126,16 +143,6 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
         return Floor(0.0, reason=f"no level surface below the cameras contains {_MIN_FLOOR_POINTS} sparse points")
     depth = float(np.median(on_floor))
     return Floor(depth, len(on_floor), float(np.median(np.abs(on_floor - depth))))
-
-
-def _directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
-    """Return unit vectors (K, 3) on a grid of tilts; the first is `up` tilted the most in one direction, and so on."""
-    tilts = np.deg2rad(np.arange(-half_deg, half_deg + step_deg / 2, step_deg))
-    x, y = np.meshgrid(tilts, tilts, indexing="ij")
-    rotvecs = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    rotvecs = rotvecs[np.hypot(rotvecs[:, 0], rotvecs[:, 1]) <= np.deg2rad(half_deg) + 1e-9]
-    around_z: FloatArray = rotation_from_rotvec(rotvecs)[:, :, 2]
-    return around_z @ rotation_from_two_vectors(np.array([0.0, 0.0, 1.0]), up).T
 
 
 def _concentration(heights: FloatArray, width: float) -> float:

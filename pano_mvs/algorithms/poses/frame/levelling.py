@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
@@ -29,13 +31,18 @@ def level_poses(
     up_in_cam: Mapping[str, Sequence[float]] | None = None,
     heading_deg: Mapping[str, float] | None = None,
     *,
+    pictures: Mapping[str, Picture] | None = None,
     evidence: Annotated[
         Evidence,
         Setting(
-            "source of the vertical: sensors (pitch and roll in the metadata), structure (level surfaces among "
-            "the sparse points), or cameras (their up directions); auto uses the first available one"
+            "source of the vertical: sensors (pitch and roll in the metadata), lines (vertical edges in the pictures), "
+            "structure (level surfaces among the sparse points), or cameras (their up directions); auto uses the first "
+            "available one"
         ),
     ] = "auto",
+    max_uncertainty_deg: Annotated[
+        float, Setting("do not level if the standard deviation of the vertical is larger", gt=0, le=90)
+    ] = 5.0,
 ) -> tuple[Poses, Vertical]:
     """Return the same scene in a level world: origin at the first camera, y down along gravity, unit unchanged.
 
@@ -46,13 +53,23 @@ def level_poses(
         poses: registered images.
         up_in_cam: image name to the up direction (3,) measured by its camera's sensors, in the camera frame.
         heading_deg: image name to the compass heading of its centre, clockwise from north.
+        pictures: image name to a function that loads its panorama, for vertical lines.
         evidence: as in `find_vertical`.
+        max_uncertainty_deg: standard deviation of the vertical above which the poses stay as they are.
 
     Returns:
-        The poses, and the evidence that they were levelled by. If the vertical cannot be determined, the unchanged
-        poses and a falsy record with the reason.
+        The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned
+        the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
-    vertical = find_vertical(poses, up_in_cam, evidence=evidence)
+    if origin_of_frame(poses.frame) is not None:
+        return poses, Vertical(_UP, reason="GPS has already turned it: x east, y down, z north")
+    vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
+    if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
+        reason = (
+            f"by {vertical.evidence}, the vertical is uncertain by {vertical.uncertainty_deg:.1f}°, more "
+            f"than max_uncertainty_deg = {max_uncertainty_deg:g}°"
+        )
+        vertical = replace(vertical, reason=reason)
     if not vertical:
         return poses, vertical
     levelling = rotation_from_two_vectors(vertical.up_in_world, _UP)
@@ -61,7 +78,8 @@ def level_poses(
     # Adding 0 turns −0 into 0: the first camera is exactly at the origin.
     level = moved_poses(level, Similarity3(1.0, towards, np.zeros(3)))
     level.translations[0] = 0.0
-    frame = f"origin at the first registered camera; y down along gravity, by {vertical.evidence}; {heading}"
+    known = f"{vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°"
+    frame = f"origin at the first registered camera; y down along gravity, by {known}; {heading}"
     return replace(level, frame=frame), vertical
 
 

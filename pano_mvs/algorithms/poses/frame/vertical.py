@@ -1,4 +1,4 @@
-"""The vertical in the world frame of poses, from sensors, level surfaces and cameras, with their agreement."""
+"""The vertical in the world frame of poses, from sensors, vertical lines, level surfaces and cameras."""
 
 from __future__ import annotations
 
@@ -10,20 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, up_from_lines
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 
 FloatArray = NDArray[np.float64]
-Evidence = Literal["auto", "sensors", "structure", "cameras"]
+Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 
 _UP = np.array([0.0, -1.0, 0.0])
 # Sensors of one rigid capture that differ by more than this did not measure gravity.
 _MAX_SENSOR_DISAGREEMENT_DEG = 5.0
 # Cameras whose up directions differ by more than this were not held upright.
 _MAX_CAMERA_DISAGREEMENT_DEG = 20.0
-# Level surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a ramp.
+# Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a ramp.
 _MAX_STRUCTURE_TILT_DEG = 2.0
+# Errors that all sensors of a type, or all cameras of one person, have in common; that of a single reading.
+_SENSOR_BIAS_DEG, _CAMERA_BIAS_DEG, _SINGLE_READING_DEG = 0.5, 1.0, 1.0
+# Of the median of the angles between directions and their mean, in terms of the standard deviation of the direction.
+_STD_PER_MEDIAN = 0.85 * np.sqrt(2.0)
+# How far from upright a single camera is usually held.
+_ONE_CAMERA_DEG = 2.0
 # Agreement better than this rejects nothing: readings are tenths of degrees at best.
 _MIN_LIMIT_DEG = 1.0
 
@@ -34,10 +41,11 @@ class Vertical:
 
     Attributes:
         up_in_world: (3,) unit vector.
-        source: "sensors", "structure" or "cameras".
+        source: "sensors", "lines", "structure" or "cameras".
         evidence: description of the source, with its amount and agreement.
         disagreement_deg: median angle between single readings and `up_in_world`; NaN if there is only one.
         reason: why the direction is unknown; "" if it is known.
+        uncertainty_deg: standard deviation of `up_in_world`; NaN if unknown.
     """
 
     up_in_world: FloatArray
@@ -45,6 +53,7 @@ class Vertical:
     evidence: str = ""
     disagreement_deg: float = float("nan")
     reason: str = ""
+    uncertainty_deg: float = float("nan")
 
     def __bool__(self) -> bool:
         """Return whether the direction is known."""
@@ -52,19 +61,25 @@ class Vertical:
 
 
 def find_vertical(
-    poses: Poses, up_in_cam: Mapping[str, Sequence[float]] | None = None, *, evidence: Evidence = "auto"
+    poses: Poses,
+    up_in_cam: Mapping[str, Sequence[float]] | None = None,
+    pictures: Mapping[str, Picture] | None = None,
+    *,
+    evidence: Evidence = "auto",
 ) -> Vertical:
     """Return the direction away from gravity in the world frame of poses.
 
     Args:
         poses: registered images, and their sparse points for `structure`.
         up_in_cam: image name to the up direction (3,) measured by its camera's sensors, in the camera frame.
-        evidence: "sensors" of the cameras; the "structure" of floors, ceilings and tables within 20° of the cameras'
-            mean up direction; the up directions of the "cameras" alone; or "auto": the first of these, in this order,
-            that can be used.
+        pictures: image name to a function that loads its panorama, for `lines`.
+        evidence: "sensors" of the cameras; vertical "lines" in the pictures, or the "structure" of floors, ceilings and
+            tables, within 20° of the cameras' mean up direction; the up directions of the "cameras" alone; or "auto":
+            the first of these, in this order, that can be used.
     """
     finders: dict[str, Callable[[], Vertical]] = {
         "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
+        "lines": lambda: vertical_from_lines(poses, pictures or {}),
         "structure": lambda: vertical_from_structure(poses),
         "cameras": lambda: vertical_from_cameras(poses),
     }
@@ -90,7 +105,10 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
     agreement = f", median disagreement {disagreement_deg:.2f}°" if len(measured) > 1 else ", nothing to compare with"
     states = plural(int(kept.sum()), "states", "state")
     evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas {states}{agreement}"
-    return Vertical(up, "sensors", evidence, disagreement_deg if len(measured) > 1 else float("nan"))
+    if len(measured) == 1:
+        return Vertical(up, "sensors", evidence, uncertainty_deg=_SINGLE_READING_DEG)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, int(kept.sum()), _SENSOR_BIAS_DEG)
+    return Vertical(up, "sensors", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
 def vertical_from_cameras(poses: Poses) -> Vertical:
@@ -104,7 +122,27 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
             f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
         )
     evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
-    return Vertical(up, "cameras", evidence, disagreement_deg)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), _CAMERA_BIAS_DEG)
+    return Vertical(up, "cameras", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
+
+
+def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertical:
+    """Return the direction near the cameras' mean up direction to which most line segments in the pictures point.
+
+    One camera suffices: its own up direction is where the search begins.
+    """
+    prior = vertical_from_cameras(poses) if len(poses.names) > 1 else _of_one_camera(poses)
+    if not prior:
+        return prior
+    rotations = dict(zip(poses.names, poses.rotations, strict=True))
+    lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
+    if not lines:
+        return _unknown(lines.reason)
+    reason = _too_far(lines.up, prior, "vertical lines are")
+    if reason:
+        return _unknown(reason)
+    evidence = f"{lines.count} vertical lines in the pictures"
+    return Vertical(lines.up, "lines", evidence, prior.disagreement_deg, uncertainty_deg=lines.uncertainty_deg)
 
 
 def vertical_from_structure(poses: Poses) -> Vertical:
@@ -115,15 +153,15 @@ def vertical_from_structure(poses: Poses) -> Vertical:
     layers = sharpest_up(poses.points_in_world, poses.centers, prior.up_in_world)
     if not layers:
         return _unknown(layers.reason)
+    reason = _too_far(layers.up, prior, "layers of sparse points are")
+    if reason:
+        return _unknown(reason)
     moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
-    limit_deg = _MAX_STRUCTURE_TILT_DEG + 3 * 1.4826 * prior.disagreement_deg
-    if moved_deg > limit_deg:
-        return _unknown(f"the layers of sparse points are tilted by {moved_deg:.1f}° against the cameras' up direction")
     evidence = (
         f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
         f"of {len(poses.names)} cameras"
     )
-    return Vertical(layers.up, "structure", evidence, prior.disagreement_deg)
+    return Vertical(layers.up, "structure", evidence, prior.disagreement_deg, uncertainty_deg=layers.uncertainty_deg)
 
 
 def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -143,6 +181,23 @@ def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArra
         mean = directions[kept].mean(axis=0)
         mean = mean / np.linalg.norm(mean)
     return mean, np.rad2deg(angle_between(directions, mean)), kept
+
+
+def _of_one_camera(poses: Poses) -> Vertical:
+    if not poses.names:
+        return _unknown("there is no camera")
+    return Vertical(poses.rotations[0].T @ _UP, "cameras", "a single camera", _ONE_CAMERA_DEG)
+
+
+def _too_far(up: FloatArray, prior: Vertical, what: str) -> str:
+    """Return why a direction cannot be the vertical, if it is too far from that of the cameras; else ""."""
+    moved_deg = float(np.rad2deg(angle_between(up, prior.up_in_world)))
+    limit_deg = _MAX_STRUCTURE_TILT_DEG + 3 * 1.4826 * prior.disagreement_deg
+    return f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction" if moved_deg > limit_deg else ""
+
+
+def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) -> float:
+    return float(np.hypot(bias_deg, _STD_PER_MEDIAN * disagreement_deg / np.sqrt(count)))
 
 
 def _unknown(reason: str) -> Vertical:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
+from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
@@ -17,7 +18,6 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
     oriented,
 )
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
-from pano_mvs.algorithms.poses.placement.registration import GrowingModel
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, consistent_edges

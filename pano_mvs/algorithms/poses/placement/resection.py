@@ -29,7 +29,7 @@ def refine_resection(
         iterations: maximum number of steps.
     """
     pose, damping = cam_from_world, 1e-6
-    cost = _cost(pose, points_in_world, bearings, scale_rad)
+    cost = _cost(pose, points_in_world, bearings, scale_rad=scale_rad)
     for _ in range(iterations):
         residuals, jacobian = _linearised(pose, points_in_world, bearings)
         weights = 1 / (1 + np.sum(residuals**2, axis=1) / scale_rad**2)
@@ -37,7 +37,7 @@ def refine_resection(
         gradient = np.einsum("mij,m,mi->j", jacobian, weights, residuals)
         step = -np.linalg.solve(hessian + np.diag(damping * hessian.diagonal() + 1e-15), gradient)
         moved = Rigid3.from_center(rotation_from_rotvec(step[:3]) @ pose.rotation, pose.center + step[3:])
-        moved_cost = _cost(moved, points_in_world, bearings, scale_rad)
+        moved_cost = _cost(moved, points_in_world, bearings, scale_rad=scale_rad)
         if moved_cost >= cost:
             damping *= 100
             continue
@@ -62,6 +62,6 @@ def _linearised(pose: Rigid3, points: FloatArray, bearings: FloatArray) -> tuple
     return (basis @ unit[:, :, None])[..., 0], jacobian
 
 
-def _cost(pose: Rigid3, points: FloatArray, bearings: FloatArray, scale_rad: float) -> float:
+def _cost(pose: Rigid3, points: FloatArray, bearings: FloatArray, *, scale_rad: float) -> float:
     errors = resection_errors(pose, points, bearings)
     return float(np.sum(np.log1p((errors / scale_rad) ** 2)))

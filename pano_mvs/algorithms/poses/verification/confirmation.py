@@ -147,7 +147,7 @@ class Confirmation:
             own,
             pose,
             maps,
-            poses,
+            source_poses=poses,
             max_relative_error=_MAX_RELATIVE_ERROR,
             max_reprojection_px=_MAX_REPROJECTION_PX,
             min_support=_MIN_SUPPORT,

@@ -10,7 +10,7 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.verification.arbitration import Arbitration, arbitrate
+from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
@@ -71,11 +71,11 @@ def _verified(
     model = model_of(poses, pairs)
     confirmation = Confirmation(lambda image: load(poses.names[image]))
     fixed = () if correct and inside else range(len(poses.names))
-    arbitration = arbitrate(model, confirmation, fixed=fixed)
-    if arbitration.moved or arbitration.removed:
+    checks = correct_cameras(model, confirmation, fixed=fixed)
+    if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
-        poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in arbitration.removed.items()})
-    return with_arbitration(poses, pairs, arbitration)
+        poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
+    return with_camera_checks(poses, pairs, checks)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -99,7 +99,7 @@ def poses_of(model: PlacedModel) -> Poses:
     return poses_with_points(poses, tracks, max_error_deg=_MAX_ERROR_DEG, min_angle_deg=_MIN_ANGLE_DEG)
 
 
-def with_arbitration(poses: Poses, pairs: Pairs, arbitration: Arbitration) -> Poses:
+def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Poses:
     """Return poses of one group with the evidence of the images."""
     position = {name: idx for idx, name in enumerate(pairs.names)}
 
@@ -108,7 +108,7 @@ def with_arbitration(poses: Poses, pairs: Pairs, arbitration: Arbitration) -> Po
 
     return replace(
         poses,
-        confirmed_shares=of_each(arbitration.shares) if arbitration.asked else None,
-        expected_shares=of_each(arbitration.expected) if arbitration.asked else None,
-        doubts={pairs.names[idx]: why for idx, why in sorted(arbitration.doubts.items())},
+        confirmed_shares=of_each(checks.shares) if checks.asked else None,
+        expected_shares=of_each(checks.expected) if checks.asked else None,
+        doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )

@@ -153,25 +153,27 @@ def _summed_paths(
     paths.prepare(pool, beyond_pole if top == 0 else 0)
     for first in range(0, height, _BLOCK_ROWS):
         count = min(_BLOCK_ROWS, height - first)
-        along = partial(_follow_some_rows, volume, sideways, p1, block, range(first, first + count))
-        run_jobs(pool, along, range(first, first + count, _JOB_ROWS))
-        paths.follow(pool, first, count, Sums(block, first, total, 0))
+        rows = range(first, first + count)
+        along = partial(_follow_some_rows, rows=rows, volume=volume, penalties=sideways, p1=p1, block=block)
+        run_jobs(pool, along, rows[::_JOB_ROWS])
+        paths.follow(pool, rows, Sums(block, first, total, 0))
     paths = _PolePaths(PathCosts(volume, penalties(*((-1, drift) for drift in DRIFTS)), p1, True))
     paths.prepare(pool, beyond_pole if end == size_hw[0] else 0)
     for step in range(0, height, _BLOCK_ROWS):
         count = min(_BLOCK_ROWS, height - step)
         first = height - step - count
-        paths.follow(pool, step, count, Sums(total, 0, block, first))
+        paths.follow(pool, range(step, step + count), Sums(total, 0, block, first))
         yield slice(first, first + count), block
 
 
 def _follow_some_rows(
+    first: int,
+    *,
+    rows: range,
     volume: NDArray[np.uint8],
     penalties: NDArray[np.uint16],
     p1: np.uint16,
     block: NDArray[np.uint16],
-    rows: range,
-    first: int,
 ) -> None:
     follow_rows(volume, penalties, p1, (first, min(_JOB_ROWS, rows.stop - first)), block, rows.start)
 
@@ -194,16 +196,16 @@ class _PolePaths:
         """Follow the paths beyond the pole from which they come."""
         nowhere = np.empty((0, *_sum_shape(self._costs.volume)), np.uint16)
         for first in range(-steps, 0, _BLOCK_ROWS):
-            self.follow(pool, first, min(_BLOCK_ROWS, -first), Sums(nowhere, 0, nowhere, 0))
+            self.follow(pool, range(first, min(first + _BLOCK_ROWS, 0)), Sums(nowhere, 0, nowhere, 0))
 
-    def follow(self, pool: Pool, step: int, count: int, sums: Sums) -> None:
+    def follow(self, pool: Pool, steps: range, sums: Sums) -> None:
         """Follow the paths by some steps, the same for any strips, and add their costs to the sums."""
         width, strip = self._costs.volume.shape[2], self._strip
 
         def follow_strip(first: int) -> None:
             columns = first, min(strip, width - first)
             state = self._states[first // strip]
-            follow_block(self._costs, self._fronts[0], self._fronts[1], (step, count), columns, sums, state)
+            follow_block(self._costs, self._fronts[0], self._fronts[1], (steps.start, len(steps)), columns, sums, state)
 
         run_jobs(pool, follow_strip, range(0, width, strip))
         self._fronts.reverse()

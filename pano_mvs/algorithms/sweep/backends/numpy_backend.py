@@ -105,7 +105,7 @@ def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]
             row = row if rows > 0 else height - 1 - row
             beyond = 0 if i >= 0 else width // 2
             here = np.roll(volume[row], beyond, axis=-1)
-            path = path_step(here, np.roll(path, columns, axis=-1), np.roll(penalties[row], beyond), p1)
+            path = path_step(here, np.roll(path, columns, axis=-1), np.roll(penalties[row], beyond), p1=p1)
             if i >= 0:
                 total[row] += path
     for step in (1, -1):
@@ -113,14 +113,14 @@ def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]
         path = np.zeros((volume.shape[1], height), np.int64)
         for i in range(-before_seam, width):
             column = i % width if step > 0 else width - 1 - i % width
-            path = path_step(volume[:, :, column].T, path, penalties[:, column], p1)
+            path = path_step(volume[:, :, column].T, path, penalties[:, column], p1=p1)
             if i >= 0:
                 total[:, :, column] += path.T
     return total
 
 
 def path_step(
-    costs: NDArray[np.int64], before: NDArray[np.int64], penalty: NDArray[np.int64], p1: int
+    costs: NDArray[np.int64], before: NDArray[np.int64], penalty: NDArray[np.int64], *, p1: int
 ) -> NDArray[np.int64]:
     """Return L(p, ·) from C(p, ·) and L(q, ·), (D, N) each, for N paths at once; `penalty` is (N,) P2."""
     floor = before.min(axis=0)

@@ -147,7 +147,7 @@ class GuidedSweep:
             penalties = step_penalties(self.work.reference, (rows, columns), settings)
 
             def strip(
-                first: int, penalties: NDArray[np.uint16] = penalties, rows: int = rows, columns: int = columns
+                first: int, *, penalties: NDArray[np.uint16] = penalties, rows: int = rows, columns: int = columns
             ) -> None:
                 lines = min(_STRIP_LINES, width - first)
                 follow_guided_strip(

@@ -1,1 +1,1 @@
-"""The compiled sweep: kernels, their arguments, tiles, threads; `kernels_constants` alone does not import numba."""
+"""The compiled sweep: kernels, their arguments, tiles and threads."""

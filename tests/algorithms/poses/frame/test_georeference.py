@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local, local_from_lla
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, origin_of_frame, scaled_by_gps
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
+from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_rotation
 

@@ -1,0 +1,173 @@
+"""Grids of one storey seen from above, filled with the points of a cloud a part at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.floor_plan.storeys import Storey
+
+FloatArray = NDArray[np.float64]
+
+LAYERS = 32
+"""Number of layers between floor and ceiling in which walls are looked for."""
+
+_WALL_FROM, _WALL_TO = 0.08, 0.95
+_VERTICAL = 0.35
+_BELOW_FLOOR = 0.05
+_HEIGHT_BITS = 20
+_FILLED_PX = 6
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a grid lies: its pixels are squares, and its first row is the farthest along y.
+
+    Attributes:
+        left: x of the left edge.
+        top: y of the upper edge.
+        pixel: edge of a pixel in scene units.
+        size_hw: rows and columns.
+    """
+
+    left: float
+    top: float
+    pixel: float
+    size_hw: tuple[int, int]
+
+    def coarser(self, factor: int) -> Extent:
+        """Return a grid of larger pixels that covers at least the same area."""
+        rows, columns = (-(-size // factor) for size in self.size_hw)
+        return Extent(self.left, self.top, self.pixel * factor, (rows, columns))
+
+    def cells(self, xy: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the flat index (N,) of the pixel of each point (N, 2), and whether it is inside."""
+        column = np.floor((xy[:, 0] - self.left) / self.pixel).astype(np.int64)
+        row = np.floor((self.top - xy[:, 1]) / self.pixel).astype(np.int64)
+        rows, columns = self.size_hw
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        return np.where(inside, row * columns + column, 0), inside
+
+    def pixels_from_xy(self, xy: FloatArray) -> FloatArray:
+        """Return positions (..., 2) as column and row; (0, 0) is the upper left corner of the grid."""
+        return np.stack([xy[..., 0] - self.left, self.top - xy[..., 1]], axis=-1) / self.pixel
+
+
+@dataclass(frozen=True, eq=False)
+class WallCells:
+    """Cells of a plan with vertical surfaces.
+
+    Attributes:
+        xy: (N, 2) mean position of the points in each cell.
+        normals_xy: (N, 2) unit normals, on the side that was seen.
+        shares: (N,) share of the layers between floor and ceiling with such points in the cell or beside it.
+        weights: (N,) number of layers with such points in the cell.
+        cell: edge of a cell.
+    """
+
+    xy: FloatArray
+    normals_xy: FloatArray
+    shares: FloatArray
+    weights: FloatArray
+    cell: float
+
+    def only(self, chosen: NDArray[np.bool_]) -> WallCells:
+        """Return some of the cells."""
+        return WallCells(self.xy[chosen], self.normals_xy[chosen], self.shares[chosen], self.weights[chosen], self.cell)
+
+
+class PlanGrid:
+    """The orthophoto and the walls of one storey.
+
+    The orthophoto shows the highest point below a cut, in each pixel. The result does not depend on the order of the
+    points. Memory: 8 bytes a pixel, and 44 bytes a cell of the walls.
+    """
+
+    def __init__(self, storey: Storey, extent: Extent, *, cut: float, cell_px: int) -> None:
+        """Start with empty grids.
+
+        Args:
+            storey: whose floor and ceiling bound the points.
+            extent: of the orthophoto.
+            cut: height of the cut; points above are not in the orthophoto.
+            cell_px: edge of a cell of the walls in pixels.
+        """
+        self.storey = storey
+        self.extent = extent
+        self.walls = extent.coarser(cell_px)
+        self._cut = cut
+        self._photo = np.zeros(extent.size_hw[0] * extent.size_hw[1], np.int64)
+        cells = self.walls.size_hw[0] * self.walls.size_hw[1]
+        self._layers = np.zeros(cells, np.uint32)
+        self._sums = np.zeros((cells, 5))  # x, y, their normal's, number
+
+    def add(self, points: FloatArray, normals: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
+        """Add points (N, 3) with z up, their unit normals (N, 3) and colours (N, 3)."""
+        self._add_photo(points, colors_rgb)
+        self._add_walls(points, normals)
+
+    def photo(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Return the orthophoto (H, W, 3) RGB, with small gaps filled, and the pixels (H, W) that show something."""
+        packed = self._photo.reshape(self.extent.size_hw)
+        known = packed > 0
+        image = np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+        if not known.any() or known.all():
+            return image, known
+        distance, labels = cv2.distanceTransformWithLabels(
+            (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        near = distance <= _FILLED_PX
+        colors = np.zeros((int(labels.max()) + 1, 3), np.uint8)
+        colors[labels[known]] = image[known]
+        return np.where(near[..., None], colors[labels], np.uint8(0)), near
+
+    def wall_cells(self) -> WallCells:
+        """Return the cells with vertical surfaces."""
+        rows, columns = self.walls.size_hw
+        beside = self._layers.reshape(rows, columns).copy()
+        for axis in (0, 1):
+            padded = np.pad(beside, [(1, 1) if number == axis else (0, 0) for number in (0, 1)])
+            size = beside.shape[axis]
+            parts = [np.take(padded, range(start, start + size), axis=axis) for start in range(3)]
+            beside = parts[0] | parts[1] | parts[2]
+        used = np.flatnonzero(self._layers)
+        sums = self._sums[used]
+        lengths = np.linalg.norm(sums[:, 2:4], axis=1)
+        sure = lengths > 0.3 * sums[:, 4]  # points whose normals agree
+        used, sums, lengths = used[sure], sums[sure], lengths[sure]
+        return WallCells(
+            xy=sums[:, :2] / sums[:, 4:],
+            normals_xy=sums[:, 2:4] / lengths[:, None],
+            shares=_bits(beside.reshape(-1)[used]) / LAYERS,
+            weights=_bits(self._layers[used]).astype(np.float64),
+            cell=self.walls.pixel,
+        )
+
+    def _add_photo(self, points: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
+        low = self.storey.floor - _BELOW_FLOOR * self.storey.height
+        index, inside = self.extent.cells(points[:, :2])
+        inside &= (points[:, 2] >= low) & (points[:, 2] <= self._cut)
+        share = (points[inside, 2] - low) / max(self._cut - low, 1e-12)
+        level = 1 + (share * ((1 << _HEIGHT_BITS) - 2)).astype(np.int64)
+        red, green, blue = colors_rgb[inside].astype(np.int64).T
+        np.maximum.at(self._photo, index[inside], (level << 24) | (red << 16) | (green << 8) | blue)
+
+    def _add_walls(self, points: FloatArray, normals: FloatArray) -> None:
+        share = (points[:, 2] - self.storey.floor) / max(self.storey.height, 1e-12)
+        index, inside = self.walls.cells(points[:, :2])
+        inside &= (share > _WALL_FROM) & (share < _WALL_TO) & (np.abs(normals[:, 2]) < _VERTICAL)
+        layer = ((share[inside] - _WALL_FROM) / (_WALL_TO - _WALL_FROM) * LAYERS).astype(np.uint32)
+        chosen = index[inside]
+        np.bitwise_or.at(self._layers, chosen, np.uint32(1) << np.minimum(layer, LAYERS - 1))
+        values = np.column_stack([points[inside, :2], normals[inside, :2], np.ones(len(chosen))])
+        for column in range(5):
+            self._sums[:, column] += np.bincount(chosen, values[:, column], len(self._sums))
+
+
+def _bits(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return the number of bits that are set in each mask."""
+    bits = np.unpackbits(masks.astype("<u4").view(np.uint8).reshape(-1, 4), axis=1)
+    return np.asarray(bits.sum(axis=1), np.int64)

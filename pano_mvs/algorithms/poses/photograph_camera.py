@@ -1,0 +1,123 @@
+"""The camera of an ordinary photograph: pose, focal length and radial distortion, and their refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+
+_ROUNDS, _MIN_POINTS = 4, 6
+# Typical changes of rotation, translation, log focal length and distortion.
+_STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
+_RADIAL_STD = 0.1
+# Errors beyond this many times the median of the inliers' count less and less (Cauchy's loss).
+_ROBUST = 1.5
+
+
+class FocalPrior(NamedTuple):
+    """What is known about a focal length.
+
+    Attributes:
+        focal_px: the expected focal length.
+        log_std: standard deviation of its natural logarithm.
+    """
+
+    focal_px: float
+    log_std: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographCamera:
+    """The camera of a photograph; see `Photographs` for the projection.
+
+    Attributes:
+        cam_from_world: the pose.
+        focal_px: focal length.
+        radial: coefficient of the distortion.
+    """
+
+    cam_from_world: Rigid3
+    focal_px: float
+    radial: float
+
+    def project(self, points_in_world: FloatArray, size_hw: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the pixels (N, 2) of points (N, 3), and which of them are before the camera, (N,)."""
+        in_cam = self.cam_from_world.apply(points_in_world)
+        before = in_cam[:, 2] > 1e-9
+        plane = in_cam[:, :2] / np.where(before, in_cam[:, 2], 1.0)[:, None]
+        distorted = (1 + self.radial * (plane**2).sum(axis=1, keepdims=True)) * plane
+        return self.focal_px * distorted + np.array(size_hw[::-1]) / 2, before
+
+    def errors(self, pixels_px: FloatArray, points_in_world: FloatArray, size_hw: tuple[int, int]) -> FloatArray:
+        """Return the reprojection errors (N,) in pixels; infinite behind the camera."""
+        seen, before = self.project(points_in_world, size_hw)
+        return np.asarray(np.where(before, np.linalg.norm(seen - pixels_px, axis=1), np.inf))
+
+
+def refine_camera(
+    pixels_px: FloatArray,
+    points_in_world: FloatArray,
+    camera: PhotographCamera,
+    *,
+    size_hw: tuple[int, int],
+    prior: FocalPrior,
+    max_error: float,
+) -> PhotographCamera:
+    """Return the camera that minimises the robust reprojection error of its inliers, given the prior.
+
+    The inliers are selected again a few times. Without priors, focal length, distortion and distance would be ambiguous
+    where all points are about equally far away.
+
+    Args:
+        pixels_px: (N, 2).
+        points_in_world: (N, 3).
+        camera: the camera to start from.
+        size_hw: (height, width) of the photograph.
+        prior: what is known about the focal length.
+        max_error: the largest error of an inlier, in radians at the centre.
+    """
+    for _ in range(_ROUNDS):
+        errors = camera.errors(pixels_px, points_in_world, size_hw)
+        inliers = errors < camera.focal_px * max_error
+        if inliers.sum() < _MIN_POINTS:
+            break
+        scale_px = max(0.1, _ROBUST * float(np.median(errors[inliers])))
+        camera = _adjusted(
+            pixels_px[inliers], points_in_world[inliers], camera, size_hw=size_hw, prior=prior, scale_px=scale_px
+        )
+    return camera
+
+
+def _adjusted(
+    pixels_px: FloatArray,
+    points_in_world: FloatArray,
+    camera: PhotographCamera,
+    *,
+    size_hw: tuple[int, int],
+    prior: FocalPrior,
+    scale_px: float,
+) -> PhotographCamera:
+    """Return the camera with the smallest errors (Cauchy's loss with a scale) to all of some points."""
+    from scipy.optimize import least_squares
+
+    def residuals(change: FloatArray) -> FloatArray:
+        moved = _moved(camera, change)
+        errors = (moved.project(points_in_world, size_hw)[0] - pixels_px).ravel() / scale_px
+        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
+        return np.concatenate([np.sign(errors) * np.sqrt(np.log1p(errors**2)), own])
+
+    return _moved(camera, least_squares(residuals, np.zeros(8), x_scale=_STEPS).x)
+
+
+def _moved(camera: PhotographCamera, change: FloatArray) -> PhotographCamera:
+    """Return a camera after a small rotation, a translation, and changes of log focal length and distortion."""
+    pose = camera.cam_from_world
+    turn = rotation_from_rotvec(change[:3])
+    moved = Rigid3(turn @ pose.rotation, turn @ pose.translation + change[3:6])
+    return PhotographCamera(moved, camera.focal_px * float(np.exp(change[6])), camera.radial + float(change[7]))

@@ -1,0 +1,402 @@
+"""Check the cameras of a model by the images, and correct them: move them, leave them out, or mark them as doubtful."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, enough_points
+from pano_mvs.algorithms.poses.verification.aliases import Alias, find_aliases, labellings, moved_cameras
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.verification.pair_weights import pair_shares
+from pano_mvs.geometry import Rigid3, geodesic_angle
+
+# A camera is examined again if its images confirm less than this share of what its neighbours suggest …
+_SUSPICIOUS = 0.75
+# … is doubtful if no other pose is better and the confirmed share stays below this …
+_DOUBTFUL = 0.55
+# … and is left out if its pairs do not support it either.
+_HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
+# Share of all pairs of a group; below this, a camera that looks right may still be the wrong one …
+_MIN_EXPLAINED_IN_ALL = 0.7
+# … unless the pairs of all reliable cameras are explained to this share.
+_MIN_EXPLAINED_BY_OTHERS = 0.85
+# A camera that confirms this share of what is expected is never doubtful, whatever its pairs suggest.
+_CONFIRMED = 0.9
+# A geometry is likely if two images confirm under it at least this share of what they confirm under their best one.
+_LIKELY = 0.9
+_PERIODIC_SHARE = 0.75
+# A second geometry with this share of the best one's weight is a rival.
+_RIVAL = 0.4
+# Another pose is used if it is better by this factor and by this difference; within the factor it is a rival.
+_BETTER, _MARGIN = 1.15, 0.03
+# If no more than this can be expected to be confirmed, nothing can be concluded.
+_MIN_EXPECTED = 0.1
+_NEIGHBOURS = 6
+# With this many cameras or more, the first pass uses shared sweeps; a second one follows below this expected share.
+_MANY, _SECOND_LOOK = 8, 0.9
+_ALTERNATIVES = 4
+_MIN_SCORE = 0.2  # minimum share of the best placement's score by matches, for a pose to be tried at all
+_ROUNDS = 3
+_BLOCK_ROUNDS = 2
+# A block is moved if the images around the cut confirm this much more. If a first choice of the block loses no more
+# than this, similar blocks are tried.
+_MIN_BLOCK_GAIN, _PROMISING_GAIN = 0.05, -0.1
+# If the images would confirm hardly less than now, the arrangement is ambiguous.
+_AMBIGUOUS_GAIN = -0.2
+# If almost every pair of images would agree with the same motion, the place is periodic throughout.
+_PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
+_NAMED, _NAMED_TURN_DEG = 4, 5.0
+_FLIPPED = 3
+_ASKED = 6
+# Exponent of the share of explained pairs relative to the share of confirmed texture.
+PAIRS_POWER = 0.25
+_HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or more; below it no more images are consulted
+
+
+@dataclass(eq=False)
+class CameraChecks:
+    """Evidence of the images for or against the cameras of a model.
+
+    Attributes:
+        shares: image position to the confirmed share of its textured pixels; NaN if too little can be judged.
+        expected: image position to the share that its neighbours suggest; NaN likewise.
+        moved: images that were moved to another pose.
+        doubts: images with a doubtful pose, with the reason.
+        removed: images that were removed from the model, with the reason.
+        asked: whether the images were consulted.
+    """
+
+    shares: dict[int, float] = field(default_factory=dict)
+    expected: dict[int, float] = field(default_factory=dict)
+    moved: set[int] = field(default_factory=set)
+    doubts: dict[int, str] = field(default_factory=dict)
+    removed: dict[int, str] = field(default_factory=dict)
+    asked: bool = True
+
+
+def correct_cameras(
+    model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
+) -> CameraChecks:
+    """Check all cameras of a model by the images, and correct those for which another pose explains more.
+
+    Cameras that confirm much less than their neighbours are tried at the other poses that their pairs suggest, against
+    cameras that are not suspect. The model is changed in place.
+
+    Args:
+        model: a model with two or more cameras.
+        confirmation: of the same capture.
+        fixed: images that are never moved or removed, only reported as doubtful.
+        remove: whether a camera that nothing explains is removed from the model.
+    """
+    found = CameraChecks()
+    ambiguity = ""
+    if not fixed:
+        found.moved, ambiguity = _unshift_blocks(model, confirmation)
+    for _ in range(_ROUNDS):
+        _judge(model, confirmation, found)
+        suspects = _suspects(found)
+        trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
+        if len(trusted) < 2:
+            trusted = dict(model.cameras)
+        moved = False
+        for image in suspects:
+            if image in fixed:
+                continue
+            pose = _better_place(model, image, trusted, confirmation=confirmation)
+            if pose is not None:
+                model.add(image, pose)
+                trusted[image] = pose
+                found.moved.add(image)
+                moved = True
+        if not moved:
+            break
+    _judge(model, confirmation, found)
+    _conclude(model, confirmation, found, fixed=fixed, remove=remove)
+    for doubt in filter(None, (ambiguity, _contradiction(model, found.doubts))):
+        for image in model.cameras:
+            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), doubt)))
+    return found
+
+
+def _contradiction(model: PlacedModel, doubted: Collection[int]) -> str:
+    """Return a warning if the pairs contradict one another too much for any reliable arrangement; "" otherwise.
+
+    A single wrong camera contradicts all of its pairs. So there is no warning if the pairs agree well without the
+    cameras that are already doubtful.
+    """
+    explained, by_others = model.explained_share(), model.explained_share(without=doubted)
+    if len(model.cameras) < 3 or explained >= _MIN_EXPLAINED_IN_ALL or by_others >= _MIN_EXPLAINED_BY_OTHERS:
+        return ""
+    return f"only {100 * explained:.0f} % of all pairs, by weight, agree with a common arrangement of the cameras"
+
+
+def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
+    """Move blocks of cameras to where the images confirm clearly more.
+
+    Returns:
+        The images that were moved, and a description of an ambiguity: a motion of a block after which the images would
+        confirm about as much as they do now; "" if there is none.
+    """
+    moved: set[int] = set()
+    for remaining in reversed(range(_BLOCK_ROUNDS + 1)):
+        aliases = find_aliases(model)
+        gains = [
+            (_gain_of(model, alias, labels, confirmation=confirmation), alias, labels)
+            for alias in aliases
+            for labels in labellings(model, alias)
+        ]
+        if not gains:
+            break
+        gain, alias, labels = max(gains, key=lambda found: found[0])
+        if gain > _PROMISING_GAIN and remaining:
+            labels, gain = _with_better_labels(model, alias, labels, gain=gain, confirmation=confirmation)
+        if gain <= _MIN_BLOCK_GAIN or not remaining:
+            periodic = len(alias.signed_weights) > _PERIODIC * len(model.chosen)
+            limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
+            if gain > limit:
+                return moved, _ambiguity(model, alias, labels)
+            return moved, next((_turned_ambiguity(other) for other in aliases if _turn_deg(other)), "")
+        before, after = model.cameras, _with_block_moved(model, alias, labels)
+        model.cameras, model.chosen = after.cameras, after.chosen
+        model.learn_ranges()
+        moved |= {image for image, camera in model.cameras.items() if camera is not before[image]}
+    return moved, ""
+
+
+def _with_block_moved(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> PlacedModel:
+    """Return a copy of a model with a block of cameras moved by an alias, and with geometries chosen again."""
+    after = model.copy()
+    after.cameras = moved_cameras(model, alias, labels)
+    after.choose_again()
+    after.learn_ranges()
+    after.choose_again()
+    return after
+
+
+def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
+    """Return a description of the images that might as well be elsewhere."""
+    block = [image for image, label in labels.items() if label]
+    rest = [image for image, label in labels.items() if not label]
+    smaller = [model.pairs.names[image] for image in min(block, rest, key=len)]
+    named = ", ".join(smaller[:_NAMED]) + (" …" if len(smaller) > _NAMED else "")
+    after = moved_cameras(model, alias, labels)
+    distance = max(float(np.linalg.norm(after[image].center - pose.center)) for image, pose in model.cameras.items())
+    turned = f", turned by {_turn_deg(alias):.0f}°" if _turn_deg(alias) else ""
+    return (
+        f"the place repeats: the images would confirm about as much if {named} were {distance:.2g} units away from "
+        f"where they are{turned}, relative to the others"
+    )
+
+
+def _turned_ambiguity(alias: Alias) -> str:
+    """Return a warning that part of the capture may be rotated; a few pairs hardly determine which images."""
+    return (
+        f"the place repeats: {len(alias.signed_weights)} pairs would agree if some of the images were rotated by "
+        f"{_turn_deg(alias):.0f}° and placed elsewhere, as in a second, similar room"
+    )
+
+
+def _turn_deg(alias: Alias) -> float:
+    """Return the angle by which an alias rotates a block; 0 if it only translates it."""
+    turn_deg = float(np.rad2deg(geodesic_angle(alias.turn, np.eye(3))))
+    return turn_deg if turn_deg > _NAMED_TURN_DEG else 0.0
+
+
+def _with_better_labels(
+    model: PlacedModel, alias: Alias, labels: dict[int, int], *, gain: float, confirmation: Confirmation
+) -> tuple[dict[int, int], float]:
+    """Change the labels of the images that confirm least, one at a time, while that gains; return labels and gain."""
+    for _ in range(_FLIPPED):
+        cameras = moved_cameras(model, alias, labels)
+        shares = {image: confirmation.share(image, pose, cameras) for image, pose in cameras.items()}
+        before = gain
+        for image in sorted(shares, key=lambda idx: (np.nan_to_num(shares[idx]), idx))[:_FLIPPED]:
+            flipped = {**labels, image: 1 - labels[image]}
+            if 0 < sum(flipped.values()) < len(flipped):
+                flipped_gain = _gain_of(model, alias, flipped, confirmation=confirmation)
+                if flipped_gain > gain:
+                    labels, gain = flipped, flipped_gain
+        if gain == before:
+            break
+    return labels, gain
+
+
+def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], *, confirmation: Confirmation) -> float:
+    """Return the relative gain in agreement of images and pairs if a block is moved (the factor minus one).
+
+    The factor is the ratio of confirmed shares, times a power of the ratio of explained shares of pairs: repeated
+    structure misleads matches more often than images, but an arrangement that the images confirm slightly more and most
+    pairs contradict is not the true one either. Only images with most neighbours on the other side of the cut are
+    consulted. Images whose neighbours all move with them, or all stay with them, see no difference.
+    """
+    cameras = moved_cameras(model, alias, labels)
+    crossing: dict[int, int] = {}
+    for image in model.cameras:
+        around = {
+            idx
+            for poses in (model.cameras, cameras)
+            for idx in nearest_cameras(poses[image], {k: pose for k, pose in poses.items() if k != image})
+        }
+        crossing[image] = sum(labels[idx] != labels[image] for idx in around)
+    asked = sorted((image for image in crossing if crossing[image]), key=lambda idx: (-crossing[idx], idx))[:_ASKED]
+    before = after = gain = 0.0
+    for number, image in enumerate(asked):
+        before += float(np.nan_to_num(confirmation.share(image, model.cameras[image], model.cameras)))
+        after += float(np.nan_to_num(confirmation.share(image, cameras[image], cameras)))
+        gain = after / before - 1 if before > 0 else 0.0
+        if gain < _HOPELESS_GAINS[min(number, 1)]:
+            return gain
+    explained = _with_block_moved(model, alias, labels).explained_share() / max(model.explained_share(), 1e-9)
+    return float((1 + gain) * explained**PAIRS_POWER - 1)
+
+
+def check_cameras(model: PlacedModel, confirmation: Confirmation | None) -> CameraChecks:
+    """Return the evidence of the images, or of the pairs alone, for the cameras of a model, without changing it."""
+    found = CameraChecks(asked=confirmation is not None)
+    if confirmation is None:
+        found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
+    else:
+        _judge(model, confirmation, found)
+    _conclude(model, confirmation, found, fixed=range(len(model.pairs.names)), remove=False)
+    return found
+
+
+def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) -> None:
+    """Compare the confirmed share of each image with the share that its nearest neighbours suggest.
+
+    In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
+    again by sweeps of their neighbours without them.
+    """
+    shared = len(model.cameras) >= _MANY
+    evidence = {
+        image: confirmation.evidence(image, pose, model.cameras, independent=not shared)
+        for image, pose in sorted(model.cameras.items())
+    }
+    neighbours = {
+        image: nearest_cameras(
+            pose, {idx: camera for idx, camera in model.cameras.items() if idx != image}, count=_NEIGHBOURS
+        )
+        for image, pose in model.cameras.items()
+    }
+
+    def expected_of(image: int) -> float:
+        return evidence[image].expected_share([evidence[idx] for idx in neighbours[image]])
+
+    if shared:
+        doubted = [image for image in evidence if evidence[image].share < _SECOND_LOOK * expected_of(image)]
+        for image in doubted:
+            evidence[image] = confirmation.evidence(image, model.cameras[image], model.cameras)
+    found.shares = {image: own.share for image, own in evidence.items()}
+    found.expected = {image: expected_of(image) for image in evidence}
+
+
+def _suspects(found: CameraChecks) -> list[int]:
+    """Return the images that confirm much less than expected, worst first."""
+    ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
+    return sorted(
+        (image for image, ratio in ratios.items() if ratio < _SUSPICIOUS and found.expected[image] > _MIN_EXPECTED),
+        key=lambda image: (ratios[image], image),
+    )
+
+
+def _better_place(
+    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], *, confirmation: Confirmation
+) -> Rigid3 | None:
+    """Return another pose of an image that the images confirm clearly better than its own; None if there is none."""
+    cameras = {idx: camera for idx, camera in trusted.items() if idx != image}
+    if len(cameras) < 2:
+        return None
+    here = confirmation.share(image, model.cameras[image], cameras)
+    best, best_share = None, max(_BETTER * here, here + _MARGIN)
+    for pose in _alternatives(model, image, cameras):
+        share = confirmation.share(image, pose, cameras)
+        if share > best_share:
+            best, best_share = pose, share
+    return best
+
+
+def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3]) -> list[Rigid3]:
+    """Return the poses that an image's pairs with some cameras suggest, refined on known points."""
+    without = model.copy()
+    without.cameras = dict(cameras)
+    pair_evidence, places = without.place(image)
+    poses = []
+    for place in places[:_ALTERNATIVES]:
+        if place.score < _MIN_SCORE * places[0].score:
+            continue
+        pose, support, known = without.polished(image, pair_evidence, place)
+        if enough_points(support, known):
+            poses.append(pose)
+    return poses
+
+
+def _conclude(
+    model: PlacedModel,
+    confirmation: Confirmation | None,
+    found: CameraChecks,
+    *,
+    fixed: Collection[int],
+    remove: bool,
+) -> None:
+    """Report or remove cameras that are still confirmed much less than expected or contradicted by their own pairs."""
+    for image, share in found.shares.items():
+        expected, explained = found.expected[image], model.explained_share_of(image)
+        ratio = share / expected if expected > _MIN_EXPECTED else float("nan")
+        reasons = []
+        # Neither images nor pairs alone may be enough to doubt a camera, although both are evidence against it.
+        if ratio < (_SUSPICIOUS if explained < _MIN_EXPLAINED_IN_ALL else _DOUBTFUL):
+            reasons.append(
+                f"other images confirm {100 * share:.0f} % of its texture, but its neighbours suggest "
+                f"{100 * expected:.0f} %"
+            )
+        contradicted = explained < _MIN_EXPLAINED and not ratio > _CONFIRMED
+        if contradicted and not _confirmed_by_pairs(model, image, confirmation):
+            reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its pose")
+        if not reasons:
+            continue
+        removable = remove and image not in fixed and len(model.cameras) - len(found.removed) > 2
+        if removable and ratio < _HOPELESS and explained < _MIN_EXPLAINED:
+            found.removed[image] = "; ".join(reasons)
+        else:
+            found.doubts[image] = "; ".join(reasons)
+    _doubt_pairs_alone(model, found)
+    for image in found.removed:
+        model.remove(image)
+        del found.shares[image], found.expected[image]
+
+
+def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmation | None) -> bool:
+    """Return whether most pairs of a camera have a geometry that agrees with it and is confirmed by the images.
+
+    Repeated structure may give false geometries more matches than the true ones.
+    """
+    if confirmation is None:
+        return False
+    partners = [idx for idx in model.pairs.partners[image] if idx in model.cameras]
+    agreeing = sum((min(image, idx), max(image, idx)) in model.chosen for idx in partners)
+    if agreeing < _PERIODIC_SHARE * len(partners):
+        return False
+    asked = confirmed = 0
+    for partner in partners[:_NEIGHBOURS]:
+        edge = min(image, partner), max(image, partner)
+        shares = pair_shares(edge, model.pairs.geometries[edge], confirmation)
+        asked += 1
+        confirmed += edge in model.chosen and shares[model.chosen[edge]] >= _LIKELY * max(shares)
+    return 2 * confirmed > asked
+
+
+def _doubt_pairs_alone(model: PlacedModel, found: CameraChecks) -> None:
+    """Report two isolated cameras with several geometries as doubtful, since nothing else can decide between these."""
+    if len(model.cameras) != 2:
+        return
+    first, second = sorted(model.cameras)
+    geometries = model.pairs.geometries.get((first, second), ())
+    if len(geometries) > 1 and geometries[1].weight > _RIVAL * geometries[0].weight:
+        for image in (first, second):
+            found.doubts[image] = (
+                f"its only pair has another geometry with {len(geometries[1].view)} matches "
+                f"({len(geometries[0].view)} support the one in use): take panoramas in between"
+            )

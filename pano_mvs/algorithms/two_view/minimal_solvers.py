@@ -1,0 +1,75 @@
+"""Essential matrices from minimal samples: the five-point and the eight-point solver, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.two_view.essential import essential_from_bearings
+
+FloatArray = NDArray[np.float64]
+Solver: TypeAlias = Literal["five_point", "eight_point"]
+
+_SAMPLE = 5
+_MAX_SOLUTIONS = 10  # maximum number of essential matrices from one sample
+
+
+@dataclass(frozen=True)
+class MinimalSolver:
+    """A minimal solver.
+
+    Attributes:
+        sample: number of matches in a sample.
+        batch: number of samples that are drawn together.
+        solve: (N, sample, 3) bearings of the first and of the second image to (K, 3, 3) essential matrices.
+        models: maximum number of essential matrices from one sample.
+    """
+
+    sample: int
+    batch: int
+    solve: Callable[[FloatArray, FloatArray], FloatArray]
+    models: int
+
+
+def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return all essential matrices that satisfy qᵀ E p = 0 for five pairs of bearings.
+
+    E = x X + y Y + z Z + W over the null space of the five equations; det E = 0 and 2 E Eᵀ E − tr(E Eᵀ) E = 0 are ten
+    cubic equations in x, y, z, and lead to one of degree ten in z (Nistér 2004, "An efficient solution to the
+    five-point relative pose problem"). Points on a plane need no special treatment.
+
+    Args:
+        first: (N, 5, 3) unit bearings p of N samples.
+        second: (N, 5, 3) unit bearings q.
+
+    Returns:
+        (K, 3, 3) matrices of Frobenius norm √2, at most ten for each sample, and the sample of each, (K,), ascending.
+        Samples with dependent equations give no matrix.
+    """
+    from pano_mvs.algorithms.two_view.kernels_five_point import solve_five
+
+    count = len(first)
+    essentials, sample_idx = np.empty((_MAX_SOLUTIONS * count, 3, 3)), np.empty(_MAX_SOLUTIONS * count, np.int64)
+    samples = np.arange(_SAMPLE * count).reshape(count, _SAMPLE)
+    found = solve_five(
+        np.ascontiguousarray(first, np.float64).reshape(-1, 3),
+        np.ascontiguousarray(second, np.float64).reshape(-1, 3),
+        samples,
+        essentials,
+        sample_idx,
+    )
+    return essentials[:found], sample_idx[:found]
+
+
+def _five(first: FloatArray, second: FloatArray) -> FloatArray:
+    return essentials_from_five(first, second)[0]
+
+
+SOLVERS: dict[Solver, MinimalSolver] = {
+    "five_point": MinimalSolver(sample=5, batch=64, solve=_five, models=10),
+    "eight_point": MinimalSolver(sample=8, batch=256, solve=essential_from_bearings, models=1),
+}

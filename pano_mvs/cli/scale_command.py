@@ -1,0 +1,79 @@
+"""Put a finished run into metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.markup import escape
+
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.run.command import run_workflow
+from pano_mvs.core.errors import UsageError
+from pano_mvs.results.run_output import RunOutput, load
+from pano_mvs.session.camera_height import height_note
+from pano_mvs.session.running import Execution
+from pano_mvs.session.scaling import (
+    WORKFLOW_FILE,
+    Measurement,
+    measured_between,
+    measured_camera_height,
+    metres_from_text,
+    scaled_session,
+)
+
+
+def scale_output(
+    out: Path, known: tuple[str, ...], *, camera_height: str, group: int, cache: Path | None, console: Console
+) -> int:
+    """Scale a run by a measurement, run its exports again, and return the exit code.
+
+    Without a measurement, only the scale that a usual camera height would give is printed.
+
+    Args:
+        out: the output folder of a run.
+        known: two ends and the distance between them, or nothing.
+        camera_height: height of the cameras above the floor, with its unit; empty if unknown.
+        group: group of poses, if points or a height were measured.
+        cache: folder of the cache; None for that of the run.
+        console: where to print.
+
+    Raises:
+        UsageError: if the measurement cannot be used.
+        InputError: if the folder holds no run.
+    """
+    run = load(out, cache=cache)
+    if not known and not camera_height:
+        return _print_guess(run, group, console)
+    measurement = _measurement(run, known, camera_height=camera_height, group=group)
+    session = scaled_session(run, measurement, cache=cache)
+    console.print(
+        f"{measurement.origin}: {measurement.length:.5g} units, so one unit is {measurement.factor:.5g} m\n"
+        f"workflow: {escape(str(out / WORKFLOW_FILE))}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return run_workflow(session, Execution())
+
+
+def _measurement(run: RunOutput, known: tuple[str, ...], *, camera_height: str, group: int) -> Measurement:
+    if known and camera_height:
+        raise UsageError("give either two ends with their distance, or --camera-height")
+    if camera_height:
+        return measured_camera_height(run, metres=metres_from_text(camera_height), group=group)
+    if len(known) != 3:
+        raise UsageError("give two images, or two points x,y,z, and the distance between them: A B 3.42m")
+    first, second, distance = known
+    return measured_between(run, first, second, metres=metres_from_text(distance), group=group)
+
+
+def _print_guess(run: RunOutput, group: int, console: Console) -> int:
+    groups = run.summary.poses.groups
+    chosen = groups[group] if group < len(groups) else None
+    if chosen is not None and chosen.metric:
+        text = f"unit of length: {chosen.scale}"
+    elif chosen is not None and chosen.camera_height is not None:
+        text = height_note(chosen.camera_height)
+    else:
+        text = "lengths are in scene units, and no floor was found below the cameras. Measure a distance: A B 3.42m"
+    console.print(text, highlight=False, soft_wrap=True)
+    return 0

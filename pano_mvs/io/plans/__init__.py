@@ -1,0 +1,1 @@
+"""Files of floor plans: world files, SVG and DXF."""

@@ -1,0 +1,345 @@
+"""What to do when a place is captured again: where to stand and what is missing, from the coverage of a run."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.text import plural, shortened_list
+from pano_mvs.results.camera_group import CameraGroup, shortest_tree
+from pano_mvs.results.coverage import LonelyArea, ViewCoverage
+from pano_mvs.results.figures import median, share, significant
+from pano_mvs.results.findings import compares_views
+from pano_mvs.results.records import Direction, PairLink, PosesSummary
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.thresholds import FAIR_CONSISTENT
+
+FloatArray = NDArray[np.float64]
+
+MIN_CAMERAS = 4
+"""Spacing, links and confirmed shares are compared within a group only if it has at least this many cameras."""
+
+GAP = 2.0
+"""Cameras are far apart if their distance is more than this many times the median distance of neighbours."""
+
+LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
+"""Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
+
+_USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
+_GOOD_BASELINE = 0.05, 0.2
+_NEIGHBOURS = 4
+_WEAK = 0.5  # of the median share that other views confirm
+_MAX_ADDED = 20
+_MAX_UNREGISTERED = 4
+_MAX_AREAS = 3
+
+
+class _Severity(IntEnum):
+    APART, UNREGISTERED, DOUBTFUL, SPACING, WEAK, LOOSE, LONELY = range(7)
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Something to do when the place is captured again.
+
+    Attributes:
+        action: what to do, in a sentence that names images.
+        reasons: why, with figures.
+        group: number of the group in whose world `at` is.
+        at: where to stand; None if no place is known.
+    """
+
+    action: str
+    reasons: tuple[str, ...]
+    group: int = 0
+    at: Direction | None = None
+
+
+@dataclass
+class _Between:
+    """Reasons for a panorama between two images."""
+
+    severity: _Severity
+    group: int
+    at: Direction | None
+    reasons: list[str] = field(default_factory=list)
+    count: int = 1
+
+
+def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None = None) -> tuple[Suggestion, ...]:
+    """Return what to do when the place is captured again, the most urgent first.
+
+    Args:
+        summary: of the run.
+        coverage: what the views see, as far as known; see `pano_mvs.results.coverage`.
+    """
+    found = _Collected()
+    parts = summary.poses.by_group()
+    _connect_groups(summary, found)
+    _register(summary, found)
+    for number, poses in enumerate(parts):
+        group = CameraGroup.of(number, poses, coverage or {})
+        if group is None:
+            continue
+        _spacing(group, found)
+        _doubtful(group, found)
+        _weak(group, summary, found)
+        _loose(group, found)
+        _lonely(group, found)
+    return found.in_order()
+
+
+class _Collected:
+    """Suggestions; those for the same two images become one with several reasons."""
+
+    def __init__(self) -> None:
+        self._between: dict[tuple[str, str], _Between] = {}
+        self._others: list[tuple[_Severity, Suggestion]] = []
+
+    def between(
+        self,
+        pair: tuple[str, str],
+        severity: _Severity,
+        reason: str,
+        *,
+        group: int = 0,
+        at: Direction | None = None,
+        count: int = 1,
+    ) -> None:
+        """Add a reason to take panoramas between two images."""
+        first, second = sorted(pair)
+        entry = self._between.setdefault((first, second), _Between(severity, group, at))
+        entry.severity = min(entry.severity, severity)
+        entry.count = max(entry.count, count)
+        entry.reasons.append(reason)
+
+    def add(self, severity: _Severity, suggestion: Suggestion) -> None:
+        """Add a suggestion that is not about two images."""
+        self._others.append((severity, suggestion))
+
+    def in_order(self) -> tuple[Suggestion, ...]:
+        """Return all suggestions, the most urgent first."""
+        ranked: list[tuple[_Severity, Suggestion]] = []
+        for (first, second), entry in self._between.items():
+            what = "a panorama" if entry.count == 1 else f"{entry.count} panoramas"
+            action = f"Take {what} between {first} and {second}."
+            ranked.append((entry.severity, Suggestion(action, tuple(entry.reasons), entry.group, entry.at)))
+        ranked += self._others
+        ranked.sort(key=lambda pair: (pair[0], -len(pair[1].reasons)))
+        return tuple(suggestion for _, suggestion in ranked)
+
+
+def _connect_groups(summary: RunSummary, found: _Collected) -> None:
+    """Suggest panoramas between groups that no reliable pair connects."""
+    for number, group in enumerate(summary.poses.groups[1:], start=1):
+        size = f"group {number} ({len(group.images)} {plural(len(group.images), 'panorama')})"
+        pair = group.nearest_pair
+        if pair is not None:
+            reason = (
+                f"{size} has no reliable connection to the largest group; of all pairs across, this one has the most "
+                f"in common: {_matches(pair.matches, pair.candidates)}"
+            )
+            found.between((pair.first, pair.second), _Severity.APART, reason)
+            continue
+        largest = summary.poses.groups[0].images
+        action = f"Take panoramas on the way from {shortened_list(largest, 2)} to {shortened_list(group.images, 2)}."
+        reason = f"{size} has no reliable connection to the largest group, and no pair across was compared"
+        found.add(_Severity.APART, Suggestion(action, (reason,)))
+
+
+def _register(summary: RunSummary, found: _Collected) -> None:
+    """Suggest panoramas between images without a pose and the registered ones with which they share most."""
+    poses = summary.poses
+    best = _best_partners(poses)
+    left_out = [name for name in poses.rejected if not _unreadable(summary, name)]
+    with_partner = sorted((name for name in left_out if name in best), key=lambda name: _strength(best[name]))[::-1]
+    for name in with_partner[:_MAX_UNREGISTERED]:
+        link = best[name]
+        partner = link.second if link.first == name else link.first
+        reason = f"{name} has no pose; this pair has {_matches(link.inliers, link.candidates)}"
+        found.between((name, partner), _Severity.UNREGISTERED, reason)
+    rest = [name for name in left_out if name not in with_partner[:_MAX_UNREGISTERED]]
+    if rest:
+        count = f"{len(rest)} {'more ' if len(rest) < len(left_out) else ''}{plural(len(rest), 'panorama')}"
+        action = f"Take panoramas 0.5–1 m apart on the way to {shortened_list(rest)}."
+        reason = f"{count} of {len(poses.registered) + len(poses.rejected)} {plural(len(rest), 'has', 'have')} no pose"
+        found.add(_Severity.UNREGISTERED, Suggestion(action, (reason,)))
+
+
+def _best_partners(poses: PosesSummary) -> dict[str, PairLink]:
+    """Return the pair of each unregistered image that has the most in common with a registered one."""
+    registered = set(poses.registered)
+    best: dict[str, PairLink] = {}
+    for link in poses.links:
+        for name, other in ((link.first, link.second), (link.second, link.first)):
+            if name in poses.rejected and other in registered and link.candidates != 0:
+                best[name] = max(best.get(name, link), link, key=_strength)
+    return best
+
+
+def _strength(link: PairLink) -> tuple[int, int]:
+    return link.inliers, link.candidates or 0
+
+
+def _unreadable(summary: RunSummary, name: str) -> bool:
+    """Return whether an image was left out by its source, as not being a panorama, for example."""
+    sources = {stage.name for stage in summary.stages if stage.use.startswith("source.")}
+    return name in summary.rejected and summary.rejected[name].stage in sources
+
+
+def _matches(inliers: int, candidates: int | None) -> str:
+    verified = f"{inliers} verified {plural(inliers, 'match', 'matches')}"
+    return verified if candidates is None else f"{verified} of {candidates} {plural(candidates, 'candidate')}"
+
+
+def _spacing(group: CameraGroup, found: _Collected) -> None:
+    """Suggest panoramas in gaps, and other distances if neighbours are too close."""
+    edges = shortest_tree(group.centers)
+    typical = median([length for _, _, length in edges]) or 0.0
+    for first, second, length in edges if len(group.names) >= MIN_CAMERAS and typical > 0 else ():
+        ranges = [known for idx in (first, second) if (known := group.typical_range(idx)) is not None]
+        if length > GAP * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
+            reason = (
+                f"they are {group.length(length)} apart; the median distance between neighbours is "
+                f"{group.length(typical)}"
+            )
+            count = min(_MAX_ADDED, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
+            _stand_between(group, found, (first, second), severity=_Severity.SPACING, reason=reason, count=count)
+    for idx, name in enumerate(group.names):
+        known = group.typical_range(idx)
+        other = int(group.nearest(idx)[0])
+        if known is not None and (distance := group.distance(idx, other)) > LONG_BASELINE * known:
+            reason = (
+                f"{name} is {group.length(distance)} from its nearest neighbour, {share(distance / known)} of the "
+                f"median distance to what it sees ({group.length(known)}): near surfaces look too different"
+            )
+            _stand_between(group, found, (idx, other), severity=_Severity.SPACING, reason=reason)
+    _all_too_close(group, found)
+
+
+def _too_close(group: CameraGroup, first: int, second: int) -> bool:
+    """Return whether a panorama between two cameras would be too close to both to be of use."""
+    known = group.typical_range(first)
+    return known is not None and group.distance(first, second) < SHORT_BASELINE * known
+
+
+def _all_too_close(group: CameraGroup, found: _Collected) -> None:
+    """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
+    known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
+    farthest = {idx: group.distance(idx, int(group.nearest(idx)[:_NEIGHBOURS][-1])) for idx in known}
+    ratios = {idx: length / (group.typical_range(idx) or 1.0) for idx, length in farthest.items()}
+    close = [idx for idx in known if ratios[idx] < SHORT_BASELINE]
+    if not close:
+        return
+    worst = min(close, key=ratios.__getitem__)
+    middle = median([group.typical_range(idx) for idx in close]) or 0.0
+    low, high = (significant(factor * middle) for factor in _GOOD_BASELINE)
+    names = shortened_list(group.names[idx] for idx in close)
+    reason = (
+        f"{len(close)} of {len(group.names)} panoramas ({names}) have their nearest neighbours within "
+        f"{share(SHORT_BASELINE)} of the median distance to what they see, so that ranges are uncertain; "
+        f"{group.names[worst]}, for example, within {group.length(farthest[worst])}, {share(ratios[worst])}"
+    )
+    found.add(
+        _Severity.SPACING, Suggestion(f"Take panoramas {low}–{high} {group.unit} apart.", (reason,), group.number)
+    )
+
+
+def _doubtful(group: CameraGroup, found: _Collected) -> None:
+    for idx, name in enumerate(group.names):
+        if name in group.poses.doubts:
+            reason = f"{name} is doubtful: {group.poses.doubts[name]}"
+            _stand_between(group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason)
+
+
+def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:
+    """Suggest panoramas beside cameras of whose pixels other views confirm much less than usual."""
+    shares = {view.name: view.consistent for view in summary.views if view.consistent is not None}
+    usual = median(list(shares.values()))
+    if usual is None or not compares_views(summary) or len(group.names) < MIN_CAMERAS:
+        return
+    limit = max(FAIR_CONSISTENT, _WEAK * usual)
+    for idx, name in enumerate(group.names):
+        other = int(group.nearest(idx)[0])
+        if shares.get(name, 1.0) < limit and not _too_close(group, idx, other):
+            reason = f"other views confirm {share(shares[name])} of {name}, and {share(usual)} of the median view"
+            _stand_between(group, found, (idx, other), severity=_Severity.WEAK, reason=reason)
+
+
+def _loose(group: CameraGroup, found: _Collected) -> None:
+    """Suggest panoramas beside cameras that share a verified geometry with only one other."""
+    links = [link for link in group.poses.links if link.inliers]
+    if len(group.names) < MIN_CAMERAS or not links:
+        return
+    count = Counter(name for link in links for name in link[:2])
+    only = {name: link for link in links for name in link[:2] if count[name] == 1}
+    for idx, name in enumerate(group.names):
+        if name not in only:
+            continue
+        link = only[name]
+        partner = link.second if link.first == name else link.first
+        others = [int(at) for at in group.nearest(idx) if group.names[at] != partner]
+        reason = f"{name} shares a verified geometry with one panorama only, {partner} ({_matches(link.inliers, None)})"
+        _stand_between(group, found, (idx, others[0]), severity=_Severity.LOOSE, reason=reason)
+
+
+def _lonely(group: CameraGroup, found: _Collected) -> None:
+    """Suggest panoramas towards the largest areas that one camera alone sees."""
+    areas = [
+        (area, idx)
+        for idx, name in enumerate(group.names)
+        if name in group.coverage
+        for area in group.coverage[name].areas
+    ]
+    areas.sort(key=lambda pair: -pair[0].share)
+    for area, idx in areas[:_MAX_AREAS]:
+        name, where = group.names[idx], direction_words(area)
+        reason = (
+            f"{share(area.share)} of the sphere around {name}, {where}, about {group.length(area.distance)} away, is "
+            "hidden from the nearest other panoramas"
+        )
+        x, y, z = (float(value) for value in (group.centers[idx] + np.array(area.at)) / 2)
+        action = f"Take a panorama half-way from {name} to what it sees {where}."
+        found.add(_Severity.LONELY, Suggestion(action, (reason,), group.number, (x, y, z)))
+
+
+def direction_words(area: LonelyArea) -> str:
+    """Return the direction of an area in its image in words.
+
+    >>> direction_words(LonelyArea(-42.4, 11.0, 0.1, 1.0, (0.0, 0.0, 0.0)))
+    '42° to the left of the image centre, 11° above the horizon'
+    """
+    azimuth, elevation = round(area.azimuth_deg), round(area.elevation_deg)
+    across = f"{abs(azimuth)}° to the {'right' if azimuth > 0 else 'left'} of the image centre"
+    if abs(azimuth) < 5:
+        across = "at the image centre"
+    elif abs(azimuth) > 175:
+        across = "at the left and right edge of the image"
+    if abs(elevation) < 5:
+        return across
+    return f"{across}, {abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
+
+
+def _stand_between(
+    group: CameraGroup,
+    found: _Collected,
+    pair: tuple[int, int],
+    *,
+    severity: _Severity,
+    reason: str,
+    count: int = 1,
+) -> None:
+    x, y, z = (float(value) for value in group.centers[list(pair)].mean(axis=0))
+    names = group.names[pair[0]], group.names[pair[1]]
+    found.between(names, severity, reason, group=group.number, at=(x, y, z), count=count)
+
+
+def marks_of(found: Iterable[Suggestion], group: int) -> list[tuple[int, Direction]]:
+    """Return the number, from 1, and the place of each suggestion that has one in the world of a group."""
+    return [(number, one.at) for number, one in enumerate(found, start=1) if one.at is not None and one.group == group]

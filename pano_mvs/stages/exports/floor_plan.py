@@ -1,0 +1,211 @@
+"""Export of floor plans."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan, strip_px
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid
+from pano_mvs.algorithms.floor_plan.storeys import Storey, find_storeys
+from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
+from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
+from pano_mvs.io.plans.drawing_files import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
+from pano_mvs.scene.upright import world_up, z_up_from_world
+
+FloatArray = NDArray[np.float64]
+Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
+
+_SAMPLED_POINTS = 500_000
+_EDGE_QUANTILE = 0.003
+_MARGIN = 0.03
+_CELL_PX = 4
+_MIN_POINTS = 100
+# In terms of the height of the room.
+_LENGTH_SHARE, _GAP_SHARE, _SNAP_SHARE = 0.15, 0.12, 0.08
+_CUT_SHARE = 0.9
+_MAX_SIDE_PX = 4096
+
+
+class FloorPlanParams(Params):
+    """Settings of export.floor_plan."""
+
+    formats: tuple[Literal["png", "svg", "dxf"], ...] = Field(
+        default=("png", "svg"), min_length=1, description="png with world file, svg and dxf of the wall lines"
+    )
+    width_px: int = Field(
+        default=1600, ge=100, le=_MAX_SIDE_PX, description="longer side of the plan in pixels, if `pixel` is 0"
+    )
+    pixel: float = Field(default=0.0, ge=0, description="edge of a pixel in scene units; 0: by `width_px`")
+    cut: float = Field(
+        default=_CUT_SHARE, gt=0, le=2, description="height of the cut of the orthophoto, in camera heights"
+    )
+    min_wall_share: float = Field(
+        default=0.4, gt=0, le=1, description="share of the height of the room at which a wall must be seen"
+    )
+    min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
+
+    @field_validator("formats")
+    @classmethod
+    def _can_be_written(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        if "dxf" in formats and not has_ezdxf():
+            raise ValueError(DXF_REMEDY)
+        return tuple(dict.fromkeys(formats))
+
+
+def plan_memory_bytes(params: FloorPlanParams, _: Mapping[str, Any]) -> int:
+    """Return the memory for the grids of one storey, 40 bytes a pixel, and for parts of the cloud."""
+    return 250_000_000 + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+
+
+@stage("export.floor_plan", memory=plan_memory_bytes)
+def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParams, ctx: Context) -> Files:
+    """Write plans of all storeys: floor_plan/storey_0.png with .pgw, storey_0.svg …, and floor_plan.json about them.
+
+    The PNG shows the floor from above, cut below the cameras, with wall lines, cameras and a scale bar. The coordinates
+    are those of cloud.ply: z up. The cloud is read in chunks: memory does not grow with its size. Further groups of
+    poses, each in its own frame, are in floor_plan_1/, floor_plan_2/ …
+    """
+    files: dict[str, Path] = {}
+    walls = storeys = 0
+    for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
+        which = f"group {number}: " if poses.other_worlds else ""
+        kept = int((group.view_counts >= params.min_views).sum())
+        if kept < _MIN_POINTS:
+            ctx.note(f"{which}no floor plan: {kept} points of the cloud are seen from {params.min_views} views")
+            continue
+        folder = f"floor_plan_{number}" if number else "floor_plan"
+        (ctx.scratch / folder).mkdir()
+        plan = _GroupPlan(group, own, params, folder=ctx.scratch / folder)
+        about = plan.write()
+        (ctx.scratch / folder / "floor_plan.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
+        files |= {f"{folder}/{path.name}": path for path in sorted((ctx.scratch / folder).iterdir())}
+        for note in plan.notes:
+            ctx.note(f"{which}{note}")
+        storeys += len(about["storeys"])
+        walls += sum(entry["walls"] for entry in about["storeys"])
+    ctx.metric("storeys", storeys)
+    ctx.metric("walls", walls)
+    return Files(files)
+
+
+class _GroupPlan:
+    """The plans of one group."""
+
+    def __init__(self, cloud: PointCloud, poses: Poses, params: FloorPlanParams, *, folder: Path) -> None:
+        self.cloud = cloud
+        self.poses = poses
+        self.params = params
+        self.folder = folder
+        self.turn = z_up_from_world(world_up(poses))
+        self.centers = poses.centers @ self.turn.T
+        self.notes: list[str] = []
+
+    def write(self) -> dict[str, Any]:
+        """Write the files of all storeys, and return what floor_plan.json states."""
+        sampled, normals = self._sample()
+        storeys = find_storeys(sampled[:, 2], normals[:, 2], self.centers[:, 2])
+        extent = self._extent(sampled[:, :2])
+        entries = [self._storey(number, storey, extent) for number, storey in enumerate(storeys)]
+        if not all(storey.has_floor for storey in storeys):
+            self.notes.append("no level surface was found below some cameras: the floor of the plan is a guess")
+        return {
+            "unit": "metre" if self.poses.metric else "scene unit",
+            "frame": f"z up; x_in_plan = file_from_world x_in_world; world: {self.poses.frame}",
+            "file_from_world": self.turn.tolist(),
+            "storeys": entries,
+        }
+
+    def _chunks(self) -> Iterator[Points]:
+        for chunk in chunks(len(self.cloud)):
+            kept = self.cloud.view_counts[chunk] >= self.params.min_views
+            points = self.cloud.points_in_world[chunk][kept].astype(np.float64) @ self.turn.T
+            normals = self.cloud.normals_in_world[chunk][kept].astype(np.float64) @ self.turn.T
+            yield points, normals, self.cloud.colors_rgb[chunk][kept]
+
+    def _sample(self) -> tuple[FloatArray, FloatArray]:
+        """Return points and normals of an even sample of the cloud."""
+        step = max(1, len(self.cloud) // _SAMPLED_POINTS)
+        parts = [(points[::step], normals[::step]) for points, normals, _ in self._chunks()]
+        return np.concatenate([points for points, _ in parts]), np.concatenate([normals for _, normals in parts])
+
+    def _extent(self, xy: FloatArray) -> Extent:
+        low, high = np.quantile(xy, [_EDGE_QUANTILE, 1 - _EDGE_QUANTILE], axis=0)
+        seen_from = self.centers[:, :2]
+        low, high = np.minimum(low, seen_from.min(axis=0)), np.maximum(high, seen_from.max(axis=0))
+        side = max(float((high - low).max()), 1e-6)
+        low, high = low - _MARGIN * side, high + _MARGIN * side
+        side *= 1 + 2 * _MARGIN
+        pixel = self.params.pixel or side / self.params.width_px
+        if side / pixel > _MAX_SIDE_PX:
+            pixel = side / _MAX_SIDE_PX
+            self.notes.append(f"pixels of {self.params.pixel:g} would be too many; the plan has pixels of {pixel:.3g}")
+        columns, rows = np.maximum(1, np.ceil((high - low) / pixel)).astype(int).tolist()
+        return Extent(float(low[0]), float(high[1]), pixel, (rows, columns))
+
+    def _storey(self, number: int, storey: Storey, extent: Extent) -> dict[str, Any]:
+        """Write the files of one storey, and return its entry in floor_plan.json."""
+        heights = self.centers[list(storey.cameras), 2]
+        eyes = float(np.median(heights)) if len(heights) else storey.ceiling
+        grid = PlanGrid(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor), cell_px=_CELL_PX)
+        for points, normals, colors in self._chunks():
+            grid.add(points, normals, colors)
+        walls = wall_lines(
+            grid.wall_cells(),
+            min_share=self.params.min_wall_share,
+            min_length=_LENGTH_SHARE * storey.height,
+            max_gap=_GAP_SHARE * storey.height,
+            snap=_SNAP_SHARE * storey.height,
+        )
+        places = self.centers[:, :2].tolist()
+        names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
+        drawing = self._drawing(number, extent, walls.ends_xy, names)
+        files = self._write_files(f"storey_{number}", grid, drawing)
+        return {
+            **files,
+            "z_range": [storey.floor, storey.ceiling],
+            "has_floor": storey.has_floor,
+            "has_ceiling": storey.has_ceiling,
+            "units_per_pixel": extent.pixel,
+            "metres_per_pixel": extent.pixel if self.poses.metric else None,
+            "origin_xy": [extent.left, extent.top],
+            "size_px": [extent.size_hw[1], extent.size_hw[0] + strip_px(extent.size_hw)],
+            "plan_size_px": [extent.size_hw[1], extent.size_hw[0]],
+            "walls": len(walls.ends_xy),
+            "cameras": {name: list(place) for name, place in names.items()},
+        }
+
+    def _drawing(
+        self, number: int, extent: Extent, walls: FloatArray, cameras: dict[str, tuple[float, float]]
+    ) -> PlanDrawing:
+        rows, columns = extent.size_hw
+        width, height = columns * extent.pixel, rows * extent.pixel
+        unit = "m" if self.poses.metric else "scene units"
+        box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
+        return PlanDrawing(f"storey {number}", walls, cameras, box, bar_length(width), unit, self.poses.metric)
+
+    def _write_files(self, stem: str, grid: PlanGrid, drawing: PlanDrawing) -> dict[str, str]:
+        """Write the files of a storey in all formats, and return their names."""
+        files: dict[str, str] = {}
+        extent = grid.extent
+        if "png" in self.params.formats:
+            files |= {"png": f"{stem}.png", "world_file": f"{stem}.pgw"}
+            photo, known = grid.photo()
+            cameras = np.array(list(drawing.cameras.values())).reshape(-1, 2)
+            picture = draw_plan(photo, known, extent, walls=drawing.walls, cameras=cameras, unit=drawing.unit)
+            write_png(self.folder / files["png"], picture)
+            text = world_file_text(extent.pixel, extent.left, extent.top)
+            (self.folder / files["world_file"]).write_text(text, encoding="ascii")
+        if "svg" in self.params.formats:
+            files["svg"] = f"{stem}.svg"
+            (self.folder / files["svg"]).write_text(svg_text(drawing), encoding="utf-8")
+        if "dxf" in self.params.formats:
+            files["dxf"] = f"{stem}.dxf"
+            write_dxf(self.folder / files["dxf"], drawing)
+        return files

@@ -1,0 +1,327 @@
+"""Frames for trainers: the files of one panorama, and the transforms.json that lists them with poses.
+
+Shared by export.nerfstudio and export.splat_bundle, whose folders differ in name and in the layers that they contain.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pano_mvs.algorithms.faces.layout import Face, panorama_faces
+from pano_mvs.algorithms.faces.pictures import face_image, face_mask
+from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
+from pano_mvs.api import (
+    Context,
+    FilePart,
+    InputError,
+    Panorama,
+    Params,
+    PointCloud,
+    Poses,
+    arguments_from,
+    params_from,
+    write_png,
+)
+from pano_mvs.core.text import plural
+from pano_mvs.io.clouds.ply_writer import write_ply
+from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.io.colmap.image_copies import write_picture
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, Variant
+from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, transforms_document
+from pano_mvs.io.ranges.files import write_confidence_png, write_normals_png, write_range_png
+from pano_mvs.scene.files import group_file
+
+_NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_MUCH = 0.01
+
+
+@params_from(panorama_faces)
+class _CutParams(Params):
+    """How panoramas are cut into faces."""
+
+    variants: tuple[Variant, ...] = Field(
+        default=("equirectangular", "faces"), min_length=1, description="whole panoramas, pinhole faces, or both"
+    )
+
+
+class FramesParams(_CutParams):
+    """Settings of stages that write the frames of one panorama."""
+
+    image_format: Literal["jpg", "png"] = Field(
+        default="jpg", description="format of images that are not copied unchanged"
+    )
+    depth_unit: float = Field(
+        default=0.001, gt=0, description="scene units per step of the 16-bit depths; pass other values to nerfstudio"
+    )
+    min_confidence: int = Field(default=64, ge=0, le=255, description="minimum confidence of depths")
+
+
+class SeedParams(Params):
+    """Settings of stages that list frames with poses and initial points."""
+
+    seed_points: int = Field(
+        default=500_000, ge=0, description="initial points for splats, thinned evenly from the cloud; 0: none"
+    )
+    min_views: int = Field(
+        default=2, ge=0, le=255, description="minimum number of views that agree on an initial point"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layers:
+    """What is known about a panorama besides its colours; only `valid` is always known.
+
+    Attributes:
+        valid: (H, W) bool, False is masked.
+        ranges: (H, W) float32, NaN unknown.
+        normals_in_cam: (H, W, 3) float32, NaN unknown.
+        confidence: (H, W) uint8, 0 unknown.
+    """
+
+    valid: NDArray[np.bool_]
+    ranges: NDArray[np.float32] | None = None
+    normals_in_cam: NDArray[np.float32] | None = None
+    confidence: NDArray[np.uint8] | None = None
+
+
+class FrameFiles:
+    """The files of one panorama below a folder of the output.
+
+    Args:
+        root: the folder; each variant is a folder below it.
+        params: settings of the stage.
+        ctx: of the stage.
+    """
+
+    def __init__(self, root: str, params: FramesParams, ctx: Context) -> None:
+        """Start without files."""
+        self.root = root
+        self.params = params
+        self.ctx = ctx
+        self.files: dict[str, Path] = {}
+        self.pictures: dict[str, FilePart] = {}
+        self.frames: list[NerfstudioFrame] = []
+        self.beyond = 0
+        self.depths = 0
+
+    def add(self, image: Panorama, picture: NDArray[np.uint8], layers: Layers) -> None:
+        """Write all variants that the settings name, and report depths that 16 bits do not hold."""
+        if "equirectangular" in self.params.variants:
+            self._add_panorama(image, picture, layers)
+        if "faces" in self.params.variants:
+            for face in panorama_faces(image.size_hw, **arguments_from(panorama_faces, self.params)):
+                self._add_face(face, picture, layers)
+        share = self.beyond / self.depths if self.depths else 0.0
+        self.ctx.metric("beyond_depth", share)
+        if share > _MUCH:
+            unit = self.params.depth_unit
+            self.ctx.note(
+                f"some depths exceed the {65535 * unit:g} scene units that 16 bits hold in steps of {unit:g}, and are "
+                "left out; use a larger depth_unit to include them"
+            )
+
+    def _add_panorama(self, image: Panorama, picture: NDArray[np.uint8], layers: Layers) -> None:
+        height, width = image.size_hw
+        whole = image.crop_ltwh is None and image.size_hw == image.source_size_hw
+        path, suffix = "images/{name}", f".{self.params.image_format}"
+        if whole and layers.valid.all() and is_common_picture(image.image.path):
+            self.pictures[f"{self.root}/equirectangular/{path}"] = image.image
+        else:
+            path += suffix
+            write_picture(self._file("equirectangular", path, suffix), picture)
+        size, focal = (width, height), (width / 2, float(height))
+        mask, depth, normal, confidence = self._add_layers("equirectangular", "{name}", layers)
+        self.frames.append(
+            NerfstudioFrame("equirectangular", path, mask, depth, size, focal, _NO_TURN, normal, confidence)
+        )
+
+    def _add_face(self, face: Face, picture: NDArray[np.uint8], layers: Layers) -> None:
+        view, suffix = face.view, f".{self.params.image_format}"
+        name = f"{{name}}.{face.name}"
+        path = f"images/{name}{suffix}"
+        write_picture(self._file("faces", path, suffix), face_image(picture, view))
+        seen = _seen_by(face, layers, threads=self.ctx.threads)
+        mask, depth, normal, confidence = self._add_layers("faces", name, seen)
+        turn = tuple(tuple(map(float, row)) for row in view.view_from_cam)
+        size, focal = (view.size_hw[1], view.size_hw[0]), (view.focal_px, view.focal_px)
+        self.frames.append(NerfstudioFrame("faces", path, mask, depth, size, focal, turn, normal, confidence))
+
+    def _add_layers(self, variant: Variant, name: str, layers: Layers) -> tuple[str, str, str, str]:
+        """Write mask, depth, normals and confidence; return their paths, each empty if there is nothing to write."""
+        paths = ["", "", "", ""]
+        if not layers.valid.all():
+            paths[0] = f"masks/{name}.png"
+            write_png(self._file(variant, paths[0]), np.where(layers.valid, np.uint8(255), np.uint8(0)))
+        if layers.ranges is not None:
+            paths[1] = f"depths/{name}.png"
+            self.depths += int(np.isfinite(layers.ranges).sum())
+            file = self._file(variant, paths[1])
+            self.beyond += write_range_png(file, layers.ranges, unit=self.params.depth_unit)
+        if layers.normals_in_cam is not None:
+            paths[2] = f"normals/{name}.png"
+            write_normals_png(self._file(variant, paths[2]), layers.normals_in_cam)
+        if layers.confidence is not None:
+            paths[3] = f"confidence/{name}.png"
+            write_confidence_png(self._file(variant, paths[3]), layers.confidence)
+        return paths[0], paths[1], paths[2], paths[3]
+
+    def _file(self, variant: Variant, path: str, suffix: str = ".png") -> Path:
+        """Return where to write the file for a target."""
+        file = self.files[f"{self.root}/{variant}/{path}"] = self.ctx.scratch / f"{len(self.files)}{suffix}"
+        return file
+
+
+def _seen_by(face: Face, layers: Layers, *, threads: int) -> Layers:
+    """Return the layers of a face: z-depths, and normals in the face's own camera frame."""
+    valid = face_mask(layers.valid, face.view)
+    if layers.ranges is None:
+        return Layers(valid)
+    depths = np.where(valid, face_z_depth(layers.ranges, face.view, threads=threads), np.float32(np.nan))
+    known = np.isfinite(depths)
+    normals = confidence = None
+    if layers.normals_in_cam is not None:
+        normals = np.where(known[..., None], face_normals(layers.normals_in_cam, face.view), np.float32(np.nan))
+    if layers.confidence is not None:
+        confidence = np.where(known, face_confidence(layers.confidence, face.view), np.uint8(0))
+    return Layers(valid, depths, normals, confidence)
+
+
+def frames_with_poses(poses: Poses, frames: Mapping[str, PanoramaFrames], ctx: Context) -> Mapping[str, PanoramaFrames]:
+    """Return the frames of all registered panoramas, and report those that have no frames.
+
+    Raises:
+        InputError: if there is no such panorama.
+    """
+    loaded = {name: frames[name] for name in poses.names if name in frames}
+    if not loaded:
+        raise InputError("no panorama has both a pose and frames: nothing can be listed in transforms.json")
+    if len(loaded) < len(poses.names):
+        without = len(poses.names) - len(loaded)
+        ctx.note(
+            f"{without} of {len(poses.names)} registered panoramas {plural(without, 'has', 'have')} no ranges and "
+            f"{plural(without, 'is', 'are')} not in transforms.json"
+        )
+    return loaded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedGroup:
+    """One group of poses with the frames of its panoramas.
+
+    Attributes:
+        number: of the group; 0 is the largest.
+        poses: of the group.
+        frames: of those of its panoramas that have frames; not empty.
+    """
+
+    number: int
+    poses: Poses
+    frames: Mapping[str, PanoramaFrames]
+
+    @property
+    def depth_unit(self) -> float:
+        """Scene units of one step of the depths."""
+        return next(iter(self.frames.values())).depth_unit
+
+    def listed(self) -> dict[Variant, list[tuple[str, NerfstudioFrame]]]:
+        """Return the frames of each variant, in order, with the names of their panoramas."""
+        found: dict[Variant, list[tuple[str, NerfstudioFrame]]] = {}
+        for name, each in self.frames.items():
+            for frame in each.frames:
+                found.setdefault(frame.variant, []).append((name, frame))
+        return dict(sorted(found.items()))
+
+
+def write_transforms(
+    root: str,
+    group: PosedGroup,
+    cloud: PointCloud | None,
+    *,
+    params: SeedParams,
+    ctx: Context,
+    file_from_world: NDArray[np.float64] | None = None,
+) -> dict[str, Path]:
+    """Write transforms.json of each variant and the initial points of a group; return the targets of the files.
+
+    Args:
+        root: folder of the variants in the output folder.
+        group: poses and frames.
+        cloud: of the group; None: the sparse points of its poses.
+        params: of the initial points.
+        ctx: of the stage.
+        file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
+    """
+    files: dict[str, Path] = {}
+    scratch = ctx.scratch / str(group.number)
+    scratch.mkdir()
+    poses = group.poses
+    seed = _write_seed(group, cloud, params, ctx=ctx, file_from_world=file_from_world)
+    seed_name = "" if seed is None else group_file("seed.ply", group.number)
+    about: dict[str, Any] = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
+    if file_from_world is not None:
+        about["file_from_world"] = file_from_world.tolist()
+    cameras = poses.cameras
+    for variant, listed in group.listed().items():
+        document = transforms_document(
+            variant,
+            [(name, cameras[name], frame) for name, frame in listed],
+            depth_unit=group.depth_unit,
+            about=about,
+            file_from_world=file_from_world,
+            seed=seed_name,
+        )
+        folder = f"{root}/{variant}"
+        path = files[f"{folder}/{group_file('transforms.json', group.number)}"] = scratch / f"{variant}.json"
+        path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        if seed is not None:
+            files[f"{folder}/{seed_name}"] = seed
+        files |= _open_masks([frame for _, frame in listed], folder, scratch)
+        ctx.metric(variant, ctx.metrics.get(variant, 0) + len(listed))
+    return files
+
+
+def _write_seed(
+    group: PosedGroup,
+    cloud: PointCloud | None,
+    params: SeedParams,
+    *,
+    ctx: Context,
+    file_from_world: NDArray[np.float64] | None,
+) -> Path | None:
+    """Write the initial points; return None if there are none."""
+    poses, scratch = group.poses, ctx.scratch / str(group.number)
+    if cloud is None or not len(cloud):
+        count = len(poses.points_in_world)
+        cloud = PointCloud(
+            poses.points_in_world.astype(np.float32),
+            np.zeros((count, 3), np.float32),
+            poses.point_colors_rgb,
+            np.full(count, 255, np.uint8),
+        )
+    if not params.seed_points or not len(cloud):
+        return None
+    selection = Selection(min_views=params.min_views, max_points=params.seed_points)
+    kept = select_points(cloud, selection, scratch)
+    ctx.metric("seed_points", ctx.metrics.get("seed_points", 0) + (len(cloud) if kept is None else kept.count))
+    path = scratch / "seed.ply"
+    write_ply(path, cloud, kept=kept, file_from_world=file_from_world)
+    return path
+
+
+def _open_masks(listed: Sequence[NerfstudioFrame], folder: str, scratch: Path) -> dict[str, Path]:
+    """Write masks of frames without masked pixels if other frames have masks: nerfstudio needs one for each frame."""
+    if not any(frame.mask for frame in listed):
+        return {}
+    files = {}
+    for width, height in {frame.size_wh for frame in listed if not frame.mask}:
+        path = files[f"{folder}/{open_mask((width, height))}"] = scratch / f"open_{width}x{height}.png"
+        write_png(path, np.full((height, width), 255, np.uint8))
+    return files

@@ -1,0 +1,121 @@
+"""People are found in a panorama, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from pano_mvs.algorithms.faces.layout import upright_rotation
+from pano_mvs.algorithms.masks import person_network
+from pano_mvs.algorithms.masks.people import people
+from pano_mvs.algorithms.masks.person_network import SIDE_PX, person_presence, person_probability
+from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.geometry import PinholeView, pixel_solid_angle, ray_grid
+
+SIZE_HW = (512, 1024)
+SAMPLE = Path(__file__).parents[2] / "workflows" / "samples" / "classroom" / "images" / "003.png"
+AREA = np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW)
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@pytest.fixture(scope="module")
+def room() -> Picture:
+    """A classroom without people."""
+    return np.array(Image.open(SAMPLE).convert("RGB"))
+
+
+@pytest.fixture(scope="module")
+def portrait() -> tuple[Picture, Mask]:
+    """Rear Admiral Grace Hopper in half-length, a photograph in the public domain, and which pixels show her."""
+    file = Path(matplotlib.get_data_path()) / "sample_data" / "grace_hopper.jpg"
+    picture = np.array(Image.open(file).convert("RGB"))
+    height, width = picture.shape[:2]
+    outline = np.array([(0.0, 1.0), (0.04, 0.75), (0.32, 0.58), (0.3, 0.1), (0.45, 0.03), (0.7, 0.1), (0.72, 0.5),
+                        (0.95, 0.68), (1.0, 1.0)]) * (width, height)  # fmt: skip  # one polygon
+    person = cv2.fillPoly(np.zeros((height, width), np.uint8), [np.rint(outline).astype(np.int32)], (1,))
+    return picture, person > 0
+
+
+def with_person(
+    room: Picture, portrait: tuple[Picture, Mask], *, azimuth_deg: float, elevation_deg: float, height_deg: float
+) -> tuple[Picture, Mask]:
+    """Return a panorama with the portrait in a direction, and which pixels show it."""
+    picture, person = portrait
+    height, width = person.shape
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    axis = np.array([np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
+    focal_px = height / 2 / float(np.tan(np.radians(height_deg) / 2))
+    view = PinholeView(upright_rotation(axis), focal_px, np.array([width / 2, height / 2]), (height, width))
+    x, y = np.moveaxis(np.nan_to_num(view.pixels_from_rays(ray_grid(SIZE_HW)), nan=-1e3).astype(np.float32), -1, 0)
+    shown = cv2.remap(person.astype(np.uint8), x - 0.5, y - 0.5, cv2.INTER_NEAREST) > 0
+    reduced = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    return np.where(shown[..., None], cv2.remap(reduced, x - 0.5, y - 0.5, cv2.INTER_LINEAR), room), shown
+
+
+def share(pixels: Mask, of: Mask) -> float:
+    return float(AREA[pixels & of].sum() / AREA[of].sum())
+
+
+PLACES = {"beside": (30, -38, 60), "across the seam": (178, -5, 30), "at a distance": (-100, -5, 25)}
+
+
+@pytest.fixture(scope="module")
+def crowd(room: Picture, portrait: tuple[Picture, Mask]) -> tuple[Picture, dict[str, Mask]]:
+    """The classroom with a person in each of the places, and which pixels show each."""
+    picture, shown = room, {}
+    for name, (azimuth_deg, elevation_deg, height_deg) in PLACES.items():
+        picture, shown[name] = with_person(
+            picture, portrait, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, height_deg=height_deg
+        )
+    return picture, shown
+
+
+def test_people_are_found_and_nothing_else(crowd: tuple[Picture, dict[str, Mask]]) -> None:
+    picture, shown = crowd
+    found = people(picture)
+    for name, person in shown.items():
+        assert share(found, person) > 0.9, name
+    around = cv2.dilate(np.any(list(shown.values()), axis=0).astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    assert share(found, ~around) < 0.01
+
+
+def test_passers_by_and_small_people_can_be_left_in(crowd: tuple[Picture, dict[str, Mask]]) -> None:
+    picture, shown = crowd
+    area_deg2 = float(AREA[shown["at a distance"]].sum()) * np.degrees(1) ** 2
+    found = people(picture, passers_by=False, min_area_deg2=2 * area_deg2)
+    assert share(found, shown["beside"]) > 0.9
+    assert share(found, shown["at a distance"]) == 0
+
+
+def test_nobody_is_found_in_an_empty_room(room: Picture) -> None:
+    assert share(people(room), np.ones(SIZE_HW, np.bool_)) < 0.003
+
+
+def test_the_networks_know_a_person(portrait: tuple[Picture, Mask]) -> None:
+    picture = np.asarray(cv2.resize(portrait[0], (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA), np.uint8)
+    person = cv2.resize(portrait[1].astype(np.uint8), (SIDE_PX, SIDE_PX)) > 0
+    probability = person_probability(picture)
+    assert probability[person].mean() > 0.8
+    assert probability[~person].mean() < 0.2
+    assert person_presence(picture) > 0.6
+    assert person_presence(np.full((SIDE_PX, SIDE_PX, 3), 128, np.uint8)) < 0.2
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((8, 16), np.uint8), np.zeros((8, 16, 3), np.float32)])
+def test_wrong_arrays_are_refused(wrong: NDArray[np.uint8]) -> None:
+    with pytest.raises(UsageError, match="a panorama is"):
+        people(wrong)
+
+
+def test_a_damaged_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(person_network, "_POSE", (person_network._POSE[0], "another digest"))
+    with pytest.raises(StoreError, match=r"pose_landmark_lite.*Install pano-mvs again"):
+        person_presence(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))

@@ -1,0 +1,157 @@
+"""What is shown while a run goes on, by a clock that is moved by hand."""
+
+from __future__ import annotations
+
+import io
+import threading
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pano_mvs.cli.run.progress import ProgressDisplay, _Repeated
+from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.session.progress import (
+    Event,
+    Forecast,
+    RunStarted,
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    UnitStarted,
+    Warned,
+)
+from tests.session.test_time_estimator import Clock
+
+STARTED = RunStarted("w", ("depth", "cloud"), "processes", workers=1, threads=1, out=Path("out"))
+FORECAST = Forecast(
+    (StageForecast("depth", (), 0, 4, 30.0, 1.0), StageForecast("cloud", ("depth",), 0, 1, 60.0, 1.0)), report_s=3.0
+)
+
+
+class Shown:
+    """A display, its clock, and what it has printed."""
+
+    def __init__(self, *, is_terminal: bool = False) -> None:
+        self.stream = io.StringIO()
+        self.console = Console(file=self.stream, width=120, force_terminal=is_terminal, no_color=True)
+        self.clock = Clock()
+        self.display = ProgressDisplay(self.console, self.clock)
+
+    def events(self, *events: Event) -> None:
+        for event in events:
+            self.display(event)
+
+    def live(self, after_s: float = 0.0) -> list[str]:
+        self.clock.now += after_s
+        with self.console.capture() as captured:
+            self.console.print(self.display.live_lines())
+        return [line.rstrip() for line in captured.get().splitlines() if line.strip()]
+
+    def line(self, after_s: float = 0.0) -> str:
+        self.clock.now += after_s
+        self.display.print_line()
+        return self.stream.getvalue().splitlines()[-1]
+
+
+def finished(stage: str, units: int = 1) -> StageFinished:
+    return StageFinished(stage, "x", units, units, 0, 0, 0, 12.34, 12.34, {})
+
+
+def test_the_live_lines_show_what_is_computed_and_count_down() -> None:
+    shown = Shown(is_terminal=True)
+    assert "starting" in shown.live()[-1]
+    shown.events(STARTED, FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
+    depth, whole = shown.live(1.0)
+    assert depth.split() == ["depth", "0", "of", "4", "0:01", "a.jpg"]
+    assert whole.endswith("1 %  0:01  about 3:02 left")
+    assert [shown.live(1.0)[-1].split()[-2] for _ in range(5)] == ["3:01", "3:00", "2:59", "2:58", "2:57"]
+
+
+def test_the_time_left_is_never_missing_and_never_stands_still() -> None:
+    shown = Shown(is_terminal=True)
+    shown.events(STARTED, Forecast((StageForecast("depth"), StageForecast("cloud", ("depth",)))))
+    assert shown.live(5.0)[-1].endswith("time left not known yet: no earlier run has computed depth, cloud")
+    shown.events(StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
+    lines = [shown.live(10.0)[-1] for _ in range(30)]
+    assert all("more than" in line and line.endswith("left; not known: cloud") for line in lines)
+    assert len(set(lines)) == len(lines)
+
+
+def test_nothing_is_left_but_the_report_once_all_stages_are_finished() -> None:
+    shown = Shown(is_terminal=True)
+    shown.events(STARTED, FORECAST, StageStarted("depth", 1), finished("depth"), finished("cloud"))
+    assert shown.live()[-1].endswith("about 0:03 left (writing the report)")
+    assert shown.live(1.0)[-1].endswith("about 0:02 left (writing the report)")
+
+
+def test_few_lines_are_shown_however_many_stages_and_units_there_are() -> None:
+    shown = Shown(is_terminal=True)
+    names = tuple(f"stage{number}" for number in range(10))
+    shown.events(RunStarted("w", names, "processes", workers=40, threads=1, out=Path("out")))
+    for name in names:
+        shown.events(StageStarted(name, 9), *(UnitStarted(name, f"{number}.jpg") for number in range(4)))
+    lines = shown.live(1.0)
+    assert len(lines) == 6 + 1 + 1
+    assert lines[0].endswith("0.jpg, 1.jpg and 2 more")
+    assert lines[6] == "… and 4 more"
+
+
+def test_a_line_states_share_time_left_and_the_stages_at_work() -> None:
+    shown = Shown()
+    shown.events(STARTED, FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
+    assert shown.line(10.0) == "5 %, about 3 min left (now: depth 0 of 4)"
+    shown.events(UnitFinished("depth", "a.jpg", "run", 30.0))
+    assert shown.line().startswith("16 %, about 3 min left")
+
+
+def test_finished_stages_failures_and_warnings_stay() -> None:
+    shown = Shown()
+    shown.events(
+        STARTED,
+        StageStarted("depth", 1),
+        UnitFailed("depth", "a[b].jpg", "no light", said=("first", "[red]last")),
+        Warned("[x] is odd"),
+        StageFinished("depth", "x", 4, 1, 1, 1, 1, 12.34, 12.34, {}),
+    )
+    lines = shown.stream.getvalue().splitlines()
+    assert lines == [
+        "failed depth:a[b].jpg",
+        "  | first",
+        "  | [red]last",
+        "warning: [x] is odd",
+        "depth          1 run, 1 cached, 1 failed, 1 blocked  12.3 s",
+    ]
+
+
+def test_names_cannot_break_lines() -> None:
+    shown = Shown(is_terminal=True)
+    shown.events(STARTED, FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a\n\x1b[31m.jpg"))
+    assert shown.live(1.0)[0].endswith(r"a\x0a\x1b[31m.jpg")
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_drawing_ends_with_the_run(is_terminal: bool) -> None:
+    shown = Shown(is_terminal=is_terminal)
+    with shown.display:
+        shown.events(STARTED, FORECAST, StageStarted("depth", 4))
+    size = len(shown.stream.getvalue())
+    shown.clock.now += 1
+    assert len(shown.stream.getvalue()) == size
+    assert (size > 0) == is_terminal
+
+
+def test_lines_are_repeated_by_a_thread_until_the_run_ends() -> None:
+    calls: list[int] = []
+    ended = threading.Event()
+
+    def call() -> None:
+        calls.append(1)
+        if len(calls) == 3:
+            ended.set()
+
+    with _Repeated(call, first_s=0.0, every_s=0.0):
+        assert ended.wait(60)
+    count = len(calls)
+    assert count >= 3

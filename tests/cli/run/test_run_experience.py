@@ -1,0 +1,275 @@
+"""What a person, or a program, sees of a run: events, interrupts, logs, exit codes; all in real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pano_mvs.cli.run.command import interrupted_by_termination
+from pano_mvs.core.processes import start_of
+from tests.engine.conftest import (  # noqa: F401 (toy is a fixture)
+    PATIENCE_S,
+    Toy,
+    finished_records,
+    start,
+    toy,
+    wait_for_records,
+)
+from tests.engine.running.test_resume import (
+    BEFORE_MEANS,
+    deliverables,
+    hold_means,
+    wait_for_means,
+)
+
+ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, out, err
+
+
+def events_of(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # noqa: F811
+    toy.number("3.txt", "13")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("noise", x.value)'))
+    code, out, _ = finish(start(toy, "--json", "--executor", "processes", "--workers", "2"))
+    assert code == 3
+    events = events_of(out)
+    assert [events[0]["event"], events[-1]["event"]] == ["run_started", "run_finished"]
+    assert (events[0]["schema"], events[0]["executor"], events[0]["workers"]) == (1, "processes", 2)
+    assert events[-1]["exit_code"] == 3
+    opened = {event["stage"]: event["units"] for event in events if event["event"] == "stage_started"}
+    assert set(opened) == set(events[0]["stages"])
+    assert Counter(event["stage"] for event in events if event["event"] == "unit_finished") == opened
+    closed = {event["stage"]: event for event in events if event["event"] == "stage_finished"}
+    assert {name: event["units"] for name, event in closed.items()} == opened
+    for what in ("run", "failed", "blocked"):
+        assert sum(event[what] for event in closed.values()) == events[-1][what]
+    (failed,) = (event for event in events if event["event"] == "unit_failed")
+    assert (failed["stage"], failed["item"], failed["said"]) == ("scaled", "3.txt", ["noise 13.0"])
+    assert Path(failed["log"]).read_text() == "noise 13.0\n"
+    begun = Counter((event["stage"], event["item"]) for event in events if event["event"] == "unit_started")
+    assert set(begun.values()) == {1}
+
+
+def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:  # noqa: F811
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace("def list_items(params):", "print('a')\ndef list_items(params):\n    print('b')"),
+    )
+    code, out, err = finish(start(toy, "--json", "--executor", "serial"))
+    assert code == 0
+    assert events_of(out)[0]["event"] == "run_started"
+    assert {"a", "b"} <= set(err.split())
+
+
+def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noqa: F811
+    for number in range(1, 6):
+        toy.number(f"{number}.txt", "not a number")
+    code, out, err = finish(start(toy, "--json", "--executor", "serial"))
+    assert code == 2
+    assert events_of(out)[-1]["exit_code"] == 2
+    assert "none of the 5 items" in err
+
+
+@ON_POSIX
+@pytest.mark.parametrize(
+    "number", ["SIGINT", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGTERM", "SIGHUP"))]
+)
+def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: str) -> None:  # noqa: F811
+    hold = hold_means(toy)
+    process = start(toy, "--executor", "processes", "--workers", "2")
+    wait_for_means(toy, process, 2)
+    process.send_signal(signal.Signals[number])
+    _read_until(process, "2 units may finish within")
+    hold.unlink()
+    code, _, err = finish(process)
+    assert code == 130
+    assert json.loads((toy.folder / "out" / "run.json").read_bytes())["stopped"] == "interrupted"
+    assert (toy.folder / "out" / "report.html").is_file()
+    assert f"pano-mvs run {toy.folder / 'wf.yaml'}" in err.replace("\n", "")
+    kept = finished_records(toy)
+    assert kept == BEFORE_MEANS + 2, "the units in flight have finished"
+    code, out, _ = finish(start(toy, "--executor", "serial"))
+    assert code == 0
+    assert f"{28 - kept} units computed, {kept} cached" in out
+
+
+def _interrupts(number: signal.Signals) -> bool:
+    try:
+        os.kill(os.getpid(), number)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+@ON_POSIX
+def test_a_terminal_that_closes_interrupts_once() -> None:
+    """A terminal that closes may send its signal twice; under nohup it must not end anything."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with interrupted_by_termination():
+            assert _interrupts(signal.SIGHUP)
+            assert not _interrupts(signal.SIGHUP)
+            assert _interrupts(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        with interrupted_by_termination():
+            assert not _interrupts(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_a_second_run_into_a_folder_is_refused_until_the_first_has_ended(toy: Toy) -> None:  # noqa: F811
+    """The second computed beside the first, and whichever came last said that all was well."""
+    first = start(toy, "--workers", "2", sleep_s=600)
+    wait_for_records(toy, first, 6)
+    earlier = {path.name for path in (toy.folder / "cache" / "tmp").iterdir()}
+    code, out, err = finish(start(toy, "--json"))
+    assert code == 4
+    assert events_of(out)[-1]["exit_code"] == 4
+    assert f"another run is writing into {toy.folder / 'out'}: process {first.pid} on" in err.replace("\n", "")
+    assert first.poll() is None
+    first.kill()
+    finish(first)
+    left = [path.name for path in (toy.folder / "cache" / "tmp").iterdir()]
+    assert earlier & set(left)
+    deadline = time.monotonic() + PATIENCE_S
+    while any(start_of(int(name.split("-")[2])) is not None for name in left if name.startswith(".tmp-")):
+        assert time.monotonic() < deadline, "a worker outlives the run"  # they notice the end of the run by and by
+        time.sleep(0.1)
+    assert finish(start(toy, "--executor", "serial"))[0] == 0
+    assert not (toy.folder / "out" / ".pano-mvs-lock").exists()
+    assert not list((toy.folder / "cache" / "tmp").iterdir()), "what the killed run left behind is gone"
+
+
+def _read_until(process: subprocess.Popen[str], *words: str) -> None:
+    assert process.stdout is not None
+    said = []
+    for line in process.stdout:
+        said.append(line)
+        if all(word in line for word in words):
+            return
+    code, _, err = finish(process)
+    pytest.fail(f"it ended with {code} and never said {words}, but {said} and {err}")
+
+
+@ON_POSIX
+def test_second_interrupt_ends_at_once(toy: Toy) -> None:  # noqa: F811
+    """The units in flight may take an hour, and so may the run after the first interrupt."""
+    toy.edit("plug.py", lambda text: f"from pano_mvs.engine.running import run\nrun.GRACE_S = 3600.0\n{text}")
+    process = start(toy, "--json", "--executor", "processes", "--workers", "2", sleep_s=3600.0)
+    for _ in range(2):  # when the second is told of, the first is at work
+        _read_until(process, '"unit_started"', '"mean"')
+    process.send_signal(signal.SIGINT)
+    _read_until(process, "may finish")
+    process.send_signal(signal.SIGINT)
+    code, out, _ = finish(process)
+    assert code == 130
+    assert events_of(out)[-1]["exit_code"] == 130
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_workers_end_with_a_run_that_is_killed(toy: Toy) -> None:  # noqa: F811
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '"""Multiply."""',
+            '''"""Multiply."""
+    open(f"pid-{os.getpid()}", "w").close(); time.sleep(300)''',
+        ),
+    )
+    process = start(toy, "--executor", "processes", "--workers", "1")
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := list(toy.folder.glob("pid-*"))) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    pid = int(found[0].name.removeprefix("pid-"))
+    deadline = time.monotonic() + 120  # less than the unit would take
+    while time.monotonic() < deadline:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        if "(zombie)" in _state(pid):
+            return
+        time.sleep(0.05)
+    os.kill(pid, signal.SIGKILL)
+    pytest.fail("the worker goes on for nobody")
+
+
+def _state(pid: int) -> str:
+    path = Path(f"/proc/{pid}/status")
+    return path.read_text() if path.is_file() else ""
+
+
+def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:  # noqa: F811
+    toy.number("3.txt", "13")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("just before")'))
+    code, out, _ = finish(start(toy, "--executor", "serial"))
+    assert code == 3
+    assert "  | just before" in out
+    assert "3.txt.log" in out
+    assert "thirteen is unlucky" in out
+    assert "just before" not in [line.strip() for line in out.splitlines()], "units do not print among our lines"
+
+
+@pytest.mark.slow
+def test_serial_and_processes_leave_the_same_files(toy: Toy) -> None:  # noqa: F811
+    assert finish(start(toy, "--executor", "serial"))[0] == 0
+    first = deliverables(toy)
+    toy.edit("wf.yaml", lambda text: text + "# another\n")
+    toy.folder.joinpath("cache").rename(toy.folder / "old")
+    assert finish(start(toy, "--workers", "2"))[0] == 0
+    assert deliverables(toy) == first
+
+
+@ON_POSIX
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("place", "how"),
+    [
+        ('"""Multiply."""\n    if x.value == 30: ', "os._exit(0)"),
+        ("def list_items(params):\n    ", "sys.exit(0)"),
+        ('"""A toy pipeline."""\nimport os, sys\n', "os._exit(0)"),
+    ],
+)
+def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str, how: str) -> None:  # noqa: F811
+    """Each of them ended the command with exit code 0 and without a word."""
+    toy.edit("plug.py", lambda text: text.replace(place.strip().splitlines()[0], f"{place}{how}", 1))
+    toy.edit("plug.py", lambda text: text.replace("import os\n", "import os, sys\n", 1))
+    code, out, err = finish(start(toy, "--executor", "serial"))
+    in_unit, at_import = "Multiply" in place, "pipeline" in place
+    assert code == (3 if in_unit else 2 if at_import else 1), err
+    assert how.partition("(")[0] in (toy.folder / "out" / "report.html").read_text() if in_unit else how[:-3] in err
+    assert "plug.py" in (out if in_unit else err)
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_an_interrupt_lets_a_single_worker_finish_its_unit(toy: Toy) -> None:  # noqa: F811
+    hold = hold_means(toy)
+    process = start(toy, "--workers", "1")
+    wait_for_means(toy, process, 1)
+    process.send_signal(signal.SIGTERM)
+    _read_until(process, "1 unit may finish within")
+    hold.unlink()
+    assert finish(process)[0] == 130
+    assert finished_records(toy) == BEFORE_MEANS + 1

@@ -1,0 +1,186 @@
+"""What to do next time: on captures whose faults are known, the advice names them, and good captures get none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pano_mvs.results.camera_group import shortest_tree
+from pano_mvs.results.coverage import LonelyArea, ViewCoverage
+from pano_mvs.results.next_time import Suggestion, direction_words, marks_of, suggestions
+from pano_mvs.results.summary import RunSummary
+
+
+def in_a_row(*places: float, metric: bool = True, **more: Any) -> dict[str, Any]:
+    """Return the poses of cameras a, b, c, … on a line, each linked to the next two."""
+    names = [chr(ord("a") + idx) for idx in range(len(places))]
+    links = [[one, other, 100, 200, 0.02] for idx, one in enumerate(names) for other in names[idx + 1 : idx + 3]]
+    centers = [[place, 0.0, 0.0] for place in places]
+    return {"registered": names, "centers": centers, "metric": metric, "links": links, **more}
+
+
+def advice(poses: dict[str, Any], ranges: float | None = None, **more: Any) -> tuple[Suggestion, ...]:
+    coverage = {} if ranges is None else {name: ViewCoverage(ranges, 0.0) for name in poses["registered"]}
+    return suggestions(RunSummary.from_json({"poses": poses, **more}), coverage)
+
+
+def test_a_gap_in_a_row_of_cameras_is_where_to_stand() -> None:
+    (found,) = advice(in_a_row(0, 1, 2, 3, 6.5, 7.5, 8.5), 5.0)
+    assert found.action == "Take 3 panoramas between d and e."
+    assert found.reasons == ("they are 3.5 m apart; the median distance between neighbours is 1 m",)
+    assert found.at == (4.75, 0.0, 0.0)
+    assert marks_of([found], 0) == [(1, (4.75, 0.0, 0.0))]
+    assert marks_of([found], 1) == []
+
+
+def test_an_even_row_needs_nothing() -> None:
+    assert advice(in_a_row(0, 1, 2.1, 3, 4.2), 5.0) == ()
+    assert advice(in_a_row(0, 1, 2.9, 4), 5.0) == (), "not more than twice the usual distance"
+    assert advice(in_a_row(0)) == ()
+    assert suggestions(RunSummary()) == ()
+
+
+def test_a_gap_that_is_small_against_the_surroundings_is_none() -> None:
+    """Cameras 0.1 m apart with one gap of 0.4 m, outdoors: no surface is seen any worse."""
+    near = in_a_row(0, 0.1, 0.2, 0.6, 0.7)
+    assert [found.action for found in advice(near, 1.0)] == ["Take 3 panoramas between c and d."]
+    assert not any("between" in found.action for found in advice(near, 20.0))
+
+
+def test_of_three_cameras_none_is_far_from_the_others() -> None:
+    """Two distances have no usual one."""
+    assert advice(in_a_row(0, 1, 4), 6.0) == ()
+
+
+def test_lengths_without_scale_are_in_scene_units() -> None:
+    (found,) = advice(in_a_row(0, 1, 2, 5, 6, metric=False), 5.0)
+    assert found.reasons[0].startswith("they are 3 scene units apart")
+
+
+def test_a_camera_far_from_all_others_for_what_it_sees_is_named() -> None:
+    found = advice(in_a_row(0, 1, 2, 3), 1.1)
+    assert [one.action for one in found] == [f"Take a panorama between {a} and {b}." for a, b in ("ab", "bc", "cd")]
+    assert (
+        "b is 1 m from its nearest neighbour, 91 % of the median distance to what it sees (1.1 m)"
+        in found[0].reasons[1]
+    )
+
+
+def test_cameras_too_close_for_what_they_see_should_be_farther_apart() -> None:
+    (found,) = advice(in_a_row(0, 0.02, 0.04, 0.06, 0.08), 10.0)
+    assert found.action == "Take panoramas 0.5–2 m apart."
+    assert "5 of 5 panoramas (a, b, c … (5 in all))" in found.reasons[0]
+    assert "c, for example, within 0.04 m, 0.4 %" in found.reasons[0]
+    assert found.at is None
+
+
+def test_a_close_pair_within_a_good_capture_is_fine() -> None:
+    assert advice(in_a_row(0, 0.02, 1, 2, 3), 5.0) == ()
+
+
+def test_views_that_others_hardly_confirm_are_named_with_figures() -> None:
+    shares = {"a": 0.5, "b": 0.6, "c": 0.14, "d": 0.5, "e": 0.05}
+    views = [{"name": name, "consistent": share, "completeness": 1.0} for name, share in shares.items()]
+    first, second = advice(in_a_row(0, 1, 2, 3, 4), 5.0, views=views)
+    assert first.action == "Take a panorama between b and c."
+    assert first.reasons == ("other views confirm 14 % of c, and 50 % of the median view",)
+    assert second.action == "Take a panorama between d and e."
+    assert advice(in_a_row(0, 1, 2, 3, 4), 5.0, views=[{**view, "consistent": 0.4} for view in views]) == ()
+
+
+def test_reasons_for_one_place_are_one_suggestion() -> None:
+    views = [{"name": name, "consistent": 0.1 if name == "d" else 0.5} for name in "abcdefg"]
+    found = advice(in_a_row(0, 1, 2, 5, 9, 10, 11, doubts={"d": "hardly confirmed"}), 6.0, views=views)
+    assert found[0].action == "Take 2 panoramas between c and d."
+    assert [reason.split()[0] for reason in found[0].reasons] == ["they", "d", "other"]
+    assert [one.action for one in found[1:]] == ["Take 3 panoramas between d and e."]
+
+
+def test_a_camera_with_one_partner_needs_another() -> None:
+    poses = in_a_row(0, 1, 2, 3)
+    poses["links"] = [["a", "b", 80], ["b", "c", 70], ["a", "c", 60], ["c", "d", 31], ["b", "d", 0, 12]]
+    (found,) = advice(poses, 5.0)
+    assert found.action == "Take a panorama between b and d."
+    assert found.reasons == ("d shares a verified geometry with one panorama only, c (31 verified matches)",)
+
+
+def test_groups_without_a_connection_name_the_pair_to_connect() -> None:
+    groups = [
+        {"images": ["a", "b", "c", "d"]},
+        {"images": ["x", "y"], "nearest_pair": ["c", "y", 3, 40]},
+        {"images": ["p", "q"]},
+    ]
+    poses = in_a_row(0, 1, 2, 3, 0, 1, 0, 1) | {"registered": [*"abcdxypq"], "groups": groups, "links": []}
+    first, second = advice(poses)
+    assert {first.action, second.action} == {
+        "Take a panorama between c and y.",
+        "Take panoramas on the way from a, b … (4 in all) to p, q.",
+    }
+    reasons = " ".join(first.reasons + second.reasons)
+    assert "group 1 (2 panoramas) has no reliable connection to the largest group" in reasons
+    assert "3 verified matches of 40 candidates" in reasons
+    assert first.at is second.at is None, "their worlds are unrelated"
+
+
+def test_panoramas_without_a_pose_are_to_be_connected_with_those_that_match_best() -> None:
+    poses = in_a_row(0, 1, 2, 3)
+    poses["rejected"] = {"m": "too few", "n": "too few", "notes.png": "not a panorama"}
+    poses["links"] += [["a", "m", 0, 9], ["m", "c", 4, 30], ["m", "n", 50, 60]]
+    summary = {
+        "stages": [{"name": "images", "use": "source.folder"}],
+        "rejected": {"notes.png": {"stage": "images", "reason": "not a panorama"}},
+    }
+    first, second = advice(poses, 5.0, **summary)
+    assert first.action == "Take a panorama between c and m."
+    assert first.reasons == ("m has no pose; this pair has 4 verified matches of 30 candidates",)
+    assert second.action == "Take panoramas 0.5–1 m apart on the way to n."
+    assert second.reasons == ("1 more panorama of 7 has no pose",)
+
+
+def test_areas_that_one_camera_sees_are_named_with_place_and_size() -> None:
+    area = LonelyArea(90.0, -10.0, 0.08, 4.0, (1.0, 0.0, -4.0))
+    small = LonelyArea(0.0, 0.0, 0.03, 2.0, (0.0, 0.0, 2.0))
+    coverage = {"a": ViewCoverage(5.0, 0.03, (small,)), "b": ViewCoverage(5.0, 0.08, (area,))}
+    first, second = suggestions(RunSummary.from_json({"poses": in_a_row(0, 1, 2)}), coverage)
+    assert first.action == (
+        "Take a panorama half-way from b to what it sees 90° to the right of the image centre, 10° below the horizon."
+    )
+    assert first.reasons[0].startswith("8.0 % of the sphere around b, 90° to the right")
+    assert "about 4 m away" in first.reasons[0]
+    assert first.at == (1.0, 0.0, -2.0)
+    assert "at the image centre" in second.action
+
+
+def test_directions_are_said_in_words() -> None:
+    def words(azimuth_deg: float, elevation_deg: float) -> str:
+        return direction_words(LonelyArea(azimuth_deg, elevation_deg, 0.1, 1.0, (0.0, 0.0, 0.0)))
+
+    assert words(3, 30) == "at the image centre, 30° above the horizon"
+    assert words(-178, 0) == "at the left and right edge of the image"
+    assert words(-90, -4) == "90° to the left of the image centre"
+
+
+def test_unknown_places_give_no_advice() -> None:
+    assert advice(in_a_row(0, 1, float("nan"), 9)) == ()
+    poses = in_a_row(0, 1, 2, 9)
+    assert advice(poses | {"centers": poses["centers"][:3]}) == ()
+
+
+def test_cameras_in_one_place_are_no_failure() -> None:
+    assert advice(in_a_row(*[0.0] * 12), 5.0)[0].action.startswith("Take panoramas 0.25–1")
+    assert advice(in_a_row(0, 0), 5.0)
+
+
+def test_the_tree_is_the_shortest() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(40, 3))
+    edges = shortest_tree(points)
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)
+    assert sum(length for *_, length in edges) == pytest.approx(minimum_spanning_tree(distances).sum())
+    assert len(edges) == 39
+    assert all(distances[a, b] == pytest.approx(length) for a, b, length in edges)
+    assert shortest_tree(points[:1]) == []
