@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.share.browser import Browser, open_browser
+from tests.share.chromium import Chromium, chromium
 
 IMAGES = Path(__file__).parents[1] / "images"
 
 
-def shot(browser: Browser, address: str, section: str, *, width: int, height: int) -> NDArray[np.uint8]:
+def shot(browser: Chromium, address: str, section: str, *, width: int, height: int) -> NDArray[np.uint8]:
     """Return a window that shows a section of the page, (H, W, 3) BGR."""
     browser.resize(width, height)
     browser.open(address)
@@ -29,7 +29,7 @@ def shot(browser: Browser, address: str, section: str, *, width: int, height: in
 
 if __name__ == "__main__":
     address = Path(sys.argv[1]).resolve().as_uri()
-    with open_browser() as browser:
+    with chromium() as browser:
         head = shot(browser, address, "header", width=1200, height=1000)
         browser.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
         cloud = shot(browser, address, "#cloud", width=1000, height=1060)

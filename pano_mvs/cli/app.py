@@ -339,6 +339,9 @@ def share(
     points: Annotated[
         int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: all.")
     ] = 5_000_000,
+    triangles: Annotated[
+        int, typer.Option("--triangles", min=0, help="Maximum number of triangles of a mesh without texture; 0: all.")
+    ] = 300_000,
     width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 4096,
     quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,
     images: Annotated[
@@ -346,11 +349,11 @@ def share(
     ] = None,
     cache: CacheOption = None,
 ) -> None:
-    """Write a page to send: cloud, cameras and panoramas, for any browser, without a network."""
+    """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
     from pano_mvs.cli.share_command import share_output
     from pano_mvs.share import ShareOptions
 
-    options = ShareOptions(title, points, width, quality)
+    options = ShareOptions(title, points, triangles, width, quality)
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 

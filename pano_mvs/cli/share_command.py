@@ -32,8 +32,9 @@ def share_output(
         )
     for note in shared.notes:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+    surface = f", {shared.triangles:,} {plural(shared.triangles, 'triangle')}" if shared.triangles else ""
     console.print(
-        f"{shared.points:,} {plural(shared.points, 'point')} and {shared.panoramas} "
+        f"{shared.points:,} {plural(shared.points, 'point')}{surface} and {shared.panoramas} "
         f"{plural(shared.panoramas, 'panorama')}, {shared.total_bytes / 1e6:.1f} MB\n"
         f"page: {escape(str(shared.page))} (send or upload the whole folder)",
         highlight=False,

@@ -17,7 +17,20 @@ from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_file, is_folder
 
-SCRIPTS = ("three.min.js", "loader.js", "cloud.js", "panorama.js", "measure.js", "page.js")
+SCRIPTS = (
+    "three.min.js",
+    "loader.js",
+    "pace.js",
+    "cloud.js",
+    "surface.js",
+    "panorama.js",
+    "walk.js",
+    "measure.js",
+    "map.js",
+    "link.js",
+    "input.js",
+    "page.js",
+)
 """In the order in which the page loads them: classic scripts, since browsers refuse modules from file://."""
 
 SINGLE_FILE = "page.html"

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,19 +14,16 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput, RunView
-from pano_mvs.scene import PointCloud
+from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import states_y_down
-from pano_mvs.share.encoding import encode_jpeg, encode_points, encode_ranges
 from pano_mvs.share.frame import page_from_world
-from pano_mvs.share.octree import octree
+from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.tiles import level_count, panorama_tiles
-
-RANGES_HW = (256, 512)
-"""Size of the range map that the page walks and measures on."""
+from pano_mvs.share.plan_file import run_plans
+from pano_mvs.share.scene_parts import RANGES_HW, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
 
 Progress = Callable[[int, int], None]
 """Receives the number of panoramas that are written, and of all."""
@@ -42,6 +38,7 @@ class Shared:
         single_file: the same as one file; None if it would be too large.
         points: number of points of the cloud.
         panoramas: number of panoramas.
+        triangles: number of triangles of the mesh; 0 without one.
         total_bytes: size of the data.
         notes: what is missing.
     """
@@ -50,6 +47,7 @@ class Shared:
     single_file: Path | None
     points: int
     panoramas: int
+    triangles: int
     total_bytes: int
     notes: tuple[str, ...] = ()
 
@@ -62,7 +60,9 @@ def share_run(
     images: Path | None = None,
     progress: Progress | None = None,
 ) -> Shared:
-    """Write a page with the cloud, the cameras and the panoramas of a run; of several groups the largest is shown.
+    """Write a page with the cloud, the mesh, the cameras and the panoramas of a run.
+
+    Of several groups of cameras, the largest is shown.
 
     >>> import pano_mvs
     >>> shared = share_run(pano_mvs.load("out"), Path("page"))
@@ -92,71 +92,82 @@ def share_run(
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
     frame = page_from_world(cameras, is_level=states_y_down(run.summary.poses.by_group()[0].frame))
     page = PageFolder(folder)
-    nodes, bounds = _put_cloud(page, cloud, frame, max_points=options.max_points)
-    described = []
-    for idx, camera in enumerate(cameras):
-        name = poses.names[idx] if poses is not None else ""
-        view = run.views.get(name)
-        image = _image(view, images / name if images is not None else None)
-        pose = camera @ frame.inverse()
-        described.append(
-            {"name": name} | _put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)
-        )
-        if progress is not None:
-            progress(idx + 1, len(cameras))
-    if missing := [entry["name"] for entry in described if not entry["levels"]]:
+    title = options.title or resolved(run.out).name
+    scene: dict[str, Any] = {"title": title, "unit": "m" if _is_metric(run) else "units", "ranges": list(RANGES_HW)}
+    centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
+    geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
+    scene |= geometry
+    notes += more
+    scene["cameras"] = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
+    if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(
-            f"{len(missing)} of {len(described)} panoramas could not be read, such as {missing[0]}; give their folder "
+            f"{len(missing)} of {len(cameras)} panoramas could not be read, such as {missing[0]}; give their folder "
             "with --images DIR"
         )
-    title = options.title or resolved(run.out).name
-    metric = run.summary.poses.by_group()[0].metric
-    page.put(
-        "scene",
-        {
-            "title": title,
-            "unit": "m" if metric else "units",
-            "cameras": described,
-            "nodes": nodes,
-            "bounds": bounds,
-            "ranges": list(RANGES_HW),
-        },
-    )
-    single = page.finish(title, max_single_file_bytes=options.max_single_file_bytes)
+    page.put("scene", scene)
     return Shared(
         folder / "index.html",
-        single,
-        sum(node["count"] for node in nodes),
-        sum(bool(entry["levels"]) for entry in described),
-        sum(page.written.values()),
-        tuple(notes),
+        page.finish(title, max_single_file_bytes=options.max_single_file_bytes),
+        points=sum(node["count"] for node in scene["nodes"]),
+        panoramas=len(cameras) - len(missing),
+        triangles=sum(piece["faces"] for piece in scene["mesh"]["pieces"]) if scene["mesh"] else 0,
+        total_bytes=sum(page.written.values()),
+        notes=tuple(notes),
     )
 
 
-def _put_cloud(
-    page: PageFolder, cloud: PointCloud | None, frame: Rigid3, *, max_points: int
-) -> tuple[list[dict[str, Any]], list[list[float]]]:
-    """Write the octree; return its nodes and the box that holds all but the outermost percent of the points."""
-    if cloud is None or not len(cloud):
-        return [], []
-    chosen = np.arange(len(cloud))
-    if 0 < max_points < len(cloud):
-        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), max_points, replace=False))
-    points = frame.apply(cloud.points_in_world[chosen]).astype(np.float32)
-    turned = PointCloud(
-        points,
-        (cloud.normals_in_world[chosen] @ frame.rotation.T).astype(np.float32),
-        cloud.colors_rgb[chosen],
-        cloud.view_counts[chosen],
-    )
-    nodes = octree(points)
-    for node in nodes:
-        page.put(f"cloud/{node.name}", encode_points(node, turned))
-    described = [
-        {"name": node.name, "lower": node.lower.tolist(), "size": node.size, "count": len(node.chosen)}
-        for node in nodes
-    ]
-    return described, np.percentile(points, [1, 99], axis=0).astype(float).tolist()
+def _put_geometry(
+    page: PageFolder,
+    run: RunOutput,
+    cloud: PointCloud | None,
+    *,
+    frame: Rigid3,
+    centers: NDArray[np.float64],
+    options: ShareOptions,
+) -> tuple[dict[str, Any], list[str]]:
+    """Write cloud, mesh and maps; return what the page needs to know of them, and notes."""
+    shown = shown_cloud(cloud, frame, max_points=options.max_points)
+    described = put_cloud(page, shown)
+    mesh, note = run_mesh(run)
+    notes = [note]
+    described["mesh"] = None
+    if mesh is not None:
+        mesh, note = thinned(mesh, options.max_triangles)
+        notes.append(note)
+        described["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
+    plans, note = run_plans(run, frame)
+    notes.append(note)
+    described["maps"] = put_maps(page, shown, plans, centers=centers)
+    return described, [note for note in notes if note]
+
+
+def _is_metric(run: RunOutput) -> bool:
+    return bool(run.summary.poses.by_group()[0].metric)
+
+
+def _put_cameras(
+    page: PageFolder,
+    run: RunOutput,
+    poses: Poses | None,
+    *,
+    frame: Rigid3,
+    options: ShareOptions,
+    images: Path | None,
+    progress: Progress | None,
+) -> list[dict[str, Any]]:
+    """Write the panoramas, and return what the page needs to know of each camera."""
+    described = []
+    for idx, name in enumerate(poses.names if poses is not None else ()):
+        assert poses is not None
+        view = run.views.get(name)
+        image = _image(view, images / name if images is not None else None)
+        pose = poses.cam_from_world(idx) @ frame.inverse()
+        described.append(
+            {"name": name, **put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)}
+        )
+        if progress is not None:
+            progress(idx + 1, len(poses.names))
+    return described
 
 
 def _image(view: RunView | None, path: Path | None) -> NDArray[np.uint8] | None:
@@ -164,34 +175,3 @@ def _image(view: RunView | None, path: Path | None) -> NDArray[np.uint8] | None:
     if path is not None and is_file(path):
         return decode_image(path)
     return view.image if view is not None else None
-
-
-def _put_camera(
-    page: PageFolder,
-    idx: int,
-    *,
-    view: RunView | None,
-    image: NDArray[np.uint8] | None,
-    cam_from_page: Rigid3,
-    options: ShareOptions,
-) -> dict[str, Any]:
-    """Write the tiles and the ranges of a panorama, and return what the page needs to know of it."""
-    levels = level_count(image.shape[1], options.max_width) if image is not None else 0
-    if image is not None:
-        for level, column, row, tile in panorama_tiles(image, levels):
-            page.put(f"panorama/{idx}/{level}-{column}-{row}", encode_jpeg(tile, options.jpeg_quality))
-    ranges = view.range_map if view is not None else None
-    text, low, high = encode_ranges(_reduced(ranges)) if ranges is not None else ("", 1.0, 2.0)
-    if text:
-        page.put(f"panorama/{idx}/ranges", text)
-    return {
-        "center": cam_from_page.center.tolist(),
-        "page_from_cam": cam_from_page.rotation.T.tolist(),
-        "levels": levels,
-        "ranges": [low, high] if text else None,
-    }
-
-
-def _reduced(ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a range map at the size of the page's: single values, because a mean of two surfaces lies on neither."""
-    return np.asarray(cv2.resize(ranges, RANGES_HW[::-1], interpolation=cv2.INTER_NEAREST_EXACT), np.float32)

@@ -18,7 +18,7 @@ from pano_mvs.scene import Panorama
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import stored, summary_of
 from tests.report.test_color_scales import farther
-from tests.share.browser import Browser, open_browser
+from tests.share.chromium import Chromium, chromium
 from tests.viewer.scenes import box_cloud
 
 GROUND = "getComputedStyle(document.querySelector('#viewer canvas')).backgroundColor.match(/\\d+/g).map(Number)"
@@ -43,13 +43,13 @@ def page(tmp_path_factory: pytest.TempPathFactory, tiny: TinyCapture) -> Path:
 
 
 @pytest.fixture(scope="module")
-def window() -> Iterator[Browser]:
-    with open_browser(width=1200, height=900) as browser:
+def window() -> Iterator[Chromium]:
+    with chromium(width=1200, height=900) as browser:
         yield browser
 
 
 @pytest.fixture
-def browser(window: Browser, page: Path) -> Iterator[Browser]:
+def browser(window: Chromium, page: Path) -> Iterator[Chromium]:
     window.resize(1200, 900)
     window.open(page.as_uri())
     yield window
@@ -57,7 +57,7 @@ def browser(window: Browser, page: Path) -> Iterator[Browser]:
     window.command("Emulation.setEmulatedMedia", media="", features=[])
 
 
-def cloud_of(browser: Browser) -> NDArray[np.int64]:
+def cloud_of(browser: Chromium) -> NDArray[np.int64]:
     """Return the part of the window that shows the cloud."""
     browser.wait("!document.getElementById('viewer').hidden && document.readyState === 'complete'")
     browser.evaluate(
@@ -75,7 +75,7 @@ def changed(first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
     return float((np.abs(first - second).sum(axis=-1) > 60).mean())
 
 
-def drag(browser: Browser, across: int, down: int) -> None:
+def drag(browser: Chromium, across: int, down: int) -> None:
     box = browser.evaluate("document.querySelector('#viewer canvas').getBoundingClientRect().toJSON()")
     x, y = box["left"] + box["width"] / 2, box["top"] + box["height"] / 2
     for kind, place in (
@@ -88,7 +88,7 @@ def drag(browser: Browser, across: int, down: int) -> None:
         )
 
 
-def test_the_cloud_is_drawn_and_can_be_turned(browser: Browser) -> None:
+def test_the_cloud_is_drawn_and_can_be_turned(browser: Chromium) -> None:
     first = cloud_of(browser)
     ground = first[5, 5]
     assert (np.abs(first - ground).sum(axis=-1) > 40).mean() > 0.15
@@ -100,7 +100,7 @@ def test_the_cloud_is_drawn_and_can_be_turned(browser: Browser) -> None:
     assert changed(first, cloud_of(browser)) < 0.02
 
 
-def test_the_cloud_is_turned_by_keys_and_seen_from_other_places(browser: Browser) -> None:
+def test_the_cloud_is_turned_by_keys_and_seen_from_other_places(browser: Chromium) -> None:
     pictures = [cloud_of(browser)]
     browser.evaluate("document.querySelector('#viewer canvas').focus(), 0")
     for _ in range(4):
@@ -116,7 +116,7 @@ def test_the_cloud_is_turned_by_keys_and_seen_from_other_places(browser: Browser
         assert changed(before, after) > limit
 
 
-def test_inside_the_picture_is_not_mirrored(browser: Browser, tiny: TinyCapture) -> None:
+def test_inside_the_picture_is_not_mirrored(browser: Chromium, tiny: TinyCapture) -> None:
     """Walls are coloured by their place: red grows to the right of a camera that looks along +z of the world."""
     for name in ("inside", "cameras"):
         browser.evaluate(f"document.getElementById('viewer-{name}').click(), 0")
@@ -139,7 +139,7 @@ def test_inside_the_picture_is_not_mirrored(browser: Browser, tiny: TinyCapture)
 
 @pytest.mark.parametrize("width", [360, 800, 1600])
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_everything_fits_and_text_is_large_enough(browser: Browser, page: Path, width: int, theme: str) -> None:
+def test_everything_fits_and_text_is_large_enough(browser: Chromium, page: Path, width: int, theme: str) -> None:
     browser.command("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
     browser.resize(width, 900)
     browser.open(page.as_uri())
@@ -163,7 +163,7 @@ def test_everything_fits_and_text_is_large_enough(browser: Browser, page: Path, 
     assert tiny_text == 0
 
 
-def test_the_scale_of_the_range_maps_is_switched_by_the_keyboard(browser: Browser) -> None:
+def test_the_scale_of_the_range_maps_is_switched_by_the_keyboard(browser: Chromium) -> None:
     shown = "[...document.querySelectorAll('.view .own')].filter((e) => getComputedStyle(e).display !== 'none').length"
     assert browser.evaluate(shown) == 0
     browser.evaluate("document.getElementById('own-scale').focus(), 0")
@@ -173,7 +173,7 @@ def test_the_scale_of_the_range_maps_is_switched_by_the_keyboard(browser: Browse
     assert browser.evaluate(common)
 
 
-def test_in_print_the_images_of_the_cloud_take_the_place_of_the_viewer(browser: Browser) -> None:
+def test_in_print_the_images_of_the_cloud_take_the_place_of_the_viewer(browser: Chromium) -> None:
     display = (
         "['#viewer', '.clouds', '#own-scale'].map((name) => getComputedStyle(document.querySelector(name)).display)"
     )
@@ -184,7 +184,7 @@ def test_in_print_the_images_of_the_cloud_take_the_place_of_the_viewer(browser: 
     assert (viewer, images != "none", switch) == ("none", True, "none")
 
 
-def test_without_webgl_the_images_remain(browser: Browser, page: Path) -> None:
+def test_without_webgl_the_images_remain(browser: Chromium, page: Path) -> None:
     script = "HTMLCanvasElement.prototype.getContext = function () { return null; };"
     added = browser.command("Page.addScriptToEvaluateOnNewDocument", source=script)
     browser.open(page.as_uri())
@@ -193,7 +193,7 @@ def test_without_webgl_the_images_remain(browser: Browser, page: Path) -> None:
     browser.command("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
 
 
-def test_all_controls_have_names(browser: Browser) -> None:
+def test_all_controls_have_names(browser: Chromium) -> None:
     nameless = browser.evaluate(
         "[...document.querySelectorAll('button, input, canvas, select')].filter((e) => !e.textContent.trim() &&"
         " !e.getAttribute('aria-label') && !(e.labels && e.labels.length)).map((e) => e.outerHTML.slice(0, 80))"
@@ -201,7 +201,7 @@ def test_all_controls_have_names(browser: Browser) -> None:
     assert nameless == []
 
 
-def test_a_view_is_compared_with_what_is_shown_over_it(browser: Browser) -> None:
+def test_a_view_is_compared_with_what_is_shown_over_it(browser: Chromium) -> None:
     browser.evaluate("document.querySelector('.slider').focus(), 0")
     clip = "getComputedStyle(document.querySelector('.laid .pane.range')).clipPath"
     before = browser.evaluate(clip)
@@ -213,7 +213,7 @@ def test_a_view_is_compared_with_what_is_shown_over_it(browser: Browser) -> None
     assert label == "000.png: panorama left of the line, confidence right of it"
 
 
-def test_panoramas_are_found_by_a_part_of_their_names(browser: Browser) -> None:
+def test_panoramas_are_found_by_a_part_of_their_names(browser: Chromium) -> None:
     shown = "[...document.querySelectorAll('#rows tr b')].map((name) => name.textContent)"
     assert len(browser.evaluate(shown)) == 4
     find = "Object.assign(document.getElementById('find'), {value: VALUE}).dispatchEvent(new Event('input'))"

@@ -1,4 +1,4 @@
-"""The page in a real browser: opened from the disk, without a server."""
+"""The page in real browsers: opened from the disk, without a server."""
 
 from __future__ import annotations
 
@@ -10,41 +10,52 @@ import numpy as np
 import pytest
 
 from pano_mvs.share import ShareOptions, share_run
-from tests.share.box_run import box_run, frame_of_page
+from tests.share.box_run import POINT_SIGMA, RELATIVE_SIGMA, box_run, frame_of_page, wall_color, wall_range
 from tests.share.browser import Browser, open_browser
+from tests.share.large_page import large_page
 from tests.viewer.scenes import HALF
 
 pytestmark = pytest.mark.browser
+
+ESCAPE = "\ue00c"
+TOOLS = 10
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
-    return share_run(box_run(folder, points=120_000), folder / "page", ShareOptions(title="Lobby")).page
+    return share_run(box_run(folder, points=60_000, mesh=True), folder / "page", ShareOptions(title="Lobby")).page
 
 
-@pytest.fixture(scope="module")
-def window() -> Iterator[Browser]:
-    with open_browser() as browser:
+@pytest.fixture(scope="module", params=["chromium", "firefox"])
+def window(request: pytest.FixtureRequest) -> Iterator[Browser]:
+    with open_browser(request.param) as browser:
         yield browser
 
 
 @pytest.fixture
 def browser(window: Browser, page: Path) -> Browser:
     window.resize(1280, 720)
-    window.open("about:blank")
     show(window, page.as_uri())
     return window
 
 
 def show(browser: Browser, address: str) -> None:
     """Open the page and wait until it has drawn everything."""
+    browser.open("about:blank")
     browser.open(address)
+    browser.wait("typeof PanoMvs === 'object' && PanoMvs.page")
     settle(browser)
 
 
 def settle(browser: Browser) -> None:
-    browser.wait("PanoMvs.page && !PanoMvs.page.dirty && !PanoMvs.page.move && PanoMvs.page.cloud.loading === 0")
+    browser.wait("PanoMvs.page.settled")
+
+
+def step_inside(browser: Browser, index: int) -> None:
+    browser.evaluate(f"PanoMvs.page.stepInside(PanoMvs.page.panoramas[{index}], true)")
+    browser.wait(f"PanoMvs.page.mode === 'inside' && PanoMvs.page.here.index === {index}")
+    settle(browser)
 
 
 def place_of(browser: Browser, point_in_world: np.ndarray) -> tuple[float, float]:
@@ -56,106 +67,204 @@ def place_of(browser: Browser, point_in_world: np.ndarray) -> tuple[float, float
     return (shown[0] + 1) / 2 * 1280, (1 - shown[1]) / 2 * 720
 
 
-def measured(browser: Browser) -> float:
+def expected_color(browser: Browser, x: int, y: int) -> np.ndarray:
+    """Return the colour of the wall that a pixel of the window shows."""
+    ray = "((ray) => [...ray.origin.toArray(), ...ray.direction.toArray()])"
+    origin, direction = np.array(browser.evaluate(f"{ray}(PanoMvs.page.raycaster({x}, {y}).ray)")).reshape(2, 3)
+    frame = frame_of_page().inverse()
+    eye, ahead = frame.apply(origin), frame.rotation @ direction
+    return wall_color(eye + wall_range(eye, ahead) * ahead).astype(float)
+
+
+def measured(browser: Browser) -> tuple[float, float]:
     text = browser.evaluate("document.getElementById('measured').textContent")
-    found = re.match(r"Distance ([\d.]+) m", text)
+    found = re.match(r"Distance ([\d.]+) m ± ([\d.]+):", text)
     assert found is not None, text
-    return float(found[1])
+    return float(found[1]), float(found[2])
 
 
-def test_the_cloud_is_drawn_and_the_console_is_empty(browser: Browser) -> None:
-    picture = browser.screenshot()
-    ground = picture[5, 700].astype(int)
-    drawn = np.abs(picture[60:640].astype(int) - ground).sum(axis=-1) > 40
-    assert picture.shape == (720, 1280, 3)
-    assert drawn.mean() > 0.1
+def differing(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the share of the pixels that differ clearly."""
+    return float((np.abs(first.astype(int) - second.astype(int)).sum(axis=-1) > 60).mean())
+
+
+def test_surface_and_cloud_are_drawn_and_the_console_is_empty(browser: Browser) -> None:
+    surface = browser.screenshot()
+    assert surface.shape == (720, 1280, 3)
+    browser.press("s")
+    settle(browser)
+    cloud = browser.screenshot()
+    for picture in (surface, cloud):
+        ground = picture[5, 700].astype(int)
+        assert (np.abs(picture[60:640].astype(int) - ground).sum(axis=-1) > 40).mean() > 0.1
+    assert 0.001 < differing(surface, cloud) < 0.15
     assert browser.console() == []
 
 
 def test_the_single_file_shows_the_same(browser: Browser, page: Path) -> None:
     folder_picture = browser.screenshot()
     show(browser, page.with_name("page.html").as_uri())
-    single = browser.screenshot()
-    assert (np.abs(single.astype(int) - folder_picture.astype(int)).sum(axis=-1) > 60).mean() < 0.01
+    assert differing(browser.screenshot(), folder_picture) < 0.01
     assert browser.console() == []
 
 
 def test_a_panorama_is_seen_from_its_centre_the_right_way_round(browser: Browser) -> None:
-    browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[1], true)")
-    browser.wait("PanoMvs.page.mode === 'inside'")
-    settle(browser)
+    step_inside(browser, 1)
     picture = browser.screenshot()
-    rotation = frame_of_page().rotation
     for x, y in [(300, 300), (900, 330), (640, 450)]:
-        ray = np.array(browser.evaluate(f"PanoMvs.page.raycaster({x}, {y}).ray.direction.toArray()"))
-        expected = 128 + 100 * (ray / np.linalg.norm(ray)) @ rotation
-        assert picture[y, x] == pytest.approx(expected, abs=12)
+        assert picture[y, x] == pytest.approx(expected_color(browser, x, y), abs=12)
     assert browser.console() == []
 
 
-@pytest.mark.parametrize("mode", ["o", "p", "i"])
-def test_clicks_on_known_places_give_known_distances(browser: Browser, mode: str) -> None:
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.8])
+def test_the_middle_of_a_walk_shows_the_room_from_there(browser: Browser, part: float) -> None:
+    step_inside(browser, 0)
+    browser.evaluate("PanoMvs.page.panoramas[2].open().then(() => 0)")
+    browser.evaluate(
+        f"""(({{panoramas: [from, , to]}}) => {{
+          const began = performance.now() - {part} * 1e9, start = from.center.clone();
+          Object.assign(PanoMvs.page, {{ here: to, move: {{ from, to, start, began, length: 1e9, flight: false }} }});
+        }})(PanoMvs.page)"""
+    )
+    browser.wait("PanoMvs.page.eye.position.distanceTo(PanoMvs.page.panoramas[0].center) > 0.05")
+    picture = browser.screenshot()
+    for x, y in [(200, 200), (500, 330), (640, 500), (900, 330)]:
+        assert picture[y, x] == pytest.approx(expected_color(browser, x, y), abs=14), (x, y)
+    assert browser.console() == []
+
+
+@pytest.mark.parametrize(("mode", "surface"), [("o", True), ("o", False), ("p", True), ("i", True)])
+def test_clicks_on_known_places_give_known_distances(browser: Browser, mode: str, surface: bool) -> None:
+    if not surface:
+        browser.press("s")
     browser.press(mode)
     browser.wait(f"PanoMvs.page.mode.startsWith({mode!r})")
     settle(browser)
     browser.press("m")
     floor = HALF[1]
     first, second = np.array([-0.9, floor, -1.8]), np.array([0.8, floor, -2.6])
+    sigma = np.sqrt(2) * POINT_SIGMA
     if mode == "i":
         browser.evaluate("Object.assign(PanoMvs.page.look, {yaw: 0, pitch: -0.9, fov: 110}), PanoMvs.page.changed(), 0")
         here = browser.evaluate("PanoMvs.page.here.center.toArray()")
         below = frame_of_page().inverse().apply(here) * [1, 0, 1] + [0, floor, 0]
         ahead = -frame_of_page().rotation[2]
         first, second = below + 0.5 * ahead, below + 1.6 * ahead
+        height = np.linalg.norm(frame_of_page().inverse().apply(here) - below)
+        sigma = RELATIVE_SIGMA * np.hypot(0.5, 1.6)  # range times the part of the error that lies along the floor
+        assert height > 0.3
         settle(browser)
     for point in (first, second):
         browser.click(*place_of(browser, point))
-    assert measured(browser) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
+    length, uncertainty = measured(browser)
+    assert length == pytest.approx(np.linalg.norm(first - second), rel=0.03)
+    assert sigma * 0.97 < uncertainty < sigma + 0.012
     assert browser.console() == []
 
 
-def test_walking_ends_in_the_other_panorama_and_the_link_leads_there(browser: Browser) -> None:
-    browser.press("i")
-    browser.wait("PanoMvs.page.mode === 'inside'")
-    settle(browser)
-    start = browser.evaluate("PanoMvs.page.here.index")
-    other = (start + 1) % 3
-    browser.evaluate(f"PanoMvs.page.stepInside(PanoMvs.page.panoramas[{other}])")
-    browser.wait(f"PanoMvs.page.here.index === {other} && location.hash.startsWith('#i={other},')")
+def test_a_link_keeps_the_panorama_the_direction_and_the_measured_distance(browser: Browser) -> None:
+    step_inside(browser, 0)
+    browser.evaluate("Object.assign(PanoMvs.page.look, {pitch: -0.7}), PanoMvs.page.changed(), 0")
+    browser.press("m")
+    for x in (560, 760):
+        browser.click(x, 480)
+    told = measured(browser)
     settle(browser)
     before, link = browser.screenshot(), browser.evaluate("location.href")
-    browser.open("about:blank")
     show(browser, link)
-    browser.wait("PanoMvs.page.mode === 'inside'")
+    assert browser.evaluate("[PanoMvs.page.mode, PanoMvs.page.here.index]") == ["inside", 0]
+    assert measured(browser) == told
+    assert differing(before, browser.screenshot()) < 0.01
+
+
+def test_a_link_keeps_points_and_coverage(browser: Browser) -> None:
+    for key in ("s", "c", "\ue012"):  # arrow to the left
+        browser.press(key)
     settle(browser)
-    assert (np.abs(before.astype(int) - browser.screenshot().astype(int)).sum(axis=-1) > 60).mean() < 0.01
-    browser.press("\ue00c")  # Escape
+    before, link = browser.screenshot(), browser.evaluate("location.href")
+    show(browser, link)
+    assert browser.evaluate("[PanoMvs.page.surfaceShown, PanoMvs.page.covered]") == [False, True]
+    assert differing(before, browser.screenshot()) < 0.01
+
+
+def test_walking_ends_in_the_other_panorama_and_escape_leads_out(browser: Browser) -> None:
+    step_inside(browser, 0)
+    browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[1])")
+    browser.wait("PanoMvs.page.move")
+    browser.wait("PanoMvs.page.here.index === 1 && location.hash.startsWith('#i=1,') && PanoMvs.page.settled")
+    assert browser.evaluate("PanoMvs.page.eye.position.distanceTo(PanoMvs.page.here.center)") < 1e-6
+    browser.press(ESCAPE)
     browser.wait("PanoMvs.page.mode === 'overview'")
 
 
-@pytest.mark.parametrize(("width", "height"), [(360, 640), (1600, 900)])
+def test_a_click_on_the_map_leads_into_a_panorama(browser: Browser) -> None:
+    boxes = browser.evaluate(
+        "[...document.querySelectorAll('#places button')].map((b) => [b.ariaLabel, b.getBoundingClientRect().toJSON()])"
+    )
+    assert [name for name, _ in boxes] == ["lobby/000.png", "lobby/001.png", "lobby/002.png"]
+    picture = browser.evaluate("(({left, top, width, height}) => [left, top, width, height])("
+                               "document.querySelector('#places img').getBoundingClientRect())")  # fmt: skip
+    lower, upper = browser.evaluate(
+        "(([x, z, w, , , h]) => [[x, z], [x + w, z + h]])(PanoMvs.page.map.shown.page_from_map)"
+    )
+    centers = np.array(browser.evaluate("PanoMvs.page.panoramas.map(({center}) => [center.x, center.z])"))
+    expected = np.array(picture[:2]) + (centers - lower) / np.subtract(upper, lower) * picture[2:]
+    middles = [(box["left"] + box["width"] / 2, box["top"] + box["height"] / 2) for _, box in boxes]
+    assert np.array(middles) == pytest.approx(expected, abs=1)
+    browser.click(*middles[2])
+    browser.wait("PanoMvs.page.mode === 'inside' && PanoMvs.page.here.index === 2 && PanoMvs.page.settled")
+    you = browser.evaluate("document.getElementById('you').getBoundingClientRect().toJSON()")
+    assert abs(you["left"] + you["width"] / 2 - middles[2][0]) < 25
+    assert browser.evaluate("document.querySelector('#places [aria-current=true]').ariaLabel") == "lobby/002.png"
+
+
+def test_fingers_turn_and_zoom(browser: Browser) -> None:
+    distance = "PanoMvs.page.eye.position.distanceTo(PanoMvs.page.orbit.target)"
+    before = browser.evaluate(distance)
+    browser.pinch((600, 350), 100, 300)
+    assert browser.evaluate(distance) < 0.6 * before
+    step_inside(browser, 1)
+    yaw, fov = browser.evaluate("[PanoMvs.page.look.yaw, PanoMvs.page.look.fov]")
+    browser.drag((700, 350), (500, 350), kind="touch")
+    assert browser.evaluate("PanoMvs.page.look.yaw") == pytest.approx(yaw + np.deg2rad(fov) * 200 / 720, rel=0.05)
+    browser.pinch((600, 350), 200, 300)
+    assert browser.evaluate("PanoMvs.page.look.fov") == pytest.approx(fov * 2 / 3, rel=0.05)
+    assert browser.evaluate("location.hash").startswith("#i=1,")
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 740), (1600, 900)])
 def test_everything_can_be_reached_on_small_and_large_windows(browser: Browser, width: int, height: int) -> None:
     browser.resize(width, height)
     browser.wait(f"Math.abs(PanoMvs.page.eye.aspect - {width / height}) < 0.001")
     settle(browser)
-    buttons = browser.evaluate(
-        "[...document.querySelectorAll('#tools button')].map((button) => button.getBoundingClientRect().toJSON())"
-    )
-    assert len(buttons) == 8
+    boxes = "[...document.querySelectorAll('#tools button')].map((button) => button.getBoundingClientRect().toJSON())"
+    buttons = browser.evaluate(boxes)
+    assert len(buttons) == TOOLS
     for box in buttons:
         assert box["left"] >= 0
         assert box["right"] <= width
         assert box["bottom"] <= height
         assert box["height"] >= 36
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    if width < 520:
+        assert browser.evaluate("document.getElementById('map').hidden")
+        browser.press("n")
+    figure = browser.evaluate("document.getElementById('map').getBoundingClientRect().toJSON()")
+    assert 80 < figure["width"] < width / 2
+    assert figure["bottom"] < min(box["top"] for box in buttons)
     browser.press("l")
     assert browser.evaluate("document.querySelectorAll('#panoramas button').length") == 3
+    browser.press("m")
+    said = browser.evaluate("document.getElementById('measured').getBoundingClientRect().toJSON()")
+    assert figure["bottom"] < said["top"] < said["bottom"] <= min(box["top"] for box in buttons)
 
 
 def test_all_controls_have_names_and_the_theme_can_be_changed(browser: Browser) -> None:
-    named = "(e) => e.textContent.trim() || e.getAttribute('aria-label') || e.getAttribute('aria-live')"
-    controls = "[...document.querySelectorAll('button, canvas, nav, output')]"
-    assert browser.evaluate(f"{controls}.filter({named}).length === {controls}.length")
+    named = "(e) => e.textContent.trim() || e.getAttribute('aria-label') || e.alt || e.getAttribute('aria-live')"
+    controls = "[...document.querySelectorAll('button, canvas, nav, output, img, figure, [role]')]"
+    assert browser.evaluate(f"{controls}.filter((e) => !({named})(e)).map((e) => e.outerHTML)") == [
+        '<p id="problem" role="alert" hidden=""></p>'
+    ]
     grounds = []
     for _ in range(2):
         browser.press("t")
@@ -164,14 +273,97 @@ def test_all_controls_have_names_and_the_theme_can_be_changed(browser: Browser) 
     assert abs(grounds[0] - grounds[1]) > 300
 
 
+def test_the_page_is_as_dark_or_light_as_the_system(browser: Browser) -> None:
+    for scheme in browser.schemes:
+        browser.prefer(scheme)
+        browser.wait("PanoMvs.page.dirty || true")
+        settle(browser)
+        ground = browser.screenshot()[5, 700].astype(int).sum()
+        assert ground < 150 if scheme == "dark" else ground > 600
+
+
+def test_reduced_motion_jumps(browser: Browser) -> None:
+    if not browser.can_reduce_motion:
+        pytest.skip("this browser cannot change the preference while it runs")
+    browser.prefer(browser.schemes[0], reduced_motion=True)
+    try:
+        step_inside(browser, 0)
+        browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[1]).then(() => 0)")
+        assert browser.evaluate("[PanoMvs.page.here.index, PanoMvs.page.move]") == [1, None]
+    finally:
+        browser.prefer(browser.schemes[0])
+
+
+def test_nothing_but_the_files_of_the_page_can_be_loaded(browser: Browser) -> None:
+    """The policy refuses inline code, evaluated code, and connections."""
+    assert browser.evaluate("fetch('https://example.org/').then(() => 'sent', () => 'refused')") == "refused"
+    assert (
+        browser.evaluate(
+            """new Promise((resolve) => {
+          const refused = ({ effectiveDirective }) => resolve(effectiveDirective);
+          document.addEventListener("securitypolicyviolation", refused, { once: true });
+          document.head.append(Object.assign(document.createElement("script"), { textContent: "window.ran = true" }));
+        })"""
+        )
+        == "script-src-elem"
+    )
+    assert browser.evaluate("window.ran") is None
+    names = browser.evaluate("performance.getEntriesByType('resource').map(({name}) => name)")
+    assert not [name for name in names if not name.startswith(("file:", "data:", "https://example.org/"))]
+    assert browser.evaluate("document.cookie + Object.keys(localStorage)") == ""
+    assert len(browser.console()) >= 2
+
+
+def test_the_coarser_surface_of_motion_shows_the_same_with_fewer_triangles(browser: Browser) -> None:
+    before = browser.screenshot()
+    whole, coarse = browser.evaluate(
+        """PanoMvs.page.surface.group.children.reduce((sums, { geometry }) => {
+          const corners = coarser(geometry.index.array, geometry.attributes.position.array, 3);
+          const counts = [sums[0] + geometry.index.count, sums[1] + corners.length];
+          geometry.setIndex([...corners]);
+          PanoMvs.page.changed();
+          return counts;
+        }, [0, 0])"""
+    )
+    settle(browser)
+    assert 0 < coarse < 0.6 * whole
+    drawn = [
+        np.abs(picture.astype(int) - picture[5, 700]).sum(axis=-1) > 40 for picture in (before, browser.screenshot())
+    ]
+    assert 0 < (drawn[0] != drawn[1]).mean() < 0.01 < drawn[0].mean()
+
+
 def test_a_missing_file_is_named(browser: Browser, page: Path) -> None:
     tile = page.parent / "data" / "panorama" / "2" / "0-0-0.js"
     kept = tile.read_text()
     tile.unlink()
     try:
-        browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[2])")
+        browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[2]), 0")
         browser.wait("!document.getElementById('problem').hidden")
         assert "panorama/2/0-0-0.js is missing" in browser.evaluate("document.getElementById('problem').textContent")
     finally:
         tile.write_text(kept)
     browser.console()
+
+
+def test_of_200_large_panoramas_only_what_is_seen_is_loaded(window: Browser, tmp_path: Path) -> None:
+    window.resize(1280, 720)
+    visited = (7, 120, 199, 3, 60, 140)
+    page = large_page(tmp_path / "page", panoramas=200, levels=4, present=visited)
+    show(window, page.as_uri())
+
+    def loaded() -> int:
+        return sum((page.parent / "data" / f"{key}.js").stat().st_size for key in window.evaluate("PanoMvs.loaded"))
+
+    assert loaded() < 300_000
+    assert window.evaluate("PanoMvs.loaded") == ["scene"]
+    for index in visited:
+        step_inside(window, index)
+    keys = window.evaluate("PanoMvs.loaded")
+    assert len(keys) < 6 * 16
+    window.evaluate("PanoMvs.page.zoom(0.3), 0")
+    settle(window)
+    assert any(key.startswith("panorama/140/3-") for key in window.evaluate("PanoMvs.loaded"))
+    assert window.evaluate("PanoMvs.page.panoramas.filter(({group}) => group.children.length).length") <= 4
+    assert window.evaluate("Math.max(...PanoMvs.page.panoramas.map(({tiles}) => tiles.size))") <= 24
+    assert window.console() == []

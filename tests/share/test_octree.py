@@ -53,12 +53,14 @@ def test_equal_points_end_the_division() -> None:
 def test_encoded_points_have_the_precision_of_their_cube() -> None:
     given = cloud(3_000)
     node = octree(given.points_in_world)[0]
-    data = base64.b64decode(encode_points(node, given))
+    sigmas = np.arange(3_000, dtype=np.int64).astype(np.uint8)
+    data = base64.b64decode(encode_points(node, given, sigmas))
     count = len(node.chosen)
-    assert len(data) == 13 * count
+    assert len(data) == 14 * count
     places = np.frombuffer(data, "<u2", 3 * count).reshape(-1, 3) / 65535 * node.size + node.lower
     assert np.abs(places - given.points_in_world[node.chosen]).max() <= 0.51 * node.size / 65535 + 1e-6
     assert np.array_equal(np.frombuffer(data, np.uint8, 3 * count, 6 * count), given.colors_rgb[node.chosen].ravel())
     assert np.array_equal(np.frombuffer(data, np.uint8, count, 9 * count), given.view_counts[node.chosen])
     normals = np.frombuffer(data, np.int8, 3 * count, 10 * count).reshape(-1, 3) / 127
     assert np.abs(normals - given.normals_in_world[node.chosen]).max() < 0.005
+    assert np.array_equal(np.frombuffer(data, np.uint8, count, 13 * count), sigmas[node.chosen])

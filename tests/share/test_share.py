@@ -23,6 +23,7 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.share import ShareOptions, share_run
 from pano_mvs.share.encoding import encode_ranges
 from pano_mvs.share.frame import page_from_world
+from pano_mvs.share.page_folder import SCRIPTS
 from pano_mvs.share.tiles import level_count, panorama_tiles
 from tests.share.box_run import NAMES, box_ranges, box_run
 from tests.viewer.scenes import turned_poses, world_color
@@ -108,7 +109,7 @@ def test_the_single_file_refers_to_nothing_and_allows_its_own_scripts_alone(tmp_
         assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in allowed
     assert "unsafe" not in policy[1]
     assert "http" not in policy[1]
-    assert len(scripts) == len(shared_pieces(shared.page.parent)) + 6
+    assert len(scripts) == len(shared_pieces(shared.page.parent)) + len(SCRIPTS)
 
 
 def shared_pieces(folder: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 const PanoMvs = {
   values: new Map(),
   waiting: new Map(),
+  loaded: [], // the keys of all pieces of data, in the order in which the page asked for them
 
   receive(key, value) {
     const waiting = this.waiting.get(key);
@@ -16,6 +17,7 @@ const PanoMvs = {
 
   /** Return a promise of a piece of data; the page does not keep it. */
   load(key) {
+    this.loaded.push(key);
     if (this.values.has(key)) return Promise.resolve(this.values.get(key)); // part of a single file
     return new Promise((resolve, reject) => {
       const script = document.createElement("script");
@@ -42,19 +44,26 @@ function bytesOf(text) {
   return bytes;
 }
 
-/** Return a promise of a texture from the base64 text of a JPEG file. */
-function textureOf(text) {
+/** Return a promise of an image from the base64 text of a file, "jpeg" or "png". */
+function imageOf(text, kind, what) {
   return new Promise((resolve, reject) => {
     const image = new Image();
-    image.onload = () => {
-      const texture = new THREE.Texture(image);
-      texture.colorSpace = THREE.SRGBColorSpace;
-      texture.minFilter = THREE.LinearMipmapLinearFilter;
-      texture.anisotropy = 4;
-      texture.needsUpdate = true;
-      resolve(texture);
-    };
-    image.onerror = () => reject(new Error("a tile of a panorama is damaged"));
-    image.src = `data:image/jpeg;base64,${text}`;
+    image.onload = () => resolve(image);
+    image.onerror = () => reject(new Error(`${what} is damaged`));
+    image.src = `data:image/${kind};base64,${text}`;
   });
+}
+
+/** Return a promise of a texture from the base64 text of a JPEG file; shaders read the values of the file as they are. */
+async function textureOf(text, what) {
+  const texture = new THREE.Texture(await imageOf(text, "jpeg", what));
+  texture.colorSpace = THREE.NoColorSpace;
+  texture.minFilter = THREE.LinearMipmapLinearFilter;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+/** Return the value of a step of `log_steps`; 0 for step 0. */
+function valueOfStep(step, [low, high], steps) {
+  return step ? low * Math.exp(((step - 1) * Math.log(high / low)) / (steps - 1)) : 0;
 }

@@ -1,35 +1,38 @@
 "use strict";
-// Distances between two points that somebody clicks.
+// Distances between two points that somebody clicks, and their uncertainty.
 
 class Ruler {
   constructor(unit) {
     this.unit = unit;
-    this.points = [];
+    this.picks = [];
     this.group = new THREE.Group();
     this.label = document.createElement("div");
     this.label.hidden = true;
     document.getElementById("labels").append(this.label);
   }
 
-  add(point) {
-    if (this.points.length === 2) this.clear();
-    this.points.push(point);
+  /** Add a point: `{ point, sigma, ray }`, where `sigma` is 0 if unknown, and `ray` null if the error has no direction. */
+  add(pick) {
+    if (this.picks.length === 2) this.clear();
+    this.picks.push(pick);
     const dot = new THREE.Sprite(new THREE.SpriteMaterial({ color: 0xffb02e, depthTest: false, sizeAttenuation: false }));
     dot.scale.setScalar(0.014);
-    dot.position.copy(point);
+    dot.position.copy(pick.point);
     this.group.add(dot);
-    if (this.points.length < 2) return say("Click the second point.");
-    const geometry = new THREE.BufferGeometry().setFromPoints(this.points);
-    this.group.add(new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: 0xffb02e, depthTest: false })));
-    const [a, b] = this.points;
-    const text = `${this.text(a.distanceTo(b))}`;
+    if (this.picks.length < 2) return say("Click the second point.");
+    const [a, b] = this.picks.map((each) => each.point);
+    this.group.add(new THREE.Line(new THREE.BufferGeometry().setFromPoints([a, b]), new THREE.LineBasicMaterial({ color: 0xffb02e, depthTest: false })));
+    const text = withUncertainty(a.distanceTo(b), this.unit, this.sigma());
     this.label.textContent = text;
-    say(`Distance ${text}: ${this.text(Math.hypot(a.x - b.x, a.z - b.z))} horizontally, ${this.text(Math.abs(a.y - b.y))} vertically`);
+    say(`Distance ${text}: ${lengthText(Math.hypot(a.x - b.x, a.z - b.z), this.unit)} horizontally, ${lengthText(Math.abs(a.y - b.y), this.unit)} vertically`);
   }
 
-  text(length) {
-    const digits = length >= 100 ? 0 : length >= 10 ? 1 : length >= 1 ? 2 : 3;
-    return `${length.toFixed(digits)} ${this.unit}`;
+  /** Return the standard deviation of the distance; 0 if it is unknown. */
+  sigma() {
+    if (!this.picks.every((pick) => pick.sigma > 0)) return 0;
+    const along = this.picks[1].point.clone().sub(this.picks[0].point).normalize();
+    // The error of a range lies along its ray; that of a point of the cloud is taken as that large in all directions.
+    return Math.hypot(...this.picks.map((pick) => pick.sigma * (pick.ray ? Math.max(0.1, Math.abs(pick.ray.dot(along))) : 1)));
   }
 
   clear() {
@@ -38,19 +41,33 @@ class Ruler {
       part.material.dispose();
     }
     this.group.clear();
-    this.points = [];
+    this.picks = [];
     this.label.hidden = true;
     say("");
   }
 
   place(camera, width, height) {
-    this.label.hidden = this.points.length < 2;
+    this.label.hidden = this.picks.length < 2;
     if (this.label.hidden) return;
-    const middle = this.points[0].clone().add(this.points[1]).multiplyScalar(0.5).project(camera);
+    const middle = this.picks[0].point.clone().add(this.picks[1].point).multiplyScalar(0.5).project(camera);
     this.label.hidden = middle.z > 1;
     const box = this.label.getBoundingClientRect();
-    this.label.style.transform = `translate(${((middle.x + 1) / 2) * width - box.width / 2}px, ${((1 - middle.y) / 2) * height - box.height - 8}px)`;
+    const x = THREE.MathUtils.clamp(((middle.x + 1) / 2) * width - box.width / 2, 4, width - box.width - 4);
+    this.label.style.transform = `translate(${x}px, ${Math.max(4, ((1 - middle.y) / 2) * height - box.height - 8)}px)`;
   }
+}
+
+function lengthText(length, unit) {
+  const digits = length >= 100 ? 0 : length >= 10 ? 1 : length >= 1 ? 2 : 3;
+  return `${length.toFixed(digits)} ${unit}`;
+}
+
+/** Return a length with its standard deviation, rounded up to one digit: "3.42 m ± 0.02". */
+function withUncertainty(length, unit, sigma) {
+  if (!(sigma > 0)) return lengthText(length, unit);
+  const digits = THREE.MathUtils.clamp(-Math.floor(Math.log10(sigma)), 0, 3);
+  const rounded = Math.ceil(sigma * 10 ** digits - 1e-9) / 10 ** digits;
+  return `${length.toFixed(digits)} ${unit} ± ${rounded.toFixed(digits)}`;
 }
 
 function say(text) {

@@ -5,8 +5,12 @@ const WALK_MS = 1100;
 const FLY_MS = 900;
 const RING_PIXELS = 34; // how near a click must come
 const OPEN_PANORAMAS = 4; // kept in memory
-const element = (id) => document.getElementById(id);
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
+const narrow = matchMedia("(max-width: 520px)");
+
+function element(id) {
+  return document.getElementById(id);
+}
 
 function problem(error) {
   element("problem").textContent = `Something is missing: ${error.message}. Copy the whole folder, and load the page again.`;
@@ -16,13 +20,20 @@ function problem(error) {
 class Page {
   constructor(scene) {
     this.canvas = element("canvas");
-    this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true });
+    this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: false });
     this.renderer.autoClear = false;
+    this.dirty = true;
     this.changed = () => { this.dirty = true; };
+    this.moved = () => {
+      this.pace.move();
+      this.changed();
+    };
     this.scene = scene;
     this.world = new THREE.Scene();
     this.cloud = new Cloud(scene, this.changed);
+    this.surface = scene.mesh ? new Surface(scene.mesh, scene.sigmas, this.changed) : null;
     this.world.add(this.cloud.group);
+    if (this.surface) this.world.add(this.surface.group);
     this.ruler = new Ruler(scene.unit);
     this.marks = new THREE.Scene(); // drawn over everything
     this.marks.add(this.ruler.group);
@@ -30,24 +41,51 @@ class Page {
     this.recent = [];
     this.here = null; // the panorama one stands in
     this.move = null; // a walk or a flight
+    this.wanted = null; // the panorama that is being opened
     this.eye = new THREE.PerspectiveCamera(55, 1, 0.01, 10000);
     this.above = new THREE.OrthographicCamera(-1, 1, 1, -1, -10000, 10000);
     this.look = { yaw: 0, pitch: 0, fov: 80 };
-    this.measuring = false;
+    this.measuring = this.covered = false;
+    this.pace = new Pace();
+    this.resolution = PACES[0].resolution;
+    this.walkView = new WalkView(this.renderer);
     this.addRings();
     this.orbit = this.controls(this.eye);
     this.glide = this.controls(this.above);
     this.glide.enableRotate = false;
     this.glide.screenSpacePanning = true;
-    this.listen();
+    this.map = new PlanMap(scene.maps, this.panoramas, (panorama) => !this.move && this.stepInside(panorama));
+    this.prepare();
     this.resize();
-    if (!this.followLink()) this.overview();
+    if (!location.hash || !followLink(this, location.hash)) this.overview();
     requestAnimationFrame((now) => this.frame(now));
+  }
+
+  /** Connect the buttons with what this scene has. */
+  prepare() {
+    this.input = new Input(this);
+    addEventListener("hashchange", () => location.hash !== this.link && followLink(this, location.hash));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.changed);
+    this.fillList();
+    element("inside").disabled = !this.nearest();
+    element("surface").hidden = !this.surface || !this.cloud.nodes.size;
+    element("coverage").hidden = !this.scene.coverage;
+    element("plot").hidden = !this.scene.maps.length;
+    this.placeMap();
+    narrow.addEventListener("change", () => this.placeMap());
+    this.showSurface(Boolean(this.surface));
+  }
+
+  /** Show the map if there is room for it. */
+  placeMap() {
+    element("map").hidden = !this.scene.maps.length || narrow.matches;
+    element("plot").setAttribute("aria-expanded", String(!element("map").hidden));
   }
 
   controls(camera) {
     const controls = new THREE.OrbitControls(camera, this.canvas);
-    controls.addEventListener("change", this.changed);
+    controls.addEventListener("change", this.moved);
+    controls.addEventListener("end", () => this.writeLink());
     controls.enabled = false;
     controls.zoomToCursor = true;
     return controls;
@@ -80,23 +118,27 @@ class Page {
 
   box() {
     const box = new THREE.Box3();
-    for (const corner of this.scene.bounds) box.expandByPoint(new THREE.Vector3(...corner));
+    for (const corner of this.scene.bounds.length ? this.scene.bounds : this.scene.mesh?.bounds ?? []) box.expandByPoint(new THREE.Vector3(...corner));
     for (const panorama of this.panoramas) box.expandByPoint(panorama.center);
     return box;
   }
 
   enter(mode) {
-    this.mode = mode;
+    this.mode = document.body.dataset.mode = mode;
     this.orbit.enabled = mode === "overview";
     this.glide.enabled = mode === "plan";
     if (mode !== "inside") this.here = null;
-    this.cloud.material.uniforms.cut.value = mode === "plan" ? this.cutHeight() : 1e30;
+    const cut = mode === "plan" ? this.cutHeight() : 1e30;
+    this.cloud.material.uniforms.cut.value = cut;
+    if (this.surface) this.surface.material.uniforms.cut.value = cut;
     this.cloud.material.uniforms.hideBacks.value = mode === "overview";
     element("place").textContent = this.here ? this.here.camera.name : "";
     for (const name of ["overview", "plan", "inside"]) element(name).setAttribute("aria-current", String(name === mode));
     for (const [index, button] of [...element("panoramas").querySelectorAll("button")].entries()) {
       button.setAttribute("aria-current", String(this.here?.index === index));
     }
+    this.map.current(this.here);
+    this.map.show((this.here ?? this.nearest())?.center.y ?? 0).catch(problem);
     this.placeRings();
     this.changed();
   }
@@ -145,26 +187,41 @@ class Page {
     this.glide.update();
   }
 
+  /** Go back by one step: close the help, end measuring, leave a panorama. */
+  back() {
+    if (!element("help").hidden) this.toggle("keys", "help");
+    else if (this.measuring) this.measure(false);
+    else if (this.mode !== "overview") this.overview();
+    this.writeLink();
+    return true;
+  }
+
   /** Stand in a panorama: walk there from another one, fly there from outside. */
-  stepInside(panorama, at_once = false) {
+  async stepInside(panorama, at_once = false) {
+    this.wanted = panorama;
+    try {
+      await panorama.open();
+    } catch (error) {
+      return problem(error);
+    }
+    if (this.wanted !== panorama) return; // somebody chose another one meanwhile
+    this.wanted = null;
+    this.keep(panorama);
     const from = this.mode === "inside" && this.here !== panorama ? this.here : null;
-    panorama.open().then(() => {
-      this.keep(panorama);
-      const start = this.camera === this.eye ? this.eye.position.clone() : panorama.center.clone();
-      if (this.mode !== "inside" && this.mode !== undefined && this.camera === this.eye) {
-        const ahead = this.eye.getWorldDirection(new THREE.Vector3());
-        this.look = { yaw: Math.atan2(ahead.x, -ahead.z), pitch: Math.asin(THREE.MathUtils.clamp(ahead.y, -1, 1)), fov: 80 };
-      }
-      const flight = this.mode === "overview";
-      const jump = at_once || reducedMotion.matches || (!from && !flight);
-      const pitch = flight ? this.look.pitch : null;
-      this.move = jump ? null : { from, to: panorama, start, began: performance.now(), length: from ? WALK_MS : FLY_MS, pitch, flight };
-      this.here = panorama;
-      if (flight && !jump) this.orbit.enabled = false;
-      else this.enter("inside");
-      if (jump) this.look.pitch = THREE.MathUtils.clamp(this.look.pitch, -0.3, 0.3);
-      this.writeLink();
-    }).catch(problem);
+    const start = this.camera === this.eye ? this.eye.position.clone() : panorama.center.clone();
+    const outside = this.mode !== "inside";
+    if (outside && this.camera === this.eye) {
+      const ahead = this.eye.getWorldDirection(new THREE.Vector3());
+      this.look = { yaw: Math.atan2(ahead.x, -ahead.z), pitch: Math.asin(THREE.MathUtils.clamp(ahead.y, -1, 1)), fov: 80 };
+    }
+    const flight = this.mode === "overview";
+    const jump = at_once || reducedMotion.matches || (!from && !flight);
+    this.move = jump ? null : { from, to: panorama, start, began: performance.now(), length: from ? WALK_MS : FLY_MS, pitch: this.look.pitch, flight };
+    this.here = panorama;
+    if (flight && !jump) this.orbit.enabled = false;
+    else this.enter("inside");
+    if (jump && outside) this.look.pitch = THREE.MathUtils.clamp(this.look.pitch, -0.3, 0.3);
+    this.writeLink();
   }
 
   keep(panorama) {
@@ -180,7 +237,7 @@ class Page {
       if (this.mode !== "inside" || !this.here) continue;
       const there = panorama.center.clone().sub(this.here.center);
       const seen = this.here.pick(there);
-      ring.visible = panorama !== this.here && panorama.camera.levels > 0 && (!seen || seen.distanceTo(this.here.center) > 0.85 * there.length());
+      ring.visible = panorama !== this.here && panorama.camera.levels > 0 && (!seen || seen.point.distanceTo(this.here.center) > 0.85 * there.length());
     }
   }
 
@@ -203,144 +260,42 @@ class Page {
     return usable.sort((a, b) => a.center.distanceTo(target) - b.center.distanceTo(target))[0];
   }
 
-  // --- Input ---
-
-  listen() {
-    addEventListener("resize", () => this.resize());
-    addEventListener("hashchange", () => this.followLink());
-    this.orbit.addEventListener("end", () => this.writeLink());
-    this.glide.addEventListener("end", () => this.writeLink());
-    const pointers = new Map();
-    let pressed = null, pinch = 0;
-    this.canvas.addEventListener("pointerdown", (event) => {
-      pointers.set(event.pointerId, event);
-      pressed = pointers.size === 1 ? { x: event.clientX, y: event.clientY, time: event.timeStamp } : null;
-      if (this.mode === "inside") this.canvas.setPointerCapture(event.pointerId);
-    });
-    this.canvas.addEventListener("pointermove", (event) => {
-      const before = pointers.get(event.pointerId);
-      if (!before) return;
-      pointers.set(event.pointerId, event);
-      if (this.mode !== "inside" || this.move) return;
-      if (pointers.size === 2) {
-        const [a, b] = [...pointers.values()];
-        const apart = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
-        if (pinch) this.zoom(pinch / apart);
-        pinch = apart;
-        return;
-      }
-      const perPixel = THREE.MathUtils.degToRad(this.look.fov) / this.canvas.clientHeight;
-      this.turn(-(event.clientX - before.clientX) * perPixel, (event.clientY - before.clientY) * perPixel);
-    });
-    const release = (event) => {
-      pointers.delete(event.pointerId);
-      pinch = 0;
-      if (this.mode === "inside") this.writeLink();
-      if (!pressed || event.type !== "pointerup") return;
-      const still = Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < 6 && event.timeStamp - pressed.time < 600;
-      pressed = null;
-      if (still && event.button === 0) this.click(event.clientX, event.clientY);
-    };
-    this.canvas.addEventListener("pointerup", release);
-    this.canvas.addEventListener("pointercancel", release);
-    this.canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      if (this.mode === "inside") this.zoom(Math.exp(event.deltaY * 0.001));
-    }, { passive: false });
-    const press = {
-      overview: () => { this.overview(); this.writeLink(); },
-      plan: () => { this.plan(); this.writeLink(); },
-      inside: () => this.mode !== "inside" && this.nearest() && this.stepInside(this.nearest()),
-      measure: () => this.measure(!this.measuring),
-      coverage: () => this.coverage(),
-      list: () => this.toggle("list", "panoramas"),
-      theme: () => this.theme(),
-      keys: () => this.toggle("keys", "help"),
-    };
-    for (const [id, action] of Object.entries(press)) element(id).addEventListener("click", action);
-    const shortcuts = { o: "overview", p: "plan", i: "inside", m: "measure", c: "coverage", l: "list", t: "theme", "?": "keys" };
-    addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
-      const id = shortcuts[event.key.toLowerCase()];
-      if (id) press[id]();
-      else if (event.target.closest?.("button") || !this.key(event.key)) return;
-      event.preventDefault();
-    });
-    this.fillList();
-    element("inside").disabled = !this.nearest();
-  }
-
-  key(name) {
-    if (name === "Escape") {
-      if (!element("help").hidden) this.toggle("keys", "help");
-      else if (this.measuring) this.measure(false);
-      else if (this.mode !== "overview") this.overview();
-      return true;
-    }
-    if (name === "Enter" && this.mode === "inside") {
-      const panorama = this.ahead();
-      if (panorama && !this.move) this.stepInside(panorama);
-      return true;
-    }
-    const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], "+": "in", "=": "in", "-": "out" };
-    const step = steps[name];
-    if (!step) return false;
-    const factor = step === "in" ? 1 / 1.15 : 1.15;
-    if (this.mode === "inside") {
-      if (typeof step === "string") this.zoom(factor);
-      else this.turn(step[0] * 0.12, step[1] * 0.12);
-    } else if (typeof step === "string") {
-      if (this.mode === "plan") this.above.zoom /= factor;
-      else this.eye.position.sub(this.orbit.target).multiplyScalar(factor).add(this.orbit.target);
-      this.above.updateProjectionMatrix();
-    } else if (this.mode === "overview") {
-      const arm = this.eye.position.clone().sub(this.orbit.target);
-      arm.applyAxisAngle(new THREE.Vector3(0, 1, 0), -step[0] * 0.12);
-      const side = new THREE.Vector3().crossVectors(arm, new THREE.Vector3(0, 1, 0)).normalize();
-      const polar = arm.angleTo(new THREE.Vector3(0, 1, 0));
-      if (polar - step[1] * 0.12 > 0.05 && polar - step[1] * 0.12 < 3.09) arm.applyAxisAngle(side, step[1] * 0.12);
-      this.eye.position.copy(arm).add(this.orbit.target);
-    } else {
-      const way = (this.halfHeight / this.above.zoom) * 0.1;
-      for (const moved of [this.above.position, this.glide.target]) moved.add(new THREE.Vector3(step[0] * way, 0, -step[1] * way));
-    }
-    if (this.mode !== "inside") (this.mode === "plan" ? this.glide : this.orbit).update();
-    this.changed();
-    this.writeLink();
-    return true;
-  }
-
   turn(yaw, pitch) {
     this.look.yaw += yaw;
     this.look.pitch = THREE.MathUtils.clamp(this.look.pitch + pitch, -1.55, 1.55);
-    this.changed();
+    this.moved();
   }
 
   zoom(factor) {
     this.look.fov = THREE.MathUtils.clamp(this.look.fov * factor, 15, 110);
-    this.changed();
+    this.moved();
   }
+
+  // --- Tools ---
 
   raycaster(x, y) {
     const caster = new THREE.Raycaster();
     const place = new THREE.Vector2((x / this.canvas.clientWidth) * 2 - 1, 1 - (y / this.canvas.clientHeight) * 2);
+    this.camera.updateMatrixWorld();
     caster.setFromCamera(place, this.camera);
     return caster;
   }
 
-  /** Return the point of the scene below a pixel of the window; null if there is none. */
+  /** Return the point of the scene below a pixel of the window, with its uncertainty; null if there is none. */
   pick(x, y) {
     const caster = this.raycaster(x, y);
-    return this.mode === "inside" ? this.here.pick(caster.ray.direction) : this.cloud.pick(caster, this.camera, this.canvas.clientHeight);
+    if (this.mode === "inside") return this.here.pick(caster.ray.direction);
+    return this.surfaceShown ? this.surface.pick(caster) : this.cloud.pick(caster, this.camera, this.canvas.clientHeight);
   }
 
   click(x, y) {
     this.canvas.focus({ preventScroll: true });
     if (this.move) return;
     if (this.measuring) {
-      const point = this.pick(x, y);
-      if (point) this.ruler.add(point);
+      const picked = this.pick(x, y);
+      if (picked) this.ruler.add(picked);
       else say("Nothing was measured there. Click a surface.");
+      this.writeLink();
       return this.changed();
     }
     let best = null, bestApart = RING_PIXELS;
@@ -362,12 +317,25 @@ class Page {
     this.changed();
   }
 
-  coverage() {
-    const uniform = this.cloud.material.uniforms.coverage;
-    uniform.value = !uniform.value;
-    element("coverage").setAttribute("aria-pressed", String(uniform.value));
-    if (uniform.value && this.mode === "inside") this.overview();
-    say(uniform.value ? "Red: confirmed by one panorama, yellow: by three or four, green: by six and more." : "");
+  coverage(on) {
+    if (on === this.covered) return;
+    this.covered = this.map.coverage = on;
+    this.cloud.material.uniforms.coverage.value = on;
+    if (this.surface) this.surface.material.uniforms.coverage.value = on;
+    element("coverage").setAttribute("aria-pressed", String(on));
+    if (on && this.mode === "inside") this.overview();
+    else if (this.mode) this.enter(this.mode);
+    say(on ? "Red: confirmed by one panorama, yellow: by three or four, green: by six and more." : "");
+    this.changed();
+  }
+
+  /** Show the surface, or else the points. */
+  showSurface(on) {
+    this.surfaceShown = on && Boolean(this.surface);
+    if (this.surface) this.surface.group.visible = this.surfaceShown;
+    this.cloud.group.visible = !this.surfaceShown;
+    if (this.surfaceShown) this.surface.open();
+    element("surface").textContent = this.surfaceShown ? "Show points" : "Show surface";
     this.changed();
   }
 
@@ -395,52 +363,17 @@ class Page {
     }
   }
 
-  // --- Links ---
-
   writeLink() {
-    const short = (numbers) => numbers.map((number) => Number(number.toPrecision(6))).join(",");
-    let link = "";
-    if (this.mode === "inside") link = `i=${this.here.index},${short([this.look.yaw, this.look.pitch, this.look.fov])}`;
-    else if (this.mode === "plan") link = `p=${short([this.above.position.x, this.above.position.z, this.above.zoom])}`;
-    else link = `o=${short([...this.eye.position.toArray(), ...this.orbit.target.toArray()])}`;
-    this.link = `#${link}`;
+    if (this.mode === undefined || (this.mode === "inside" && !this.here)) return;
+    this.link = linkOf(this);
     history.replaceState(null, "", this.link);
-  }
-
-  followLink() {
-    if (!location.hash || location.hash === this.link) return Boolean(location.hash);
-    const [kind, text] = location.hash.slice(1).split("=");
-    const numbers = (text ?? "").split(",").map(Number);
-    if (!numbers.every(Number.isFinite)) return false;
-    if (kind === "i" && numbers.length === 4 && this.panoramas[numbers[0]]?.camera.levels) {
-      if (this.mode === undefined) this.overview();
-      this.look = { yaw: numbers[1], pitch: THREE.MathUtils.clamp(numbers[2], -1.55, 1.55), fov: THREE.MathUtils.clamp(numbers[3], 15, 110) };
-      this.mode = "inside"; // keeps this direction
-      this.stepInside(this.panoramas[numbers[0]], true);
-      return true;
-    }
-    if (kind === "p" && numbers.length === 3) {
-      this.plan();
-      [this.above.position.x, this.above.position.z, this.above.zoom] = numbers;
-      [this.glide.target.x, this.glide.target.z] = numbers;
-      this.resize();
-      return true;
-    }
-    if (kind === "o" && numbers.length === 6) {
-      this.overview();
-      this.eye.position.fromArray(numbers);
-      this.orbit.target.fromArray(numbers, 3);
-      this.orbit.update();
-      return true;
-    }
-    return false;
   }
 
   // --- Drawing ---
 
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.resolution);
     this.renderer.setSize(width, height, false);
     this.eye.aspect = width / height;
     this.eye.updateProjectionMatrix();
@@ -452,13 +385,24 @@ class Page {
 
   frame(now) {
     requestAnimationFrame((next) => this.frame(next));
-    if (this.move) this.changed();
+    if (this.move) this.moved();
+    const pace = this.pace.moving(now) ? this.pace.frame(now) : this.loading ? PACES[3] : this.pace.frame(now);
+    if (pace.resolution !== this.resolution || (pace === PACES[0] && this.coarse)) {
+      this.coarse = false;
+      if (pace.resolution !== this.resolution) {
+        this.resolution = pace.resolution;
+        this.resize();
+      }
+      this.changed();
+    }
     if (!this.dirty) return;
     this.dirty = false;
-    const t = this.move ? Math.min(1, (now - this.move.began) / this.move.length) : 1;
+    this.coarse = pace !== PACES[0];
+    const t = this.move ? Math.min(1, Math.max(0, (now - this.move.began) / this.move.length)) : 1;
     const smooth = t * t * (3 - 2 * t);
     if (this.mode === "inside" || this.move) this.lookFrom(smooth);
-    this.draw(smooth);
+    this.draw(smooth, pace);
+    if (this.settled) this.firstComplete ??= performance.now(); // for measurements
     if (this.move && t >= 1) {
       this.move = null;
       if (this.mode !== "inside") this.enter("inside");
@@ -467,6 +411,14 @@ class Page {
       this.changed();
     }
   }
+
+  /** Whether everything that the view needs was loaded and drawn. */
+  get settled() {
+    return !this.dirty && !this.move && !this.wanted && !this.coarse && !this.loading && !this.here?.loading;
+  }
+
+  /** Whether parts of the scene are on their way. */
+  get loading() { return this.cloud.loading + (this.surface?.loading ?? 0) > 0; }
 
   /** Place the eye: within a panorama, or on the way to one. */
   lookFrom(t) {
@@ -481,32 +433,39 @@ class Page {
     this.eye.updateMatrixWorld();
   }
 
-  draw(t) {
+  draw(t, pace) {
     const { renderer, camera } = this;
-    const height = this.canvas.clientHeight;
+    const height = this.canvas.clientHeight * renderer.getPixelRatio();
     renderer.setClearColor(getComputedStyle(document.documentElement).getPropertyValue("--ground").trim());
     renderer.clear();
     camera.updateMatrixWorld();
-    if (this.mode === "inside") this.drawPanoramas(t, height);
-    else {
-      this.cloud.update(camera, height * renderer.getPixelRatio());
-      renderer.render(this.world, camera);
-    }
+    if (this.mode === "inside" || this.move) this.drawPanoramas(t, height, pace);
+    else this.drawWorld(height, pace);
     renderer.clearDepth();
     for (const ring of this.rings) ring.scale.setScalar(camera === this.above ? (0.05 * this.halfHeight) / this.above.zoom : 0.04 * Math.tan(THREE.MathUtils.degToRad(this.eye.fov) / 2));
     renderer.render(this.marks, camera);
-    this.ruler.place(camera, this.canvas.clientWidth, height);
+    this.ruler.place(camera, this.canvas.clientWidth, this.canvas.clientHeight);
+    const forward = this.eye.getWorldDirection(new THREE.Vector3());
+    this.map.look(this.mode === "plan" ? null : this.eye.position, Math.atan2(forward.x, -forward.z));
   }
 
-  drawPanoramas(t, height) {
+  drawWorld(height, pace) {
+    if (this.surfaceShown) this.surface.detail(pace.coarse);
+    else this.cloud.update(this.camera, height, pace.points);
+    this.renderer.render(this.world, this.camera);
+  }
+
+  drawPanoramas(t, height, pace) {
     const { move, here, renderer, eye } = this;
-    if (!move) here.update(eye, height * renderer.getPixelRatio());
-    here.fade(1);
-    renderer.render(here.group, eye);
-    if (!move?.from) return;
-    renderer.clearDepth();
-    move.from.fade(1 - t);
-    renderer.render(move.from.group, eye);
+    here.update(eye, (height / this.resolution));
+    here.fromElsewhere(Boolean(move), move?.from);
+    move?.from?.fromElsewhere(true, here);
+    if (!move) return renderer.render(here.group, eye);
+    if (move.flight) this.drawWorld(height, pace);
+    const opacity = move.flight ? THREE.MathUtils.smoothstep(t, 0.55, 1) : 1;
+    const scene = !move.flight && this.surfaceShown && this.surface.ready ? this.world : null;
+    if (scene) this.surface.detail(true);
+    this.walkView.draw(move.from, move.to, scene, eye, { t, opacity });
   }
 }
 

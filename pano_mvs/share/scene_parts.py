@@ -1,0 +1,199 @@
+"""The parts of a scene that are written into a page: cloud, mesh, map and cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pano_mvs.geometry import Rigid3
+from pano_mvs.results.run_output import RunView
+from pano_mvs.scene import PointCloud
+from pano_mvs.share.encoding import (
+    LogSteps,
+    encode_arrays,
+    encode_jpeg,
+    encode_png,
+    encode_points,
+    encode_ranges,
+    log_steps,
+)
+from pano_mvs.share.mesh_file import SharedMesh
+from pano_mvs.share.mesh_pieces import VertexFacts, mesh_pieces
+from pano_mvs.share.octree import octree
+from pano_mvs.share.options import ShareOptions
+from pano_mvs.share.page_folder import PageFolder
+from pano_mvs.share.plan_file import StoreyMap
+from pano_mvs.share.tiles import level_count, panorama_tiles
+from pano_mvs.share.top_view import MapPlace, cut_height, place_around, top_view
+
+RANGES_HW = (256, 512)
+"""Size of the range map that the page walks and measures on."""
+
+MAX_TEXTURE = 4096
+"""Largest width and height of the texture of a mesh, which all graphics processors in use can hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownCloud:
+    """A cloud as the page shows it.
+
+    Attributes:
+        cloud: thinned, in the frame of the page.
+        sigmas: standard deviations of its points in logarithmic steps.
+    """
+
+    cloud: PointCloud
+    sigmas: LogSteps
+
+    def facts(self, vertices: NDArray[np.float32]) -> VertexFacts:
+        """Return what is known of the nearest point of each vertex; nothing if the cloud is empty."""
+        if not len(self.cloud) or not len(vertices):
+            return VertexFacts(np.zeros(len(vertices), np.uint8), np.zeros(len(vertices), np.uint8))
+        nearest = cKDTree(self.cloud.points_in_world).query(vertices)[1]
+        return VertexFacts(self.sigmas.steps[nearest].astype(np.uint8), self.cloud.view_counts[nearest])
+
+
+def shown_cloud(cloud: PointCloud | None, frame: Rigid3, *, max_points: int) -> ShownCloud:
+    """Return a cloud with at most `max_points` points, drawn at random, in the frame of the page.
+
+    Args:
+        cloud: of one group; None for an empty one.
+        frame: page_from_world.
+        max_points: 0 for all.
+    """
+    if cloud is None:
+        empty = np.zeros((0, 3), np.float32)
+        cloud = PointCloud(empty, empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
+    chosen = np.arange(len(cloud))
+    if 0 < max_points < len(cloud):
+        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), max_points, replace=False))
+    turned = PointCloud(
+        frame.apply(cloud.points_in_world[chosen]).astype(np.float32),
+        (cloud.normals_in_world[chosen] @ frame.rotation.T).astype(np.float32),
+        cloud.colors_rgb[chosen],
+        cloud.view_counts[chosen],
+    )
+    sigmas = cloud.uncertainty[chosen] if cloud.uncertainty is not None else np.zeros(len(chosen))
+    return ShownCloud(turned, log_steps(sigmas, np.uint8))
+
+
+def put_cloud(page: PageFolder, shown: ShownCloud) -> dict[str, Any]:
+    """Write the octree; return its nodes and the box that holds all but the outermost percent of the points."""
+    points = shown.cloud.points_in_world
+    nodes = octree(points)
+    for node in nodes:
+        page.put(f"cloud/{node.name}", encode_points(node, shown.cloud, shown.sigmas.steps))
+    return {
+        "nodes": [
+            {"name": node.name, "lower": node.lower.tolist(), "size": node.size, "count": len(node.chosen)}
+            for node in nodes
+        ],
+        "bounds": np.percentile(points, [1, 99], axis=0).astype(float).tolist() if len(points) else [],
+        "sigmas": [shown.sigmas.low, shown.sigmas.high],
+        "coverage": bool(shown.cloud.view_counts.any()),
+    }
+
+
+def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_quality: int) -> dict[str, Any]:
+    """Write the pieces and the texture of a mesh in the frame of the page; return what the page needs to know of it."""
+    described = []
+    for idx, (piece, text) in enumerate(mesh_pieces(mesh, shown.facts(mesh.vertices))):
+        page.put(f"mesh/{idx}", text)
+        described.append(piece)
+    if mesh.texture is not None:
+        shrink = min(1.0, MAX_TEXTURE / max(mesh.texture.shape[:2]))
+        size = (max(1, round(mesh.texture.shape[1] * shrink)), max(1, round(mesh.texture.shape[0] * shrink)))
+        texture = mesh.texture if shrink == 1 else cv2.resize(mesh.texture, size, interpolation=cv2.INTER_AREA)
+        page.put("mesh/texture", encode_jpeg(np.asarray(texture, np.uint8), jpeg_quality))
+    return {
+        "pieces": described,
+        "textured": mesh.texture is not None,
+        "bounds": np.percentile(mesh.vertices, [1, 99], axis=0).astype(float).tolist(),
+    }
+
+
+def put_maps(
+    page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], *, centers: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    """Write the floor plans, or without them the cloud from above; return where they lie.
+
+    Args:
+        page: the page.
+        shown: the cloud, which also gives the coverage.
+        plans: of the storeys; may be empty.
+        centers: (N, 3) of the cameras in the page.
+    """
+    if plans:
+        return [
+            _put_map(page, number, plan.place, colors=encode_png(plan.picture), shown=shown, heights=plan.heights)
+            for number, plan in enumerate(plans)
+        ]
+    if not len(shown.cloud):
+        return []
+    place = place_around(shown.cloud.points_in_world, centers)
+    heights = (-np.inf, cut_height(shown.cloud.points_in_world, centers))
+    colors = encode_png(top_view(shown.cloud, place, heights)[0])
+    return [_put_map(page, 0, place, colors=colors, shown=shown, heights=heights)]
+
+
+def _put_map(
+    page: PageFolder,
+    number: int,
+    place: MapPlace,
+    *,
+    colors: str,
+    shown: ShownCloud,
+    heights: tuple[float, float],
+) -> dict[str, Any]:
+    page.put(f"map/{number}/colors", colors)
+    coverage = top_view(shown.cloud, place, heights)[1] if len(shown.cloud) else None
+    if coverage is not None:
+        page.put(f"map/{number}/coverage", encode_png(coverage))
+    return {
+        "page_from_map": [*place.corner.tolist(), *place.right.tolist(), *place.down.tolist()],
+        "aspect": float(np.linalg.norm(place.right) / np.linalg.norm(place.down)),
+        "coverage": coverage is not None,
+        "heights": list(heights) if np.isfinite(heights).all() else None,
+    }
+
+
+def put_camera(
+    page: PageFolder,
+    idx: int,
+    *,
+    view: RunView | None,
+    image: NDArray[np.uint8] | None,
+    cam_from_page: Rigid3,
+    options: ShareOptions,
+) -> dict[str, Any]:
+    """Write the tiles, the ranges and their uncertainty of a panorama; return what the page needs to know of it."""
+    levels = level_count(image.shape[1], options.max_width) if image is not None else 0
+    if image is not None:
+        for level, column, row, tile in panorama_tiles(image, levels):
+            page.put(f"panorama/{idx}/{level}-{column}-{row}", encode_jpeg(tile, options.jpeg_quality))
+    ranges = view.range_map if view is not None else None
+    text, low, high = encode_ranges(reduced(ranges)) if ranges is not None else ("", 1.0, 2.0)
+    if text:
+        page.put(f"panorama/{idx}/ranges", text)
+    relative = view.uncertainty if view is not None and text else None
+    sigmas = log_steps(reduced(relative), np.uint8) if relative is not None else None
+    if sigmas is not None:
+        page.put(f"panorama/{idx}/sigmas", encode_arrays(sigmas.steps))
+    return {
+        "center": cam_from_page.center.tolist(),
+        "page_from_cam": cam_from_page.rotation.T.tolist(),
+        "levels": levels,
+        "ranges": [low, high] if text else None,
+        "sigmas": [sigmas.low, sigmas.high] if sigmas is not None else None,
+    }
+
+
+def reduced(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a map at the size of the page's: single values, because a mean of two surfaces lies on neither."""
+    return np.asarray(cv2.resize(values, RANGES_HW[::-1], interpolation=cv2.INTER_NEAREST_EXACT), np.float32)

@@ -1,0 +1,98 @@
+"""How soon a shared page shows its first complete picture, and how often it draws while it is turned.
+
+    python -m tests.benchmarks.shared_page PAGE [--browser firefox] [--seconds 5]
+
+PAGE is a folder that `pano-mvs share` wrote. The browsers draw in software. Beside the frames per second stands the
+processor time of the browser per frame, which depends less on what else the machine does: with two free cores, 60 ms
+allow 30 frames per second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+from pathlib import Path
+
+from tests.share.browser import Browser, open_browser
+
+_READY = "typeof PanoMvs === 'object' && PanoMvs.page && PanoMvs.page.settled"
+# The page adapts within the first second; it is not counted.
+_TURN = """new Promise((resolve) => {
+  const page = PanoMvs.page, vertical = new THREE.Vector3(0, 1, 0), times = [], end = performance.now() + %d;
+  const step = (now) => {
+    times.push(now);
+    if (page.mode === "inside") page.turn(0.01, 0);
+    else {
+      page.eye.position.sub(page.orbit.target).applyAxisAngle(vertical, 0.01).add(page.orbit.target);
+      page.orbit.update();
+    }
+    if (now < end) requestAnimationFrame(step);
+    else resolve([times.length - 1, times.at(-1) - times[0], page.pace.step]);
+  };
+  requestAnimationFrame(step);
+})"""
+_SURFACE = "(PanoMvs.page.showSurface(true), PanoMvs.page.overview(), PanoMvs.page.surfaceShown)"
+_POINTS = "(PanoMvs.page.showSurface(false), PanoMvs.page.overview(), PanoMvs.page.cloud.total > 0)"
+_INSIDE = "PanoMvs.page.nearest() ? PanoMvs.page.stepInside(PanoMvs.page.nearest(), true).then(() => true) : false"
+_VIEWS = {"surface": _SURFACE, "points": _POINTS, "inside": _INSIDE}
+
+
+def main() -> None:
+    """Measure a page and print the figures as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", type=Path)
+    parser.add_argument("--browser", choices=("chromium", "firefox"), default="chromium")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of turning per view")
+    parser.add_argument("--openings", type=int, default=5)
+    given = parser.parse_args()
+    with open_browser(given.browser, width=1280, height=720) as browser:
+        opened = [_opening_ms(browser, given.page / "index.html") for _ in range(given.openings)]
+        middle, worst = statistics.median(opened), max(opened)
+        print(f"first complete picture: median {middle:.0f} ms of {len(opened)}, worst {worst:.0f} ms\n")
+        print("| view | frames/s | CPU ms/frame | pace |\n|---|---|---|---|")
+        for name, script in _VIEWS.items():
+            if browser.evaluate(f"(async () => {script})()"):
+                print(f"| {name} | {' | '.join(_turning(browser, given.seconds))} |", flush=True)
+        print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def _opening_ms(browser: Browser, page: Path) -> float:
+    browser.open("about:blank")
+    browser.open(page.resolve().as_uri())
+    browser.wait(_READY)
+    return float(browser.evaluate("PanoMvs.page.firstComplete"))
+
+
+def _turning(browser: Browser, seconds: float) -> list[str]:
+    """Return frames per second, processor time per frame, and the step of the page's pace, after it has adapted."""
+    browser.wait(_READY)
+    browser.evaluate(_TURN % 1500)
+    before = _cpu_s(os.getpid())
+    frames, took_ms, pace = browser.evaluate(_TURN % (1000 * seconds))
+    spent = _cpu_s(os.getpid()) - before
+    return [f"{1000 * frames / took_ms:.1f}", f"{1000 * spent / frames:.0f}", f"{pace:.0f}"]
+
+
+def _cpu_s(process: int) -> float:
+    """Return the processor time of all descendants of a process that are alive (Linux)."""
+    children: dict[int, list[int]] = {}
+    ticks: dict[int, int] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue  # it has ended
+        number = int(folder.name)
+        children.setdefault(int(fields[1]), []).append(number)
+        ticks[number] = int(fields[11]) + int(fields[12])
+    pending, total = list(children.get(process, [])), 0
+    while pending:
+        number = pending.pop()
+        total += ticks[number]
+        pending += children.get(number, [])
+    return total / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()
