@@ -14,7 +14,7 @@ from pano_mvs.geometry import Rigid3
 Spacing = Literal["parallax", "inverse", "log", "uniform"]
 
 # A surface this near, as a share of the mean baseline, is expected anywhere …
-_NEAREST_BASELINES = 0.25
+_NEAREST_BASELINES = 0.5
 # … and a point this much parallax away from infinity looks the same as one at infinity.
 _MIN_PARALLAX_PX = 0.5
 
@@ -71,7 +71,7 @@ def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, floa
         width: columns of the reference picture: one pixel at the equator is 2π/width.
 
     Returns:
-        (near, far): a quarter of the mean baseline, and the range b / (½ px), where b is the longest baseline, at which
+        (near, far): half of the mean baseline, and the range b / (½ px), where b is the longest baseline, at which
         parallax falls under half a pixel; the images do not constrain ranges beyond it.
 
     Raises:

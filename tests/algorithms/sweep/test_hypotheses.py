@@ -65,7 +65,7 @@ def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
 
 def test_the_baselines_and_the_resolution_decide() -> None:
     near, far = range_limits([0.0, 0.2, 1.0], width=1024)
-    assert near == pytest.approx(0.15)
+    assert near == pytest.approx(0.3)
     parallax_px = np.arctan(1.0 / far) / (2 * np.pi / 1024)
     assert parallax_px == pytest.approx(0.5, rel=1e-3)
     assert range_limits([0.4, 2.0], width=1024) == pytest.approx((2 * near, 2 * far))

@@ -38,7 +38,7 @@ def test_limits_hold_what_there_is_without_wasting_planes(capture: Capture) -> N
     pictures, poses, truth = capture
     near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
     nearest, farthest = np.nanquantile(truth[0], [0.01, 0.99])
-    assert min(nearest / 3, 0.2 * mean_baseline(poses)) < near < nearest
+    assert min(nearest / 3, 0.4 * mean_baseline(poses)) < near < nearest
     assert farthest < far < 3 * farthest
 
 
@@ -53,9 +53,9 @@ def test_the_near_limit_reaches_a_desk_within_the_baseline(top: Texture) -> None
 
 
 def test_something_near_is_possible_where_nothing_near_agrees(capture: Capture) -> None:
-    """A surface without texture, which no small sweep finds, may still be as near as a quarter of a baseline."""
+    """A surface without texture, which no small sweep finds, may still be as near as half a baseline."""
     pictures, poses, _ = capture
-    assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.25 * mean_baseline(poses)
+    assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.5 * mean_baseline(poses)
 
 
 def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
