@@ -199,7 +199,15 @@ def corridor(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: fl
     return _scene("corridor", room, views=views, turned=turned, centers=centers, exposure=exposure)
 
 
-def desk(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
+def desk(
+    *,
+    seed: int = 0,
+    views: int = 4,
+    turned: bool = True,
+    exposure: float = 0.0,
+    reach: float = 1.0,
+    top: Texture = "strong",
+) -> Scene:
     """Return a room of 6 × 2.9 × 5 with cameras 0.42 above a large desk: the baselines are longer than that.
 
     Straight below the cameras, most sources see the desk at 45–80° from the reference's direction.
@@ -209,10 +217,12 @@ def desk(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float 
         views: number of cameras, about 0.9 apart.
         turned: whether every camera is rotated arbitrarily.
         exposure: as in `courtyard`.
+        reach: factor of the distances between the cameras; with 1.6, the desk is at 0.2 to 0.5 baselines.
+        top: texture of the desk top.
     """
     surfaces: list[Painted] = [
         (Cuboid((-3.0, -1.7, -2.5), (3.0, 1.2, 2.5), STONE), "strong"),
-        (Cuboid((-1.8, 0.42, -1.1), (1.8, 0.46, 1.1), OAK), "strong"),
+        (Cuboid((-1.8, 0.42, -1.1), (1.8, 0.46, 1.1), OAK), top),
         (Cuboid((-1.2, 0.36, 0.3), (-0.9, 0.42, 0.7), BLUE), "strong"),
         (Cuboid((0.5, 0.37, -0.6), (0.75, 0.42, -0.2), BRICK), "strong"),
         (Ball((0.2, 0.39, 0.75), 0.03, LEAVES), "strong"),
@@ -224,7 +234,8 @@ def desk(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float 
         (Rod((x, 0.46, z), (x, 1.2, z), 0.04, OAK), "strong") for x, z in ((-1.6, -0.9), (1.6, -0.9), (1.6, 0.9))
     ]
     room = _painted("desk", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
-    return _scene("desk", room, views=views, turned=turned, spread=(0.9, 0.06, 0.6), exposure=exposure)
+    spread = 0.9 * reach, 0.06 * reach, 0.6 * reach
+    return _scene("desk", room, views=views, turned=turned, spread=spread, exposure=exposure)
 
 
 def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.geometry import Rigid3
@@ -32,6 +33,17 @@ class SweepCase:
     source_from_reference: tuple[Rigid3, ...]
     masks: tuple[NDArray[np.bool_], ...]
     settings: SweepSettings
+
+    @property
+    def ranges(self) -> NDArray[np.float64]:
+        """The depth hypotheses, (D,)."""
+        return virtual_ranges(
+            NEAR,
+            FAR,
+            planes=self.settings.planes,
+            spacing=self.settings.spacing,
+            baseline=mean_baseline_of(self.source_from_reference),
+        )
 
     def swept(self, backend: str, *, device: str = "auto") -> RangeMap:
         """Return the range map that a backend computes."""
@@ -60,7 +72,7 @@ def sweep_case(number: int) -> SweepCase:
     rng = np.random.default_rng([2026, number])
     cost, combination, aggregation = _COMBINED[number]
     settings = SweepSettings(planes=int(rng.integers(3, 24))).replace(
-        spacing=str(rng.choice(["inverse", "log", "uniform"])),
+        spacing=str(rng.choice(["parallax", "inverse", "log", "uniform"])),
         cost=cost,
         window=int(rng.choice([3, 5, 7])),
         spherical_window=bool(rng.integers(2)),
@@ -97,21 +109,22 @@ def agreement(number: int, backend: str, *, device: str = "auto") -> float:
     """
     found = sweep_case(number).swept(backend, device=device)
     found.check()
-    return share_alike(found, _by_numpy(number), sweep_case(number).settings)
+    return share_alike(found, _by_numpy(number), sweep_case(number).ranges)
 
 
-def share_alike(one: RangeMap, other: RangeMap, settings: SweepSettings) -> float:
-    """Return the share of pixels within half a level of each other, or without a range in both."""
+def share_alike(one: RangeMap, other: RangeMap, ranges: NDArray[np.float64]) -> float:
+    """Return the share of pixels within half a level of each other, or without a range in both.
+
+    Args:
+        one: a range map.
+        other: another one of the same size.
+        ranges: the depth hypotheses, (D,).
+    """
     with np.errstate(invalid="ignore"):
-        close = np.abs(_level(one, settings) - _level(other, settings)) < 0.5
+        close = np.abs(plane_position(one.range, ranges) - plane_position(other.range, ranges)) < 0.5
     return float((close | (np.isnan(one.range) & np.isnan(other.range))).mean())
 
 
-def _level(range_map: RangeMap, settings: SweepSettings) -> NDArray[np.float64]:
-    """Return the positions of the ranges between the planes, (H, W)."""
-    ranges = range_map.range.astype(np.float64)
-    scaled = {"inverse": 1 / ranges, "log": np.log(ranges), "uniform": ranges}[settings.spacing]
-    near, far = {"inverse": (1 / NEAR, 1 / FAR), "log": (np.log(NEAR), np.log(FAR)), "uniform": (NEAR, FAR)}[
-        settings.spacing
-    ]
-    return np.asarray((scaled - near) / (far - near) * (settings.planes - 1))
+def plane_position(found: NDArray[np.float32], ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the positions of ranges between the depth hypotheses, (D,), of any shape; 1/range is interpolated."""
+    return np.interp(-1 / found.astype(np.float64), -1 / ranges, np.arange(len(ranges)))

@@ -91,8 +91,7 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     reason = _why_not(work, winners, row=row, column=column, masked=masked)
     found = range_map_from_winners(
         winners,
-        near=float(work.ranges[0]),
-        far=float(work.ranges[-1]),
+        range_at=work.range_at,
         settings=work.settings,
         seen=np.full((1, 1), not reason),
     )

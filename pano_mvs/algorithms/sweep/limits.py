@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend
-from pano_mvs.algorithms.sweep.hypotheses import range_limits
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_limits
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
@@ -27,7 +27,8 @@ _PLANES = 96
 # Heavier penalties than those of a sweep for its own sake: surfaces must agree, not details.
 _P1, _P2 = 80, 1600
 _MAX_PICTURES = 5
-_NEAREST_BASELINES = 0.15
+# The small sweeps begin at this share of the mean baseline.
+_NEAREST_BASELINES = 0.05
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
 _MIN_SHARE = 0.01
@@ -35,7 +36,7 @@ _MIN_SHARE = 0.01
 # or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
 _OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
 # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
-_MIN_CONTRAST = 10
+_MIN_CONTRAST = 4
 
 
 def limits_by_sweeping(
@@ -93,8 +94,8 @@ def limits_by_sweeping(
     if solid_angle[agreed].sum() <= _MIN_SHARE * seen_angle:
         return range_limits(_baselines(0, poses), width=width)
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
-    near, far = _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
-    farthest = range_limits(_baselines(0, poses), width=width)[1]
+    nearest, farthest = range_limits(_baselines(0, poses), width=width)
+    near, far = _outward(min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far)
     open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
     return near, max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
 
@@ -112,7 +113,7 @@ def _coarse(
     """Return the small range map of one of the pictures, swept against all others."""
     baselines = _baselines(idx, poses)
     others = [other for other, baseline in enumerate(baselines) if baseline > 0]
-    near = _NEAREST_BASELINES * max(baselines)
+    near = _NEAREST_BASELINES * mean_baseline(baselines)
     far = range_limits(baselines, width=width)[1]
     return sweep_range(
         pictures[idx],

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -40,6 +41,23 @@ class SweepInput:
     ranges: NDArray[np.float64]
     settings: SweepSettings
     device: str = "auto"
+
+    @property
+    def baseline(self) -> float:
+        """Mean distance of the sources from the reference, for the spacing "parallax"."""
+        return mean_baseline_of(self.source_from_reference)
+
+    def range_at(self, positions: ArrayLike) -> NDArray[np.float64]:
+        """Return the range at positions between the depth hypotheses, of any shape."""
+        settings = self.settings
+        return range_at(
+            positions,
+            float(self.ranges[0]),
+            float(self.ranges[-1]),
+            planes=settings.planes,
+            spacing=settings.spacing,
+            baseline=self.baseline,
+        )
 
 
 def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:

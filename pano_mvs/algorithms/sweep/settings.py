@@ -31,8 +31,10 @@ class SweepSettings:
     """
 
     planes: int = setting(128, ge=3, le=4096, doc="number of depth hypotheses")
-    spacing: Literal["inverse", "log", "uniform"] = setting(
-        "inverse", doc="spacing of the depth hypotheses: even in 1/range, log range, or range (the paper)"
+    spacing: Literal["parallax", "inverse", "log", "uniform"] = setting(
+        "parallax",
+        doc="spacing of the depth hypotheses: even in 1/range beyond the baseline and in log range within it, or "
+        "everywhere in 1/range, log range, or range (the paper)",
     )
     cost: str = setting(
         "census",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.registry import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
-from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
 from pano_mvs.algorithms.sweep.no_match import has_match
 from pano_mvs.algorithms.sweep.preparation import (
     SweepInput,
@@ -95,7 +95,7 @@ def sweep_range(
     seen = seen & sees_winner(winners, work)
     if settings.no_match == "invalid":
         seen &= has_match(winners, work)
-    return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
+    return range_map_from_winners(winners, range_at=work.range_at, settings=settings, seen=seen)
 
 
 def sweep_input(
@@ -114,7 +114,13 @@ def sweep_input(
     """Return what a backend is given for a sweep, checked and prepared; arguments and errors of `sweep_range`."""
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
-    ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
+    ranges = virtual_ranges(
+        near,
+        far,
+        planes=settings.planes,
+        spacing=settings.spacing,
+        baseline=mean_baseline_of(source_from_reference),
+    )
     if settings.exposure and settings.matching_cost.minds_exposure:
         rough = _rough_range(
             reference,
@@ -156,7 +162,9 @@ def _rough_range(
 
     `masks` are those of the reference and of the sources.
     """
-    settings = SweepSettings(planes=_ROUGH_PLANES, cost="census", window=5, aggregation="box", no_match="keep")
+    settings = SweepSettings(
+        planes=_ROUGH_PLANES, spacing="inverse", cost="census", window=5, aggregation="box", no_match="keep"
+    )
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     small_reference = shrink(reference, _ROUGH_ROWS)
     sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.hypotheses import range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
 
@@ -63,15 +63,18 @@ class Winners:
 
 
 def range_map_from_winners(
-    winners: Winners, *, near: float, far: float, settings: SweepSettings, seen: NDArray[np.bool_]
+    winners: Winners,
+    *,
+    range_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    settings: SweepSettings,
+    seen: NDArray[np.bool_],
 ) -> RangeMap:
     """Return the range and the confidence of every pixel, NaN and 0 where it was not seen.
 
     Args:
         winners: of all pixels.
-        near: the nearest depth hypothesis.
-        far: the last one.
-        settings: planes, spacing, selection and confidence.
+        range_at: returns the ranges at positions between the planes, see `SweepInput.range_at`.
+        settings: planes, selection and confidence.
         seen: (H, W) where the reference is valid and at least one source saw the winner.
     """
     result, sure = np.empty(seen.shape, np.float32), np.empty(seen.shape, np.uint8)
@@ -81,8 +84,7 @@ def range_map_from_winners(
         position = some.position
         if settings.selection != "winner":
             position += subplane_offset(some, planes=settings.planes, shape=settings.selection)
-        ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
-        result[rows] = np.where(seen[rows], ranges, np.nan)
+        result[rows] = np.where(seen[rows], range_at(position), np.nan)
         sure[rows] = np.where(seen[rows], confidence(some, measure=settings.confidence), 0)
     return RangeMap(result, sure)
 

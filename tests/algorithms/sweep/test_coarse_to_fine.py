@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_guided_rows, follow_guided_strip
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates, split_layers
-from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
 from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, spread_tiles, tile_means
@@ -49,7 +49,8 @@ def _sweep(
 
 def _work(height: int, settings: SweepSettings) -> SweepInput:
     pictures, poses, _ = _capture(height)
-    ranges = virtual_ranges(NEAR, FAR, planes=settings.planes, spacing=settings.spacing)
+    baseline = mean_baseline_of(poses)
+    ranges = virtual_ranges(NEAR, FAR, planes=settings.planes, spacing=settings.spacing, baseline=baseline)
     prepared = [prepare_picture(picture, settings) for picture in pictures]
     return SweepInput(prepared[0], tuple(prepared[1:]), tuple(poses), None, ranges, settings)
 

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from pano_mvs.algorithms.sweep.hypotheses import Spacing, range_at, range_limits, virtual_ranges
 from pano_mvs.core.errors import UsageError
 
-SPACINGS = ("inverse", "log", "uniform")
+SPACINGS = ("parallax", "inverse", "log", "uniform")
 
 
 @given(
     near=st.floats(1e-3, 1e3), ratio=st.floats(1.01, 1e4), planes=st.integers(3, 300), spacing=st.sampled_from(SPACINGS)
 )
 def test_virtual_ranges_ascend_from_near_to_far(near: float, ratio: float, planes: int, spacing: Spacing) -> None:
-    ranges = virtual_ranges(near, near * ratio, planes=planes, spacing=spacing)
+    ranges = virtual_ranges(near, near * ratio, planes=planes, spacing=spacing, baseline=2.0)
     assert ranges.shape == (planes,)
     assert ranges[0] == pytest.approx(near)
     assert ranges[-1] == pytest.approx(near * ratio)
@@ -33,18 +33,42 @@ def test_virtual_ranges_are_even_in_what_the_spacing_names(spacing: Spacing, eve
     np.testing.assert_allclose(steps, steps[0])
 
 
+def test_parallax_is_even_in_inverse_range_far_away_and_in_log_range_nearby() -> None:
+    near, far, baseline = 0.05, 50.0, 1.0
+    ranges = virtual_ranges(near, far, planes=200, spacing="parallax", baseline=baseline)
+    distant, close = ranges > 10 * baseline, ranges < baseline / 10
+    assert distant.sum() > 3
+    assert close.sum() > 10
+    np.testing.assert_allclose(np.diff(1 / ranges[distant]), np.diff(1 / ranges)[-1], rtol=0.01)
+    np.testing.assert_allclose(np.diff(np.log(ranges[close])), np.diff(np.log(ranges))[0], rtol=0.01)
+
+
+def test_planes_at_a_tenth_of_the_baseline_leave_the_others_their_distances() -> None:
+    """Even in 1/range, a near limit of a tenth instead of a half would take four fifths of the planes."""
+    settings: dict[str, Any] = {"planes": 128, "spacing": "parallax", "baseline": 1.0}
+    beyond = [np.sum(virtual_ranges(near, 20.0, **settings) > 0.5) for near in (0.5, 0.1)]
+    assert beyond[1] > 0.45 * beyond[0]
+
+
+def test_without_a_baseline_parallax_is_even_in_inverse_range() -> None:
+    expected = virtual_ranges(0.3, 9.0, planes=50, spacing="inverse")
+    np.testing.assert_array_equal(virtual_ranges(0.3, 9.0, planes=50, spacing="parallax"), expected)
+    small = virtual_ranges(0.3, 9.0, planes=50, spacing="parallax", baseline=1e-4)
+    np.testing.assert_allclose(small, expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize("limits", [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
 def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="0 < near < far"):
         range_at([0.0], *limits, planes=8, spacing="inverse")
 
 
-def test_the_longest_baseline_and_the_resolution_decide() -> None:
-    near, far = range_limits([0.2, 1.0], width=1024)
+def test_the_baselines_and_the_resolution_decide() -> None:
+    near, far = range_limits([0.0, 0.2, 1.0], width=1024)
     assert near == pytest.approx(0.3)
     parallax_px = np.arctan(1.0 / far) / (2 * np.pi / 1024)
     assert parallax_px == pytest.approx(0.5, rel=1e-3)
-    assert range_limits([2.0], width=1024) == pytest.approx((2 * near, 2 * far))
+    assert range_limits([0.4, 2.0], width=1024) == pytest.approx((2 * near, 2 * far))
 
 
 @pytest.mark.parametrize("baselines", [[], [0.0], [np.nan]])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -8,7 +10,9 @@ from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, roll_panorama
+from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.scenes import desk
 
 Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], list[NDArray[np.float32]]]
 
@@ -26,12 +30,32 @@ def no_masks(count: int) -> list[NDArray[np.bool_]]:
     return [np.ones(SIZE_HW, np.bool_)] * count
 
 
+def mean_baseline(poses: Sequence[Rigid3]) -> float:
+    return float(np.mean([np.linalg.norm(pose.center - poses[0].center) for pose in poses[1:]]))
+
+
 def test_limits_hold_what_there_is_without_wasting_planes(capture: Capture) -> None:
     pictures, poses, truth = capture
     near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
     nearest, farthest = np.nanquantile(truth[0], [0.01, 0.99])
-    assert nearest / 3 < near < nearest
+    assert min(nearest / 3, 0.4 * mean_baseline(poses)) < near < nearest
     assert farthest < far < 3 * farthest
+
+
+@pytest.mark.parametrize("top", ["strong", "weak"])
+def test_the_near_limit_reaches_a_desk_within_the_baseline(top: Texture) -> None:
+    scene = desk(seed=3, views=4, reach=1.6, top=top)
+    views = [scene.view(idx, SIZE_HW, supersample=1) for idx in range(4)]
+    near, _ = limits_by_sweeping([image for image, _ in views], scene.poses, masks=no_masks(4))
+    nearest = np.nanmin(views[0][1])
+    assert nearest < 0.4 * mean_baseline(scene.poses)
+    assert 0.4 * nearest < near < nearest
+
+
+def test_something_near_is_possible_where_nothing_near_agrees(capture: Capture) -> None:
+    """A surface without texture, which no small sweep finds, may still be as near as half a baseline."""
+    pictures, poses, _ = capture
+    assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.5 * mean_baseline(poses)
 
 
 def test_limits_follow_the_unit_of_length(capture: Capture) -> None:

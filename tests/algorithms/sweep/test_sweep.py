@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.sweep_backends import plane_position
 
 NEAR, FAR = 0.5, 6.0
 FAST = SweepSettings(planes=24, window=5)
@@ -111,10 +113,10 @@ def test_a_tiny_sweep_equals_the_readable_one(changes: dict[str, str]) -> None:
 
 
 def _position(ranges: NDArray[np.float32], settings: SweepSettings) -> NDArray[np.float64]:
-    scales: dict[str, Callable[[Any], Any]] = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}
-    scale = scales[settings.spacing]
-    result: NDArray[np.float64] = (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)
-    return result
+    _, poses, _ = _capture(16)  # the same at any size
+    baseline = mean_baseline_of(poses)
+    hypotheses = virtual_ranges(NEAR, FAR, planes=settings.planes, spacing=settings.spacing, baseline=baseline)
+    return plane_position(ranges, hypotheses)
 
 
 @pytest.mark.parametrize("settings", [FAST, PAPER, FAST.replace(aggregation="box")])
@@ -211,8 +213,9 @@ def test_masked_pixels_have_no_range_and_no_vote(backend: str) -> None:
     assert np.isfinite(result.range[:18]).all()
     nobody = [np.zeros((32, 64), np.bool_)] * 2
     assert np.isnan(_sweep(pictures, poses, backend=backend, source_masks=nobody).range).all()
-    only_second = _sweep(pictures, poses, backend=backend, source_masks=[nobody[0], None])
-    alone = _sweep((pictures[0], pictures[2]), poses[1:], backend=backend)
+    even = FAST.replace(spacing="inverse")  # the planes of "parallax" depend on all sources
+    only_second = _sweep(pictures, poses, even, backend=backend, source_masks=[nobody[0], None])
+    alone = _sweep((pictures[0], pictures[2]), poses[1:], even, backend=backend)
     np.testing.assert_allclose(only_second.range, alone.range, rtol=1e-5)
 
 

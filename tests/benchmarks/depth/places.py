@@ -61,6 +61,8 @@ SYNTHETIC = (
     Place("facade_row", 384, 4, arguments=(("seed", 18), ("layout", "path"), ("exposure", 0.03))),
     Place("stairs", 384, 3, arguments=(("seed", 19), ("layout", "path"))),
     Place("twin_rooms", 384, 3, arguments=(("seed", 20), ("layout", "path"))),
+    Place("desk", 384, 4, arguments=(("seed", 0),)),
+    Place("desk", 512, 4, arguments=(("seed", 0), ("reach", 1.6), ("top", "weak"))),
 )
 # Width and number of views of the captures of the first folder, and of each other one.
 _FIRST, _OTHERS = ((512, 4), (256, 9)), ((384, 4), (320, 5))

@@ -23,7 +23,7 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 """A panorama (H, W, 3) uint8 RGB with its mask (H, W); False is ignored."""
 
 WIDTH_PX = 256
-_SETTINGS = SweepSettings(planes=64, cost="census", p1=80, p2=1600, no_match="keep")
+_SETTINGS = SweepSettings(planes=64, spacing="inverse", cost="census", p1=80, p2=1600, no_match="keep")
 _SOURCES = 4
 # In units of the median baseline. A near limit from the longest one would lose the foreground if one source is far
 # away.

@@ -61,7 +61,9 @@ def _coarse_input(work: SweepInput) -> SweepInput | None:
     planes = max(min(_MIN_PLANES, settings.planes), -(-settings.planes // 2))
     # A step by one plane is as much longer as there are fewer of them.
     p1 = min(round(settings.p1 * (settings.planes - 1) / (planes - 1)), max(settings.p2, settings.p1), _MAX_PENALTY)
-    ranges = virtual_ranges(work.ranges[0], work.ranges[-1], planes=planes, spacing=settings.spacing)
+    ranges = virtual_ranges(
+        work.ranges[0], work.ranges[-1], planes=planes, spacing=settings.spacing, baseline=work.baseline
+    )
     return replace(
         work,
         reference=_halved(work.reference),

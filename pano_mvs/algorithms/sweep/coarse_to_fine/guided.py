@@ -15,7 +15,6 @@ from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
     follow_guided_strip,
 )
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates
-from pano_mvs.algorithms.sweep.hypotheses import range_at
 from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
@@ -179,7 +178,5 @@ class GuidedSweep:
 
 
 def _inverse_ranges(work: SweepInput) -> NDArray[np.float32]:
-    settings = work.settings
-    positions = np.arange((settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
-    ranges = range_at(positions, work.ranges[0], work.ranges[-1], planes=settings.planes, spacing=settings.spacing)
-    return (1 / ranges).astype(np.float32)
+    positions = np.arange((work.settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
+    return (1 / work.range_at(positions)).astype(np.float32)
