@@ -32,6 +32,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
+from pano_mvs.core.paths import is_file
 from pano_mvs.io.images.captures import list_pictures
 from pano_mvs.io.images.containers import read_container
 from pano_mvs.io.images.exif import focal_from_exif
@@ -104,7 +105,7 @@ def _localised(
 
 def _photographs(path: Path) -> tuple[Path, list[Path]]:
     """Return the folder to which names are relative, and the photographs."""
-    if path.is_file():
+    if is_file(path):
         return path.parent, [path]
     return path.parent, list_pictures(path)
 

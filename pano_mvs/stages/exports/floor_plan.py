@@ -16,6 +16,7 @@ from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid
 from pano_mvs.algorithms.floor_plan.storeys import Storey, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
 from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
+from pano_mvs.core.paths import children
 from pano_mvs.io.plans.drawing_files import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
 from pano_mvs.scene.upright import world_up, z_up_from_world
 
@@ -85,7 +86,7 @@ def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParam
         plan = _GroupPlan(group, own, params, folder=ctx.scratch / folder)
         about = plan.write()
         (ctx.scratch / folder / "floor_plan.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
-        files |= {f"{folder}/{path.name}": path for path in sorted((ctx.scratch / folder).iterdir())}
+        files |= {f"{folder}/{path.name}": path for path in children(ctx.scratch / folder)}
         for note in plan.notes:
             ctx.note(f"{which}{note}")
         storeys += len(about["storeys"])
