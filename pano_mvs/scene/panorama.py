@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
 from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.image_files.recent_pictures import RecentPictures
-from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
+from pano_mvs.scene.masks.cropping import inside_crop, placed_picture, same_shape
+from pano_mvs.scene.masks.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
 
 _RECENT = RecentPictures(limit_bytes=48 << 20)

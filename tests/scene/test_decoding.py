@@ -15,7 +15,7 @@ from pano_mvs.scene.image_files import decoding
 from pano_mvs.scene.image_files.decoding import check_stated_size, decode_picture
 from pano_mvs.scene.image_files.header import stated_size, stated_size_of_file
 from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.scene.masking import decode_mask
+from pano_mvs.scene.masks.masking import decode_mask
 from tests.io.images.pictures import png_chunk
 
 NOISE = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)

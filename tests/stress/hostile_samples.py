@@ -28,7 +28,7 @@ from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.io.ranges.files import read_normals
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.scene.masking import decode_mask
+from pano_mvs.scene.masks.masking import decode_mask
 from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.room import capture_poses
 from pano_mvs.viewer.shown_scene import has_faces

@@ -15,7 +15,7 @@ from pano_mvs.algorithms.masks.frame_agreement import FrameAgreement, color_diff
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.scene.masking import placed_mask
+from pano_mvs.scene.masks.masking import placed_mask
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]

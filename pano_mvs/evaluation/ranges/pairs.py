@@ -18,7 +18,7 @@ from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.io.images.mask_files import find_mask
 from pano_mvs.io.images.names import pair_image_names, without_extension
-from pano_mvs.scene.masking import decode_mask, placed_mask
+from pano_mvs.scene.masks.masking import decode_mask, placed_mask
 
 
 @dataclass(frozen=True, eq=False)

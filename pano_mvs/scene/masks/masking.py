@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.scene.cropping import Crop
 from pano_mvs.scene.image_files.decoding import decode_picture
+from pano_mvs.scene.masks.cropping import Crop
 from pano_mvs.scene.record import FilePart
 
 Mask = NDArray[np.bool_]

@@ -1,0 +1,1 @@
+"""Masked and cropped panoramas: placing masks and crops, filling masked pixels."""

@@ -1,0 +1,1 @@
+"""Poses checked against the images."""
