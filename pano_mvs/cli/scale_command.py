@@ -21,6 +21,9 @@ from pano_mvs.session.scaling import (
     scaled_session,
 )
 
+_USUAL_HEIGHTS_M = (0.3, 4.0)
+"""Outside of these, the height of the cameras is called in question."""
+
 
 def scale_output(
     out: Path, known: tuple[str, ...], *, camera_height: str, group: int, cache: Path | None, console: Console
@@ -46,12 +49,17 @@ def scale_output(
         return _print_guess(run, group, console)
     measurement = _measurement(run, known, camera_height=camera_height, group=group)
     session = scaled_session(run, measurement, cache=cache)
-    console.print(
-        f"{measurement.origin}: {measurement.length:.5g} units, so one unit is {measurement.factor:.5g} m\n"
-        f"workflow: {escape(str(out / WORKFLOW_FILE))}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    chosen = run.summary.poses.groups[measurement.group]
+    if chosen.metric:
+        text = f"{measurement.length:.5g} m until now, so all lengths are multiplied by {measurement.factor:.5g}"
+    else:
+        text = f"{measurement.length:.5g} units, so one unit is {measurement.factor:.5g} m"
+    lines = [f"{measurement.origin}: {text}", f"workflow: {out / WORKFLOW_FILE}"]
+    if chosen.camera_height is not None:
+        height_m = chosen.camera_height * measurement.factor
+        doubt = "" if _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1] else "; is the distance right?"
+        lines.insert(1, f"the cameras are then {height_m:.3g} m above the floor{doubt}")
+    console.print("\n".join(map(escape, lines)), highlight=False, soft_wrap=True)
     return run_workflow(session, Execution())
 
 
@@ -60,6 +68,8 @@ def _measurement(run: RunOutput, known: tuple[str, ...], *, camera_height: str, 
         raise UsageError("give either two ends with their distance, or --camera-height")
     if camera_height:
         return measured_camera_height(run, metres=metres_from_text(camera_height), group=group)
+    if len(known) == 4:  # "3.42 m" without quotes
+        known = (*known[:2], known[2] + known[3])
     if len(known) != 3:
         raise UsageError("give two images, or two points x,y,z, and the distance between them: A B 3.42m")
     first, second, distance = known

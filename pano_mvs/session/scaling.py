@@ -76,6 +76,8 @@ def metres_from_text(text: str) -> float:
     Raises:
         UsageError: if it is not a positive length.
     """
+    if re.fullmatch(r"\s*[0-9]*,[0-9]+\s*[a-z]*\s*", text.lower()):
+        raise UsageError(f"{text[:80]!r}: write a point, not a comma: {text[:80].replace(',', '.')}")
     found = _LENGTH.fullmatch(text.lower())
     metres = float(found[1]) * _METRES[found[2]] if found else 0.0
     if not metres > 0:
@@ -133,6 +135,18 @@ def measured_camera_height(run: RunOutput, *, metres: float, group: int = 0) -> 
     if height is None:
         raise UsageError(f"{run.out}: no floor was found below the cameras. Measure a distance instead: A B 3.42m")
     return Measurement(height, metres, group, f"the cameras' height of {metres:g} m above the floor of the cloud")
+
+
+def lost_scale(session: Session) -> str:
+    """Return a note if the output folder of a session was in metres and the session writes scene units; else ""."""
+    scaled = session.out / WORKFLOW_FILE
+    path = session.workflow.path
+    if not is_file(scaled) or (path is not None and resolved(path) == resolved(scaled)):
+        return ""
+    return (
+        f"{session.out} was put into metres before, by pano-mvs scale, and is in the units of the workflow again. To "
+        f"use metres, repeat the measurement: pano-mvs scale {session.out} A B 3.42m"
+    )
 
 
 def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = None) -> Session:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.geometry import Rigid3
-from pano_mvs.results.run_output import RunOutput, RunView
+from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
@@ -24,6 +24,8 @@ from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
 from pano_mvs.share.plan_file import run_plans
 from pano_mvs.share.scene_parts import RANGES_HW, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
+
+_INTERRUPTED = 130
 
 Progress = Callable[[int, int], None]
 """Receives the number of panoramas that are written, and of all."""
@@ -86,7 +88,15 @@ def share_run(
     cloud = run.cloud.groups()[0] if run.cloud is not None else None
     if poses is None and (cloud is None or not len(cloud)):
         raise InputError(f"{run.out}: has neither a cloud nor cameras to show. Look at its report.html")
+    names = poses.names if poses is not None else ()
+    if (cloud is None or not len(cloud)) and not any(_may_have_image(run, name, images) for name in names):
+        raise InputError(
+            f"{run.out}: there is neither a cloud nor a panorama to show. Finish the run, or give the folder of the "
+            "panoramas with --images DIR"
+        )
     notes = [] if cloud is not None else ["the run has no cloud; the page shows the panoramas alone"]
+    if run.summary.exit_code == _INTERRUPTED:
+        notes.append("the run was interrupted; the page shows what it had finished")
     if len(run.summary.poses.by_group()) > 1:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
@@ -160,7 +170,7 @@ def _put_cameras(
     for idx, name in enumerate(poses.names if poses is not None else ()):
         assert poses is not None
         view = run.views.get(name)
-        image = _image(view, images / name if images is not None else None)
+        image = _image(run, name, images)
         pose = poses.cam_from_world(idx) @ frame.inverse()
         described.append(
             {"name": name, **put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)}
@@ -170,8 +180,14 @@ def _put_cameras(
     return described
 
 
-def _image(view: RunView | None, path: Path | None) -> NDArray[np.uint8] | None:
-    """Return a panorama from the given file if that exists, else from where the run found it."""
-    if path is not None and is_file(path):
-        return decode_image(path)
-    return view.image if view is not None else None
+def _image(run: RunOutput, name: str, images: Path | None) -> NDArray[np.uint8] | None:
+    """Return a panorama from the given folder, else from where the run found it; None if it is not there."""
+    if images is None and (view := run.views.get(name)) is not None:
+        return view.image
+    folder = images or run.summary.source_folder
+    return decode_image(folder / name) if folder is not None and is_file(folder / name) else None
+
+
+def _may_have_image(run: RunOutput, name: str, images: Path | None) -> bool:
+    folder = images or run.summary.source_folder
+    return (images is None and name in run.views) or (folder is not None and is_file(folder / name))

@@ -83,6 +83,7 @@ def localise(
         else:
             rejected[name] = result
             ctx.note(f"{name} was not localised: {result}")
+    ctx.note(f"{len(found)} of {len(paths)} photographs were localised")
     ctx.metric("localised", len(found) / max(1, len(paths)))
     return _record(found, rejected)
 

@@ -60,9 +60,12 @@ def test_every_setting_is_there_with_its_value(pano_mvs: Command, tmp_path: Path
     depth = open_session("quality").workflow.stages["depth"].params
     assert all(f"    {name}: " in shown for name in type(depth).model_fields)
     written = pano_mvs("show", "quality", "--resolved", "--set", "depth.planes=77", "--out", tmp_path / "mine.yaml")
-    assert (written.code, written.text) == (0, "")
+    assert (written.code, written.text) == (0, f"written to {tmp_path / 'mine.yaml'}\n")
     assert (tmp_path / "mine.yaml").read_text() == shown
     assert pano_mvs("check", tmp_path / "mine.yaml").code == 0
+    again = pano_mvs("show", "fast", "--out", tmp_path / "mine.yaml")
+    assert (again.code, "such a file already" in again.flat) == (2, True)
+    assert (tmp_path / "mine.yaml").read_text() == shown
     (tmp_path / "file").touch()
     refused = pano_mvs("show", "quality", "--out", tmp_path / "file" / "mine.yaml")
     assert (refused.code, "cannot be written" in refused.flat) == (2, True)

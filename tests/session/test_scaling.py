@@ -21,8 +21,14 @@ from pano_mvs.scene import Pose, RangeMap
 from pano_mvs.scene.pose_groups import join_groups
 from pano_mvs.session.camera_height import camera_height, height_note
 from pano_mvs.session.running import Execution, run_session
-from pano_mvs.session.scaling import measured_between, measured_camera_height, metres_from_text, scaled_session
-from pano_mvs.session.session import Session
+from pano_mvs.session.scaling import (
+    lost_scale,
+    measured_between,
+    measured_camera_height,
+    metres_from_text,
+    scaled_session,
+)
+from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import _scale_notes
 from pano_mvs.stages.filters import ScaleRangesParams, scale_ranges
 from pano_mvs.stages.frame import ScaleParams, scale
@@ -135,6 +141,10 @@ def test_the_command_takes_points_and_lengths(
     assert seen[0].workflow.stages["metres_poses"].params.model_dump()["factor"] == pytest.approx(1.5)
     assert "one unit is 1.5 m" in capsys.readouterr().out
     assert (run.out / "metres.yaml").read_text().startswith("pano_mvs: 1\nname: tiny\n")
+    parted = ("-1,0,0.5", "1,0,0.5", "300", "cm")  # as a shell passes 300 cm without quotes
+    scale_output(run.out, parted, camera_height="", group=0, cache=None, console=Console())
+    assert seen.pop().workflow.stages["metres_poses"].params.model_dump()["factor"] == pytest.approx(1.5)
+    capsys.readouterr()
     scale_output(run.out, (), camera_height="", group=0, cache=None, console=Console())
     assert "one unit is" in capsys.readouterr().out
     assert len(seen) == 1
@@ -169,6 +179,20 @@ def test_lengths_have_units(text: str, metres: float) -> None:
 def test_what_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not a length"):
         metres_from_text(text)
+
+
+def test_a_comma_is_refused_with_a_point() -> None:
+    with pytest.raises(UsageError, match=r"write a point, not a comma: 3\.42m"):
+        metres_from_text("3,42m")
+
+
+def test_a_run_that_loses_its_scale_is_noted(run: pano_mvs.RunOutput, made: Path) -> None:
+    session = open_session(made / "tiny.yaml", cache=made / "cache", out=run.out)
+    assert lost_scale(session) == ""
+    (run.out / "metres.yaml").write_text("pano_mvs: 1\n")
+    assert "repeat the measurement" in lost_scale(session)
+    scaled = replace(session.workflow, path=run.out / "metres.yaml")
+    assert lost_scale(replace(session, workflow=scaled)) == ""
 
 
 def test_the_height_of_the_cameras_is_found_and_offered_but_not_applied() -> None:

@@ -160,6 +160,33 @@ def test_a_panorama_that_is_gone_is_noted(tmp_path: Path) -> None:
     assert share_run(load(run.out), tmp_path / "page", images=tmp_path / "moved").panoramas == 2
 
 
+def test_other_images_are_not_replaced_by_those_of_the_run(tmp_path: Path) -> None:
+    """Another folder that lacks the images is a mistake to be shown, not to be passed over."""
+    run = box_run(tmp_path, points=100)
+    (tmp_path / "others").mkdir()
+    shared = share_run(load(run.out), tmp_path / "page", images=tmp_path / "others")
+    assert shared.panoramas == 0
+    assert "3 of 3 panoramas could not be read" in shared.notes[0]
+
+
+def test_a_page_is_not_replaced_when_there_is_nothing_to_show(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=100)
+    page = share_run(run, tmp_path / "page").page
+    before = page.read_bytes()
+    without_cloud = RunOutput(tmp_path / "nowhere", run.summary, StoredValues())
+    without_cloud.__dict__["poses"] = run.poses
+    with pytest.raises(InputError, match="neither a cloud nor a panorama"):
+        share_run(without_cloud, tmp_path / "page", images=tmp_path / "nowhere")
+    assert page.read_bytes() == before
+
+
+def test_an_interrupted_run_is_noted(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=100)
+    summary = run.summary.model_copy(update={"exit_code": 130})
+    (run.out / "run.json").write_text(json.dumps(summary.to_json()))
+    assert "interrupted" in " ".join(share_run(load(run.out), tmp_path / "page").notes)
+
+
 def test_a_run_with_nothing_to_show_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="neither a cloud nor cameras"):
         share_run(RunOutput(tmp_path, RunSummary(), StoredValues()), tmp_path / "page")

@@ -62,6 +62,7 @@ def test_a_folder_is_localised_and_the_rest_is_named(capture: Inputs, folder: Pa
     assert "only 0 of its 0 key points" in found.rejected["phone/10.jpg"]
     assert "not an image" in found.rejected["phone/broken.jpg"]
     assert ctx.metrics["localised"] == pytest.approx(1 / 3)
+    assert "1 of 3 photographs were localised" in ctx.notes
     assert sum("was not localised" in note for note in ctx.notes) == 2
 
 

@@ -15,6 +15,7 @@ from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
 from pano_mvs.session.running import Execution, run_session
+from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
 
 
@@ -30,6 +31,8 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
             with ProgressDisplay(console) as bars:
                 output = run_session(session, execution, bars)
             print_summary(output, console, following=next_commands(output, session))
+            if note := lost_scale(session):
+                console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
             return output.summary.exit_code
     finally:
         if stream is not sys.stdout:

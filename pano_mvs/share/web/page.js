@@ -400,7 +400,7 @@ class Page {
     this.coarse = pace !== PACES[0];
     const t = this.move ? Math.min(1, Math.max(0, (now - this.move.began) / this.move.length)) : 1;
     const smooth = t * t * (3 - 2 * t);
-    if (this.mode === "inside" || this.move) this.lookFrom(smooth);
+    if (this.move || (this.mode === "inside" && this.here)) this.lookFrom(smooth);
     this.draw(smooth, pace);
     if (this.settled) this.firstComplete ??= performance.now(); // for measurements
     if (this.move && t >= 1) {
