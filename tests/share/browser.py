@@ -20,11 +20,9 @@ class Browser(ABC):
 
     Attributes:
         schemes: the values of prefers-color-scheme that `prefer` can set.
-        can_reduce_motion: whether `prefer` can set prefers-reduced-motion.
     """
 
     schemes: tuple[str, ...] = ()
-    can_reduce_motion = False
 
     @abstractmethod
     def open(self, address: str) -> None:

@@ -39,7 +39,6 @@ class Chromium(Browser):
     """
 
     schemes = ("light", "dark")
-    can_reduce_motion = True
 
     def __init__(self, root: str) -> None:
         self.root = root

@@ -282,9 +282,8 @@ def test_the_page_is_as_dark_or_light_as_the_system(browser: Browser) -> None:
         assert ground < 150 if scheme == "dark" else ground > 600
 
 
+@pytest.mark.parametrize("window", ["chromium"], indirect=True)  # Firefox cannot change the preference while it runs
 def test_reduced_motion_jumps(browser: Browser) -> None:
-    if not browser.can_reduce_motion:
-        pytest.skip("this browser cannot change the preference while it runs")
     browser.prefer(browser.schemes[0], reduced_motion=True)
     try:
         step_inside(browser, 0)
