@@ -16,6 +16,7 @@ FIXED = """\
 pano_mvs: 1
 stages:
   refined: null
+  levelled: null
   verified: {correct: false, in: {poses: points}}
   poses: {use: poses.from_model, path: TRUTH/poses.json}
   points: {use: poses.triangulate, in: {poses: poses}}

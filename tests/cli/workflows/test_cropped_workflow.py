@@ -63,6 +63,8 @@ def test_cropped_and_masked_panoramas_from_files_to_cloud(pano_mvs: Command, cap
         "out",
         *SMALL,
         "--set",
+        "depth.planes=64",
+        "--set",
         f"poses.path={capture / 'truth' / 'poses.json'}",
         "--set",
         f"scores.truth={capture / 'truth'}",
