@@ -64,12 +64,13 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
         StoreError: if the image cannot be written.
     """
     size_wh = _size_wh(options.size)
+    if options.screenshot is not None:
+        _check_screenshot(options.screenshot)
+    scene = open_scene(path, images=options.images, group=options.group)
     if options.screenshot is None:
         require_display()
     else:
-        _check_screenshot(options.screenshot)
         require_drawing()
-    scene = open_scene(path, images=options.images, group=options.group)
     tour = _tour(scene, options, size_wh)
     from pano_mvs.viewer.window import SceneWindow  # imported on use, because pyvista is slow to import
 

@@ -48,10 +48,15 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
         cache: folder of the cache; None for that of the run, or the default.
 
     Raises:
+        UsageError: if there is no such workflow or folder.
         InputError: if the folder has no run.json, or its workflow file is missing.
     """
     out = Path(target)
     if not is_folder(out):
+        try:
+            find_workflow(target, presets_folder())
+        except UsageError as error:
+            raise UsageError(f"there is no output folder {target[:80]!r}, and {error}") from error
         return open_session(target, overrides=overrides, images=images, cache=cache)
     summary = RunSummary.read(out)
     workflow = Path(summary.workflow.path)

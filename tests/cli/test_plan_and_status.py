@@ -120,6 +120,8 @@ def test_status_of_a_workflow_takes_settings(pano_mvs: Command, here: Path) -> N
 
 
 def test_status_of_a_folder_that_holds_no_run_or_lost_its_workflow(pano_mvs: Command, here: Path) -> None:
+    missing = pano_mvs("status", here / "nowhere")
+    assert (missing.code, "there is no output folder" in missing.flat) == (2, True)
     refused = pano_mvs("status", here / "capture")
     assert refused.code == 2
     assert "Give the output folder of a run" in refused.flat
