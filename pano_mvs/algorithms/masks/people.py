@@ -120,14 +120,14 @@ def _confirmed(picture: Picture, area: Mask, candidates: Map) -> Mask:
     if not core.any():
         return nobody
     views, upright = _views_of(area)
+    if upright and np.mean([person_presence(face_image(picture, view)) for view in views]) < _MIN_PRESENCE:
+        return nobody
     seen_again = []
     for view in views:
         look = _look(view, size_hw)
         seen_again.append(_probability(picture, look, mirrored=True)[0])
         if np.average(seen_again[-1][core], weights=weights[core]) < _MIN_AGREEMENT:
             return nobody
-    if upright and np.mean([person_presence(face_image(picture, view)) for view in views]) < _MIN_PRESENCE:
-        return nobody
     mean = np.mean([*seen_again, _at_size(candidates, size_hw)], axis=0, dtype=np.float32)
     labels = area_labels(np.asarray(mean > _BELONGS))
     return np.isin(labels, np.unique(labels[core & (labels >= 0)]))
