@@ -49,13 +49,14 @@ def scale_output(
         return _print_guess(run, group, console)
     measurement = _measurement(run, known, camera_height=camera_height, group=group)
     session = scaled_session(run, measurement, cache=cache)
-    chosen = run.summary.poses.groups[measurement.group]
-    if chosen.metric:
+    groups = run.summary.poses.groups
+    chosen = groups[measurement.group] if measurement.group < len(groups) else None
+    if chosen is not None and chosen.metric:
         text = f"{measurement.length:.5g} m until now, so all lengths are multiplied by {measurement.factor:.5g}"
     else:
         text = f"{measurement.length:.5g} units, so one unit is {measurement.factor:.5g} m"
     lines = [f"{measurement.origin}: {text}", f"workflow: {out / WORKFLOW_FILE}"]
-    if chosen.camera_height is not None:
+    if chosen is not None and chosen.camera_height is not None:
         height_m = chosen.camera_height * measurement.factor
         doubt = "" if _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1] else "; is the distance right?"
         lines.insert(1, f"the cameras are then {height_m:.3g} m above the floor{doubt}")

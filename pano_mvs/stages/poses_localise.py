@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,11 @@ from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.record import FilePart
 
 
+def localise_memory_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for a photograph and the key points of all panoramas, of which there are 8000 by default."""
+    return 600_000_000 + 6_000_000 * len(inputs["ranges"])
+
+
 @params_from(localise_photograph, own_last=True)
 class LocaliseParams(Params):
     """Settings of poses.localise."""
@@ -50,7 +55,7 @@ class LocaliseParams(Params):
     min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of ranges (128: consistent)")
 
 
-@stage("poses.localise", memory="1GB")
+@stage("poses.localise", memory=localise_memory_bytes)
 def localise(
     poses: One[Poses], features: All[Features], ranges: All[RangeMap], params: LocaliseParams, ctx: Context
 ) -> Photographs:

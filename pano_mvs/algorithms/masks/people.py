@@ -61,7 +61,7 @@ def people(
     A network that segments people in ordinary pictures looks at overlapping pinhole views around the nadir, below the
     horizon and along it, eight of each. A candidate is where their mean is high. It is seen again in the middle of
     views of its own, rolled and mirrored, and is kept if the network finds it in each of them and a second network,
-    which detects people, confirms it in most. Floors and furniture, which the first network takes for people now and
+    which detects people, confirms it. Floors and furniture, which the first network takes for people now and
     then, fail. Around the nadir, where nobody is upright, four rotations have to agree; a rig or a tripod's head is
     found there as well.
 
@@ -82,12 +82,12 @@ def people(
     small = _reduced(picture)
     candidates = _search(small, passers_by=passers_by)
     found = np.zeros(small.shape[:2], np.bool_)
-    tried = np.zeros(_SEARCH_HW, np.bool_)
+    accepted = np.zeros(_SEARCH_HW, np.bool_)
     for grown in _GROWN:
         for area in _areas(candidates, grown, min_area_deg2 / 2):
-            if not (tried & area).any() and (person := _confirmed(small, area, candidates)).any():
+            if not (accepted & area).any() and (person := _confirmed(small, area, candidates)).any():
                 found |= person
-                tried |= area
+                accepted |= area
     return _large_and_dilated(found, min_area_deg2=min_area_deg2, margin_deg=margin_deg)
 
 

@@ -119,6 +119,17 @@ def test_matches_in_one_spot_are_refused(panoramas: dict[str, KnownPoints], take
     assert isinstance(found, str), found
 
 
+def test_a_key_point_counts_once_however_many_panoramas_match_it(
+    panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]
+) -> None:
+    keypoints = photograph_keypoints(taken[0])
+    few = PhotographKeypoints(keypoints.pixels_px[:120], keypoints.descriptors[:120])
+    copies = {f"{name} {copy}": known for name, known in panoramas.items() for copy in range(6)}
+    found = localise_photograph(few, PHOTO_HW, copies, focal_px=FOCAL_PX, min_inliers=121, rng=np.random.default_rng(0))
+    assert isinstance(found, str)
+    assert "key points, agree with one pose" in found
+
+
 def test_key_points_keep_their_place_when_the_photograph_is_reduced(taken: tuple[Picture, Rigid3]) -> None:
     large = np.asarray(cv2.resize(taken[0], (3200, 2400), interpolation=cv2.INTER_CUBIC), np.uint8)
     pixels, reduced = photograph_keypoints(taken[0]).pixels_px, photograph_keypoints(large).pixels_px

@@ -163,7 +163,11 @@ def localise_photograph(
         pixels, points, errors = pixels[inliers], points[inliers], errors[inliers]
     reason = _implausible(pixels, size_hw, camera=refined, matches=len(pixels), min_inliers=min_inliers)
     return reason or Localised(
-        refined.cam_from_world, refined.focal_px, refined.radial, inliers=len(pixels), error_px=float(np.median(errors))
+        refined.cam_from_world,
+        refined.focal_px,
+        refined.radial,
+        inliers=len(np.unique(pixels, axis=0)),
+        error_px=float(np.median(errors)),
     )
 
 
@@ -233,8 +237,10 @@ def _implausible(
     inliers_px: FloatArray, size_hw: tuple[int, int], *, camera: PhotographCamera, matches: int, min_inliers: int
 ) -> str:
     """Return why a pose cannot be trusted, "" if it can."""
-    if len(inliers_px) < max(min_inliers, _MIN_INLIER_SHARE * matches):
-        return f"only {len(inliers_px)} of its {matches} matches agree with one pose"
+    # A key point that matches the same place in several panoramas counts once.
+    distinct = len(np.unique(inliers_px, axis=0))
+    if distinct < min_inliers or len(inliers_px) < _MIN_INLIER_SHARE * matches:
+        return f"only {len(inliers_px)} of its {matches} matches, of {distinct} key points, agree with one pose"
     fov_deg = float(np.degrees(2 * np.arctan(max(size_hw) / 2 / camera.focal_px)))
     if not _FOV_BOUNDS_DEG[0] <= fov_deg <= _FOV_BOUNDS_DEG[1] or abs(camera.radial) > _MAX_RADIAL:
         return f"its matches give an implausible camera: {fov_deg:.0f}° wide, distortion {camera.radial:.2f}"
