@@ -1,0 +1,263 @@
+"""Real captures without ground truth: `python -m tests.benchmarks.real_captures DIR … --out DIR [--width 2048]`.
+
+Each DIR is a folder of panoramas. `pano-mvs run` (the preset `quality`; `--workflow` chooses another) and COLMAP on its
+own (EQUIRECTANGULAR cameras, its SIFT, all pairs, its defaults, incremental and global) process the same images in the
+same run. For each, the table shows
+
+- the registered images, in the largest model and in all, and the cameras that the program itself doubts,
+- the number of points and the median and 95 % quantile of their angular residuals,
+- the confirmed share: how much of the textured sphere other images confirm in small sweeps with these poses (median
+  and least camera). It uses images alone, needs no ground truth, and treats all models equally,
+- CPU seconds of the poses, and of the whole run for ours.
+
+Below it are the share of each range map that other views confirm, the points of the cloud, and how far our poses and
+COLMAP's differ: the median and maximum over all common pairs of the larger of rotation and direction difference.
+Images are reduced to `--width` columns first, for all programs alike; `--without-colmap` leaves COLMAP out. In `--out`
+are the table (`table.md`), our output folders, and three pictures of each cloud.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import pano_mvs
+from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.algorithms.rendering.cloud import draw_cloud
+from pano_mvs.algorithms.rendering.viewpoints import inside_camera, viewpoints
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.results.residuals import reprojection_residuals
+from pano_mvs.results.run_output import RunOutput
+from pano_mvs.scene import Poses
+from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.pose_groups import split_groups
+from tests.benchmarks.poses.captures_with_truth import MAPPERS, SEED, native_features, native_matches
+
+_IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
+_POSE_STAGES = ("masks.", "features.", "global.", "pairs.", "matches.", "poses.", "source.")
+_PICTURE_HW = (600, 960)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One program's model of a capture.
+
+    Attributes:
+        label: of the program.
+        models: its models, the largest first.
+        cpu_s: CPU seconds from images to refined poses.
+    """
+
+    label: str
+    models: tuple[Poses, ...]
+    cpu_s: float
+
+
+def reduced(folder: Path, out: Path, width: int) -> int:
+    """Link the images of a folder that have at most `width` columns, write the others reduced, and return their number.
+
+    Reduced images have no metadata.
+    """
+    out.mkdir(parents=True)
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
+    for path in files:
+        picture = decode_image(path)
+        if picture.shape[1] <= width:
+            (out / path.name).symlink_to(path.resolve())
+            continue
+        small = cv2.resize(picture, (width, width * picture.shape[0] // picture.shape[1]), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str((out / path.name).with_suffix(".png")), small[..., ::-1])
+    return len(files)
+
+
+def ours(images: Path, out: Path, workflow: str, overrides: Sequence[str]) -> tuple[RunOutput, float, float]:
+    """Return our run, CPU seconds of all of it, and those of the stages up to the poses."""
+    command = [sys.executable, "-m", "pano_mvs", "run", workflow, "--images", str(images), "--out", str(out)]
+    command += ["--cache", str(out.with_name(out.name + "_cache"))]
+    for override in overrides:
+        command += ["--set", override]
+    before = _children_s()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 3):  # 3: finished, some images were left out
+        raise SystemExit(done.stdout + done.stderr)
+    whole = _children_s() - before
+    run = pano_mvs.load(out, cache=out.with_name(out.name + "_cache"))
+    stages = json.loads((out / "run.json").read_text(encoding="utf-8"))["stages"]
+    busy = {stage["name"]: stage["units"] * stage["unit_seconds"] for stage in stages}
+    poses = sum(busy[stage["name"]] for stage in stages if stage["use"].startswith(_POSE_STAGES))
+    # Seconds of units are wall time. Their proportion divides the CPU time, which other programs do not lengthen.
+    return run, whole, whole * poses / max(sum(busy.values()), 1e-9)
+
+
+def colmap(images: Path, mapper: str, database: Path) -> Row:
+    """Return COLMAP's models; features and matches of an earlier mapper are kept, and their time is counted again."""
+    import pycolmap
+
+    spent = database.with_suffix(".seconds")
+    if not database.exists():
+        start = time.process_time()
+        native_features(database, images)
+        native_matches(database)
+        spent.write_text(str(time.process_time() - start))
+    options = pycolmap.IncrementalPipelineOptions() if mapper == "incremental" else pycolmap.GlobalPipelineOptions()
+    options.random_seed, options.num_threads = SEED, 1
+    run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    out = database.with_name(mapper)
+    out.mkdir()
+    start = time.process_time()
+    with quiet_colmap():
+        found = run(database, images, out, options)
+    cpu_s = time.process_time() - start + float(spent.read_text())
+    models = []
+    for idx, model in found.items():
+        folder = out / f"model_{idx}"
+        folder.mkdir()
+        model.write(folder)
+        models.append(read_poses(folder))
+    models.sort(key=lambda poses: -len(poses.names))
+    return Row(f"COLMAP, {mapper}", tuple(models), cpu_s)
+
+
+def table(rows: Iterable[Row], confirmed: Callable[[Poses], np.ndarray], total: int) -> list[str]:
+    """Return the lines of the Markdown table of one capture."""
+    lines = [
+        "| | registered: largest model | … all models | doubted | points | residual °: median / 95 % "
+        "| confirmed %: median / least | CPU-s of the poses |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        if not row.models:
+            lines.append(f"| {row.label} | 0 of {total} | 0 | – | – | – | – | {row.cpu_s:.0f} |")
+            continue
+        model = row.models[0]
+        found = reprojection_residuals(model)
+        residual = "–" if found is None else f"{found.overall.median_deg:.3f} / {found.overall.p95_deg:.3f}"
+        shares = confirmed(model)
+        share = (
+            f"{100 * np.nanmedian(shares):.0f} / {100 * np.nanmin(shares):.0f}" if np.isfinite(shares).any() else "–"
+        )
+        everywhere = " + ".join(str(len(other.names)) for other in row.models)
+        doubts = sum(len(other.doubts) for other in row.models)
+        lines.append(
+            f"| {row.label} | {len(model.names)} of {total} | {everywhere} | {doubts or '–'} "
+            f"| {len(model.points_in_world):,} | {residual} | {share} | {row.cpu_s:.0f} |"
+        )
+    return lines
+
+
+def confirmation(run: RunOutput, images: Path) -> Callable[[Poses], np.ndarray]:
+    """Return a function from poses to the confirmed share of each camera, (N,)."""
+    files = {path.name: path for path in sorted(images.iterdir())}
+    position = {name: idx for idx, name in enumerate(files)}
+
+    def load(idx: int) -> tuple[np.ndarray, np.ndarray]:
+        name = list(files)[idx]
+        panorama = run.values.panorama(name)
+        if panorama is None:
+            picture = decode_image(files[name])
+            return picture, np.ones(picture.shape[:2], np.bool_)
+        return panorama.load(), panorama.load_mask()
+
+    judge = Confirmation(load)
+
+    def shares(poses: Poses) -> np.ndarray:
+        cameras = {position[name]: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+        return np.array([judge.share(image, pose, cameras) for image, pose in cameras.items()])
+
+    return shares
+
+
+def difference(first: Poses, second: Poses) -> str:
+    """Return how far two models differ over the pairs of their common cameras, in words."""
+    a = {name: first.cam_from_world(idx) for idx, name in enumerate(first.names)}
+    b = {name: second.cam_from_world(idx) for idx, name in enumerate(second.names) if name in a}
+    if len(b) < 2:
+        return f"{len(b)} common cameras"
+    errors = relative_pose_errors(a, b)
+    return f"{len(b)} common cameras, {errors.median_pair_deg:.3f}° in the median, at most {errors.pair_deg.max():.2f}°"
+
+
+def write_pictures(run: RunOutput, poses: Poses, out: Path) -> None:
+    """Write three pictures of the cloud of the largest group."""
+    cloud = None if run.cloud is None else run.cloud.groups()[0]
+    if cloud is None or not len(cloud.points_in_world):
+        return
+    up = np.asarray(run.summary.poses.up or (0.0, 0.0, 1.0), float)
+    arrays = cloud.points_in_world, cloud.normals_in_world, cloud.colors_rgb
+    place = poses.names[inside_camera(poses.centers)]
+    aspect = _PICTURE_HW[1] / _PICTURE_HW[0]
+    views = viewpoints(cloud.points_in_world, poses.centers, up, aspect=aspect, place=place)
+    for name, view in zip(("above", "outside", "inside"), views, strict=True):
+        image = draw_cloud(*arrays, viewpoint=view, size_hw=_PICTURE_HW)
+        cv2.imwrite(str(out / f"cloud_{name}.png"), image[..., ::-1])
+
+
+def measure(folder: Path, out: Path, options: argparse.Namespace) -> list[str]:
+    """Return the Markdown lines of one capture."""
+    out.mkdir(parents=True)
+    total = reduced(folder, out / "images", options.width)
+    run, whole_s, poses_s = ours(out / "images", out / "run", options.workflow, options.set)
+    groups = () if run.poses is None else tuple(split_groups(run.poses))
+    rows = [Row(f"pano_mvs, `{options.workflow}`", groups, poses_s)]
+    if not options.without_colmap:
+        with tempfile.TemporaryDirectory() as scratch:
+            rows += [colmap(out / "images", mapper, Path(scratch) / "native.db") for mapper in MAPPERS]
+    lines = [f"### {folder.name}: {total} images, at most {options.width} columns", ""]
+    lines += table(rows, confirmation(run, out / "images"), total)
+    shares = [view.consistent for view in run.summary.views if view.consistent is not None]
+    lines += ["", f"The whole run took {whole_s:.0f} CPU-s."]
+    if shares:
+        lines += [f"Confirmed pixels of the range maps: {_spread(shares)}; cloud: {run.summary.cloud.points:,} points."]
+    for row in rows[1:]:
+        if groups and row.models:
+            lines += [f"{row.label} and ours: {difference(groups[0], row.models[0])}."]
+    for name, why in {**run.summary.poses.rejected, **run.summary.poses.doubts}.items():
+        lines += [f"- {name}: {why}"]
+    if groups:
+        write_pictures(run, groups[0], out)
+    return [*lines, ""]
+
+
+def _spread(shares: Sequence[float]) -> str:
+    low, middle, high = (100 * float(value) for value in np.quantile(shares, [0, 0.5, 1]))
+    return f"{middle:.0f} % in the median of the views ({low:.0f} to {high:.0f} %)"
+
+
+def _children_s() -> float:
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+def main() -> None:
+    """Measure the captures that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR")
+    parser.add_argument("--out", type=Path, required=True, help="an empty or new folder")
+    parser.add_argument("--workflow", default="quality")
+    parser.add_argument("--width", type=int, default=2048)
+    parser.add_argument("--set", action="append", default=[], metavar="STAGE.PARAM=VALUE")
+    parser.add_argument("--without-colmap", action="store_true")
+    options: Any = parser.parse_args()
+    for folder in options.folders:
+        lines = measure(folder, options.out / folder.name, options)
+        with (options.out / "table.md").open("a", encoding="utf-8") as file:
+            file.write("\n".join(lines) + "\n")
+        print("\n".join(lines), flush=True)
+
+
+if __name__ == "__main__":
+    main()
