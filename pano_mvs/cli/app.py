@@ -291,11 +291,14 @@ def view_results(
             help="Group to show if the panoramas form several groups; 0 is the largest.",
         ),
     ] = 0,
+    ranges: Annotated[
+        bool, typer.Option("--ranges", help="Inside a camera, show its ranges; unconfirmed ones are marked.")
+    ] = False,
 ) -> None:
     """View the cloud, the mesh and the cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
-    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group)
+    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group, ranges)
     view_scene(out, options, Console())
 
 

@@ -40,6 +40,7 @@ class ViewOptions:
         blended: whether the cloud is shown within a panorama.
         backs: whether points and triangles that face away from the viewer are shown.
         group: group of poses to show; 0 is the largest.
+        ranges: whether a camera's ranges are shown inside it instead of its panorama.
     """
 
     images: Path | None = None
@@ -53,6 +54,7 @@ class ViewOptions:
     blended: bool = False
     backs: bool = False
     group: int = 0
+    ranges: bool = False
 
 
 def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
@@ -100,7 +102,8 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     tour.see(options.view)
     # Our meshes face the observed side; the orientation of other meshes is unknown.
     backs = options.backs or (cloud is None and not scene.cameras)
-    tour.begin(coloring=options.color, labels=options.labels, blended=options.blended, backs=backs)
+    shown = {"labels": options.labels, "blended": options.blended, "backs": backs, "ranges": options.ranges}
+    tour.begin(coloring=options.color, **shown)
     if options.surface:
         tour.begin(surface=_surface(options.surface, scene))
     return tour

@@ -75,3 +75,9 @@ class RangeMap(Record):
         if self.sky is not None:
             sky = require_array(self, "sky", dtype=np.bool_, shape=array.shape)
             require(not bool((sky & valid).any()), self, "a pixel of the sky has a range")
+
+
+def confidence_name(confidence: int) -> str:
+    """Return what a confidence means: "no range", "filled", "seen but weak" or "consistent"."""
+    limits = (0, "no range"), (FILLED_CONFIDENCE[1], "filled"), (WEAK_CONFIDENCE[1], "seen but weak")
+    return next((name for most, name in limits if confidence <= most), "consistent")

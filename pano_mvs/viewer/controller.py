@@ -38,6 +38,7 @@ class TourState:
         labels: whether all cameras are named.
         cameras: whether cameras are shown.
         blended: whether the cloud is shown inside a panorama.
+        ranges: whether a camera's ranges are shown inside it instead of its panorama.
         backs: whether points and triangles that face away from the viewer are shown; hiding them opens rooms
             to view.
         all_points: whether all points of the file are drawn.
@@ -56,6 +57,7 @@ class TourState:
     labels: bool = False
     cameras: bool = True
     blended: bool = False
+    ranges: bool = False
     backs: bool = False
     all_points: bool = False
     help: bool = False
@@ -197,6 +199,7 @@ class Tour:
             "l": lambda: self._toggle("labels"),
             "k": lambda: self._toggle("cameras"),
             "b": lambda: self._toggle("blended"),
+            "r": lambda: self._toggle("ranges"),
             "x": lambda: self._toggle("backs"),
             "d": lambda: self._toggle("all_points"),
             "h": lambda: self._toggle("help"),

@@ -20,6 +20,7 @@ _KEYS = (
     ("s", "cloud, mesh, or both"),
     ("x", "what faces away from you"),
     ("b", "cloud within the panorama"),
+    ("r", "inside: ranges, unconfirmed ones pale"),
     ("d", "all points"),
     ("l, k", "names, cameras"),
     ("h, q", "this help, quit"),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
+from pano_mvs.scene.range_map import confidence_name
 from pano_mvs.viewer.shown_scene import ShownCamera
 from pano_mvs.viewer.sizes import length_text
 
@@ -33,5 +34,6 @@ def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], 
     found = float(ranges[row, column])
     said = f"range {length_text(found, unit)}" if np.isfinite(found) else "no range"
     if confidence is not None and confidence.shape == ranges.shape:
-        said += f", confidence {confidence[row, column]}"
+        level = int(confidence[row, column])
+        said += f", confidence {level} ({confidence_name(level)})"
     return f"pixel {column} {row}: {said}\n{angles}"

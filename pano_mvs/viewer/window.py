@@ -16,6 +16,7 @@ from pano_mvs.viewer.controller import Tour, TourState
 from pano_mvs.viewer.input_events import Hands
 from pano_mvs.viewer.overlay import Overlay
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
+from pano_mvs.viewer.range_sphere import range_panorama
 from pano_mvs.viewer.sizes import bar_length, bar_text, length_text
 from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
 from pano_mvs.viewer.viewpoint import Viewpoint
@@ -58,7 +59,7 @@ class SceneWindow:
         self._surroundings: Any = None
         self._rims: Any = None
         self._dots: Any = None
-        self._legend = ""
+        self._legend = self._range_legend = ""
         self._add_mesh()
         self._add_cloud()
         self._add_bar()
@@ -103,8 +104,8 @@ class SceneWindow:
         self._place_camera(state.viewpoint)
         if before is None or before.all_points != state.all_points:
             self._reload_points(state)
-        if before is None or before.inside != state.inside:
-            self._surround(state.inside)
+        if before is None or (before.inside, before.ranges) != (state.inside, state.ranges):
+            self._surround(state.inside, ranges=state.ranges)
         if before is None or before.viewpoint.eye is not state.viewpoint.eye or not _looks_elsewhere(before, state):
             self._show_cloud(state, before)
             self._show_cameras(state, before)
@@ -199,8 +200,9 @@ class SceneWindow:
         share = 2.0 if state.inside is not None else 1.6
         return float(np.clip(share * np.sqrt(width * height / count), 1.5, 6.0))
 
-    def _surround(self, camera_idx: int | None) -> None:
-        """Show the panorama of a camera around the viewer, or remove it."""
+    def _surround(self, camera_idx: int | None, *, ranges: bool) -> None:
+        """Show the panorama of a camera, or its ranges if there are any, around the viewer, or remove it."""
+        self._range_legend = ""
         if self._surroundings is not None:
             self.plotter.remove_actor(self._surroundings, render=False)
             self._surroundings = None
@@ -212,7 +214,11 @@ class SceneWindow:
             return
         camera = self.tour.scene.cameras[camera_idx]
         radius = _SURROUND_SHARE * float(np.linalg.norm(np.ptp(self.tour.box, axis=0)))
-        picture = sphere_picture(camera, LARGE_WIDTH)
+        picture = None
+        if ranges:
+            picture, self._range_legend = range_panorama(camera, self.tour.scene.unit)
+        if picture is None:
+            picture = sphere_picture(camera, LARGE_WIDTH)
         self._surroundings = sphere_actor(picture, camera.cam_from_world, radius, surrounds=True)
         self.plotter.add_actor(self._surroundings, name="surroundings", reset_camera=False, pickable=False)
 
@@ -305,7 +311,8 @@ class SceneWindow:
         if scene.cameras:
             counts.append(f"{len(scene.cameras):,} {plural(len(scene.cameras), 'camera')}")
         self._overlay.text([title, *state.message.split("\n")], "upper_left")
-        self._overlay.text([self._legend, "   ".join([*counts, "h: keys"])], "lower_right")
+        legend = "" if self._range_legend and not state.blended else self._legend
+        self._overlay.text([*self._range_legend.split("\n"), legend, "   ".join([*counts, "h: keys"])], "lower_right")
         self._overlay.help(wanted=state.help)
 
 

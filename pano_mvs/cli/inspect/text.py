@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.scene.range_map import confidence_name
 from pano_mvs.viewer.inspect.curve_text import curve_text
 from pano_mvs.viewer.inspect.inspection import Inspection
 
 _BLOCKS = "▁█△"
-_CONFIDENCES = ((0, "no range"), (63, "filled"), (127, "seen but weak"), (255, "consistent"))
 
 
 def as_json_value(found: Inspection) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def _verdict(found: Inspection) -> str:
 def _stage_table(found: Inspection) -> Table:
     table = Table("stage", "use", "range", "confidence")
     for one in found.stages:
-        kind = next(text for most, text in _CONFIDENCES if one.confidence <= most)
+        kind = confidence_name(one.confidence)
         shown = f"{one.range:.5g}" if math.isfinite(one.range) else "–"
         table.add_row(escape(one.stage), escape(one.use), shown, f"{one.confidence} {kind}")
     if math.isfinite(found.true_range):
