@@ -30,6 +30,8 @@ Units
 """
 
 from pano_mvs.core import kernel_cache
+from pano_mvs.geometry.fisheye import FisheyeLens
+from pano_mvs.geometry.lens_rig import LensRig
 from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import (
     pad_panorama,
@@ -61,6 +63,8 @@ from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_be
 kernel_cache.use_kernel_cache()
 
 __all__ = [
+    "FisheyeLens",
+    "LensRig",
     "PinholeView",
     "Rigid3",
     "Similarity3",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import cv2
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import LensRig
 from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.image_files.recent_pictures import RecentPictures
 from pano_mvs.scene.masks.cropping import inside_crop, placed_picture, same_shape
 from pano_mvs.scene.masks.masking import decode_mask, painted_over, placed_mask
-from pano_mvs.scene.record import Axis, FilePart, Record, require
+from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
 
 _RECENT = RecentPictures(limit_bytes=48 << 20)
 
@@ -40,6 +41,9 @@ class Panorama(Record):
         up_in_cam: the direction away from gravity by the camera's sensors, unit (3,), or None.
         heading_deg: compass heading of the image centre, or None.
         position_lla: (latitude deg, longitude deg, altitude m) from GPS, or None.
+        rig: the lenses from whose pictures the panorama was stitched, or None if they are not known.
+        first_lens: the file with the picture of the rig's first lens, or None without a rig.
+        second_lens: the file of the second lens; None if `first_lens` shows both side by side.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -55,6 +59,27 @@ class Panorama(Record):
     up_in_cam: tuple[float, float, float] | None = None
     heading_deg: float | None = None
     position_lla: tuple[float, float, float] | None = None
+    rig: LensRig | None = None
+    first_lens: FilePart | None = None
+    second_lens: FilePart | None = None
+
+    def to_parts(self) -> Parts:
+        """Return the panorama with its rig as JSON."""
+        parts = dict(super().to_parts())
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        if self.rig is not None:
+            parts["meta"] = meta | {"rig": self.rig.to_values()}
+        return parts
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the panorama from the result of `to_parts`."""
+        panorama = super().from_parts(parts)
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        rig = meta.get("rig")
+        return panorama if rig is None else replace(panorama, rig=LensRig.from_values(rig))
 
     def check(self) -> None:
         """Raise ContractError unless the sizes are those of full spheres."""

@@ -35,6 +35,7 @@ from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_localise import localise
+from pano_mvs.stages.rigs.dual_fisheye import dual_fisheye
 from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
@@ -54,6 +55,7 @@ __all__ = [
     "color",
     "confidence",
     "consistency",
+    "dual_fisheye",
     "exchange",
     "exhaustive",
     "extend",

@@ -123,7 +123,8 @@ def _check_pixels(path: Path, data: bytes, info: PictureInfo, *, max_pixels: int
     if info.gpano is None and is_dual_fisheye(picture):
         raise InputError(
             f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
-            "the camera maker's program first (stitching)"
+            "the camera maker's program (stitching), or, if the calibration of the lenses is known, use "
+            "source.dual_fisheye (docs/rigs.md)"
         )
 
 

@@ -111,6 +111,17 @@ def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArr
     return _first_hit(room, origin_in_world, rays_in_world)[0]
 
 
+def color_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray, *, pixel_rad: float) -> FloatArray:
+    """Return the colours (N, 3) in [0, 1] that a point (3,) sees along unit rays (N, 3), for pixels of that width."""
+    colors = np.zeros_like(rays_in_world)
+    for start in range(0, len(rays_in_world), _RAYS_AT_ONCE):
+        block = slice(start, start + _RAYS_AT_ONCE)
+        rays = rays_in_world[block]
+        hits = _first_hit(room, origin_in_world, rays)
+        colors[block] = _shaded(room, origin_in_world, rays, hits=hits, pixel_rad=pixel_rad)
+    return colors
+
+
 def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, size_hw: tuple[int, int]) -> None:
     """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
 

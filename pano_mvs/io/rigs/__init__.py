@@ -1,0 +1,1 @@
+"""Rigs of fisheye cameras: calibration files, and the pictures of their captures."""

@@ -1,0 +1,1 @@
+"""Stages for rigs of fisheye lenses."""

@@ -1,0 +1,83 @@
+"""A rig knows which lens a direction of its panorama comes from, and where that ray starts."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec, spiral_rays
+
+BACK = rotation_from_rotvec(np.array([0.02, np.pi - 0.03, 0.01]))
+
+
+def rig(distance: float = 2.0, field_deg: float = 200.0) -> LensRig:
+    lens = FisheyeLens((960, 960), (250.0, 252.0), (478.0, 483.0), (0.01, -0.002, 0.0, 0.0), np.radians(field_deg / 2))
+    return LensRig.centred(
+        ("front", "back"),
+        (lens, lens),
+        (Rigid3.identity(), Rigid3.from_center(BACK, (0.002, -0.003, -0.04))),
+        stitch_distance_m=distance,
+    )
+
+
+def test_the_origin_is_between_the_lenses_whatever_the_file_calls_the_origin() -> None:
+    assert rig().centers.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-15)
+    assert rig().centers[0] - rig().centers[1] == pytest.approx((-0.002, 0.003, 0.04))
+    assert 2 * rig().lens_offset_m == pytest.approx(np.linalg.norm((0.002, 0.003, 0.04)))
+
+
+@pytest.mark.parametrize("distance", [0.3, 2.0, np.inf])
+def test_true_rays_start_at_the_lens_and_pass_through_the_stitching_sphere(distance: float) -> None:
+    bearings = spiral_rays(500)
+    own = rig(distance)
+    origins, directions = own.rays_from_bearings(bearings)
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(1)
+    assert origins == pytest.approx(own.centers[own.lens_of_bearings(bearings)])
+    assert own.bearings_from_rays(origins, directions) == pytest.approx(bearings, abs=1e-14)
+    if np.isinf(distance):
+        assert directions == pytest.approx(bearings)
+    else:
+        assert np.cross(distance * bearings - origins, directions) == pytest.approx(np.zeros_like(bearings), abs=1e-14)
+
+
+def test_a_surface_at_another_distance_is_shifted_as_the_documentation_states() -> None:
+    own, range_m = rig(2.0), 0.8
+    towards = spiral_rays(2000)
+    for idx in (0, 1):
+        directions = range_m * towards - own.centers[idx]
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        shown = own.bearings_from_rays(np.broadcast_to(own.centers[idx], towards.shape), directions)
+        shift = np.linalg.norm(np.cross(shown, towards), axis=1).max()
+        assert shift == pytest.approx(own.lens_offset_m * (1 / range_m - 1 / 2.0), rel=0.05)
+
+
+def test_the_lens_is_the_one_that_sees_further_inside_its_field_of_view() -> None:
+    labels = rig().lens_of_bearings([(0, 0, 1), (0, 0, -1), (1, 0, 0.3), (1, 0, -0.3), (0, 1, 0.2)])
+    assert labels.tolist() == [0, 1, 0, 1, 0]
+    blind = rig(field_deg=170.0)
+    assert blind.lens_of_bearings((0, 1, 0)) == -1
+    assert blind.rays_from_bearings((0.0, 1.0, 0.0))[0].tolist() == [0, 0, 0]
+
+
+def test_beyond_the_border_of_its_picture_a_lens_sees_nothing() -> None:
+    lens = FisheyeLens((300, 960), (250.0, 250.0), (480.0, 150.0), (0.0, 0.0, 0.0, 0.0), np.radians(100))
+    both = LensRig.centred(("a", "b"), (lens, lens), (Rigid3.identity(), Rigid3.from_center(BACK, (0, 0, -0.04))))
+    assert both.lens_of_bearings([(0, 1, 1), (1, 0, 1)]).tolist() == [-1, 0]
+
+
+def test_values_survive_json_exactly() -> None:
+    for distance in (2.0, np.inf):
+        own = rig(distance)
+        again = LensRig.from_values(json.loads(json.dumps(own.to_values())))
+        assert again.to_values() == own.to_values()
+        assert again.lenses == own.lenses
+        assert again.stitch_distance_m == distance
+        assert np.array_equal(again.centers, own.centers)
+
+
+def test_a_stitching_distance_inside_of_the_rig_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"stitching distance of 0\.03 m is not outside of the rig"):
+        rig(0.03)

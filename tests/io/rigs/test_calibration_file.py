@@ -1,0 +1,127 @@
+"""A calibration file gives the rig that it states, or an error with file, line, key and remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.rigs.calibration_file import read_rig
+from pano_mvs.scene import FilePart
+from pano_mvs.testing.fisheye_rig import calibration_text, example_rig
+
+TEXT = """\
+model: opencv_fisheye
+first_pixel_px: 0
+lenses:
+  front:
+    image_size_px: [640, 480]
+    focal_px: [150.0, 151.0]
+    principal_point_px: [319.5, 239.5]
+    distortion: [0.01, 0, 0, 0]
+    field_of_view_deg: 190
+    lens_from_rig: {rotation_wxyz: [1, 0, 0, 0], translation_m: [0, 0, 0]}
+  back:
+    image_size_px: [640, 480]
+    focal_px: [150.0, 151.0]
+    principal_point_px: [320, 240]
+    distortion: [0.01, 0, 0, 0]
+    field_of_view_deg: 190
+    lens_from_rig:
+      rotation: [[-1, 0, 0], [0, 1, 0], [0, 0, -1]]
+      translation_m: [0, 0, -0.03]
+"""
+
+
+def file_of(folder: Path, text: str) -> FilePart:
+    (folder / "rig.yaml").write_text(text, encoding="utf-8")
+    return FilePart(folder / "rig.yaml")
+
+
+def test_a_rig_survives_its_own_calibration_file(tmp_path: Path) -> None:
+    rig = example_rig()
+    again = read_rig(file_of(tmp_path, calibration_text(rig)))
+    assert again.names == rig.names
+    for lens, expected in zip(again.lenses, rig.lenses, strict=True):
+        assert lens.size_hw == expected.size_hw
+        assert (*lens.focal_xy, *lens.principal_xy, *lens.distortion) == pytest.approx(
+            (*expected.focal_xy, *expected.principal_xy, *expected.distortion)
+        )
+        assert lens.max_angle_rad == pytest.approx(expected.max_angle_rad)
+    for pose, true in zip(again.lens_from_rig, rig.lens_from_rig, strict=True):
+        assert pose.rotation == pytest.approx(true.rotation, abs=1e-12)
+        assert pose.translation == pytest.approx(true.translation, abs=1e-12)
+
+
+def test_opencv_counts_pixels_from_the_centre_of_the_first(tmp_path: Path) -> None:
+    rig = read_rig(file_of(tmp_path, TEXT), stitch_distance_m=2.0)
+    assert rig.lenses[0].principal_xy == (320.0, 240.0)
+    assert rig.lenses[1].principal_xy == (320.5, 240.5)
+    assert rig.stitch_distance_m == 2.0
+    # Its centre is -Rᵀ t = (0, 0, -0.03) in the frame of the front lens.
+    assert rig.centers[0] - rig.centers[1] == pytest.approx((0, 0, 0.03))
+    assert rig.lens_of_bearings([(0, 0, 1), (0, 0, -1)]).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("opencv_fisheye", "pinhole", r"rig\.yaml:1:1: model: unknown model 'pinhole'.*kannala_brandt"),
+        ("first_pixel_px: 0", "first_pixel_px: 1", r"rig\.yaml:2:1: first_pixel_px: must be 0\.5 \(COLMAP\) or 0"),
+        ("first_pixel_px: 0\n", "", r"rig\.yaml:1:1: first_pixel_px is missing, and cannot be guessed"),
+        ("[640, 480]", "[640]", r"rig\.yaml:5:5: image_size_px: must be a list of 2 numbers: width and height"),
+        ("[640, 480]", "[640, 4.5]", r"rig\.yaml:5:5: image_size_px: must be two whole numbers"),
+        ("[150.0, 151.0]", "[150.0, -1]", r"rig\.yaml:6:5: focal_px: must be positive"),
+        ("[319.5, 239.5]", "[319.5, 500]", r"rig\.yaml:7:5: principal_point_px: is outside of the picture of 640×480"),
+        ("[0.01, 0, 0, 0]", "[-0.2, 0, 0, 0]", r"rig\.yaml:8:5: distortion: .* stops growing 74\.0°.*smaller field_of"),
+        (
+            "[0.01, 0, 0, 0]",
+            "[a, 0, 0, 0]",
+            r"rig\.yaml:8:5: distortion: must be a list of 4 numbers: k1, k2, k3 and k4",
+        ),
+        ("field_of_view_deg: 190", "field_of_view_deg: 0", r"rig\.yaml:9:5: field_of_view_deg: must be the full angle"),
+        ("    field_of_view_deg: 190\n", "", r"rig\.yaml:5:5: field_of_view_deg is missing"),
+        ("field_of_view_deg", "fov", r"rig\.yaml:9:5: fov: unknown key; the keys here are image_size_px"),
+        ("[1, 0, 0, 0]", "[1, 1, 0, 0]", r"rig\.yaml:10:21: rotation_wxyz: the length of the quaternion is not 1"),
+        ("[0, 0, 0]}", "[0, 0, 30]}", r"rig\.yaml:10:50: translation_m: is more than 10 metres"),
+        ("[[-1, 0, 0]", "[[1, 0, 0]", r"rig\.yaml:18:7: rotation: is not a rotation matrix"),
+        (", [0, 0, -1]]", "]", r"rig\.yaml:18:7: rotation: must be three rows of three numbers"),
+        ("lens_from_rig: {", "lens_from_rig: 3 #", r"rig\.yaml:10:5: lens_from_rig: must have the keys"),
+        ("  back:", "  front:", r"rig\.yaml:\d+:\d+: not valid YAML: found duplicate key"),
+        ("  back:", "  ba ck:", r"rig\.yaml:11:3: ba ck: the name 'ba ck' of a lens must consist of"),
+        ("[640, 480]", "[640, 480", r"rig\.yaml:\d+:\d+: not valid YAML"),
+    ],
+)
+def test_errors_state_file_line_key_and_remedy(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in TEXT
+    with pytest.raises(InputError, match=message) as error:
+        read_rig(file_of(tmp_path, TEXT.replace(old, new, 1)))
+    assert "docs/rigs.md" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "- 1\n", "3\n", "\x00", "model: kannala_brandt\nfirst_pixel_px: 0\nlenses: {a: 1}\n"]
+)
+def test_files_that_are_no_calibration_are_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match=r"rig\.yaml.*docs/rigs\.md"):
+        read_rig(file_of(tmp_path, text))
+
+
+def test_a_stitching_distance_inside_of_the_rig_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"rig\.yaml: the stitching distance of 0\.01 m .* Give a larger stitch_distance_m"
+    ):
+        read_rig(file_of(tmp_path, TEXT), stitch_distance_m=0.01)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nothing\.yaml: cannot be read"):
+        read_rig(FilePart(tmp_path / "nothing.yaml"))
+
+
+def test_names_of_lenses_are_those_of_the_file(tmp_path: Path) -> None:
+    rig = read_rig(file_of(tmp_path, TEXT.replace("front", "left").replace("back", "right")))
+    assert rig.names == ("left", "right")
+    assert np.isinf(rig.stitch_distance_m)
