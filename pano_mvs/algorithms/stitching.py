@@ -73,12 +73,11 @@ def lens_weights(margins_rad: FloatArray, *, blend_rad: float) -> FloatArray:
         blend_rad: width of the strip around the seam in which both weights are positive.
     """
     seen = np.isfinite(margins_rad)
-    any_seen: NDArray[np.bool_] = seen.any(axis=-1, keepdims=True)
     first, second = np.moveaxis(np.where(seen, margins_rad, 0.0), -1, 0)
     # Away from the seam, one margin grows as the other shrinks.
     share = np.clip(0.5 + (second - first) / (2 * max(blend_rad, 1e-9)), 0.0, 1.0)
     share = np.where(seen[..., 0], np.where(seen[..., 1], share, 0.0), 1.0)
-    return np.where(any_seen, np.stack([1 - share, share], axis=-1), 0.0)
+    return np.where((seen[..., 0] | seen[..., 1])[..., None], np.stack([1 - share, share], axis=-1), 0.0)
 
 
 def _reduced(picture: Picture, lens: FisheyeLens, width: int) -> tuple[Picture, FloatArray]:

@@ -123,13 +123,24 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     """Refine all poses and points by angular bundle adjustment, with errors in degrees on the sphere instead of pixels.
 
     Between two adjustments, patches of the images are aligned, which locates the observations more precisely than the
-    detector and estimates their precision. Groups of poses are adjusted one by one.
+    detector and estimates their precision. Groups of poses are adjusted one by one. For panoramas of
+    source.dual_fisheye, the ray of each observation starts at the centre of its lens. If the distance of the lenses
+    determines the unit of length to 10 %, the poses are in metres.
     """
+    rigs = {name: image.rig for name, image in images.items() if image.rig is not None}
     refined = refine_poses(
         poses,
         **arguments_from(refine_poses, params),
         load=panorama_loader(images) if params.align else None,
+        rigs=rigs,
     )
+    if refined.metric and not poses.metric:
+        ctx.note(f"unit of length: {refined.scale}")
+    elif rigs and not refined.metric:
+        ctx.note(
+            "the distance between the lenses does not determine the unit of length here, so their offsets were "
+            "ignored; if it matters, add poses.scale before poses.refine"
+        )
     largest = split_groups(refined)[0]
     if largest.center_stds is not None and largest.rotation_stds_rad is not None:
         ctx.metric("center_std_median", np.nanmedian(largest.center_stds))

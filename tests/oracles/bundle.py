@@ -17,9 +17,9 @@ def tangent_residuals(bundle: Bundle, bases: FloatArray, steps: FloatArray) -> F
     camera_steps = steps[: 6 * cameras].reshape(cameras, 6)
     points = bundle.points + steps[6 * cameras :].reshape(-1, 3)
     residuals = []
-    for point, image, basis in zip(bundle.point_idx, bundle.image_idx, bases, strict=True):
+    for point, image, basis, origin in zip(bundle.point_idx, bundle.image_idx, bases, bundle.origins, strict=True):
         rotation = rotation_from_rotvec(camera_steps[image, :3]) @ bundle.rotations[image]
-        x = rotation @ (points[point] - bundle.centers[image] - camera_steps[image, 3:])
+        x = rotation @ (points[point] - bundle.centers[image] - camera_steps[image, 3:]) - origin
         residuals.append(basis.T @ x / np.linalg.norm(x))
     return np.concatenate(residuals)
 

@@ -245,15 +245,27 @@ def bundle_of(rng: np.random.Generator, *, cameras: int = 4, points: int = 60, n
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_bundle")
-def test_kernel_equals_the_dense_system() -> None:
+@pytest.mark.parametrize("units_per_m", [0.0, 0.7])
+def test_kernel_equals_the_dense_system(units_per_m: float) -> None:
     rng = np.random.default_rng(16)
     bundle = bundle_of(rng, points=15, noise_deg=3.0)
+    offsets_m = rng.normal(0, 0.3, bundle.bearings.shape)
+    bundle = replace(bundle, offsets_m=offsets_m, units_per_m=units_per_m)
     bases = tangent_basis(bundle.bearings)
     weights = rng.uniform(0.1, 1.0, size=len(bundle.bearings))
     starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
     width = 6 * (camera_span(starts, bundle.image_idx) + 1)
     band, gradient, diagonal, *_ = reduced_system(
-        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, 0.01, width
+        bundle.rotations,
+        bundle.centers,
+        bundle.points,
+        starts,
+        bundle.image_idx,
+        bases,
+        bundle.origins,
+        weights,
+        0.01,
+        width,
     )
     lower = dense_from_band(band)
     system = np.tril(lower) + np.tril(lower, -1).T
@@ -265,9 +277,17 @@ def test_kernel_equals_the_dense_system() -> None:
 
 @pytest.mark.kernel("poses.adjustment.kernels_bundle")
 def test_compiled_errors_are_those_of_the_bundle() -> None:
-    bundle = bundle_of(np.random.default_rng(21), points=15, noise_deg=3.0)
+    rng = np.random.default_rng(21)
+    bundle = bundle_of(rng, points=15, noise_deg=3.0)
+    bundle = replace(bundle, offsets_m=rng.normal(0, 0.3, bundle.bearings.shape), units_per_m=0.7)
     found = ray_errors(
-        bundle.rotations, bundle.centers, bundle.points, bundle.point_idx, bundle.image_idx, bundle.bearings
+        bundle.rotations,
+        bundle.centers,
+        bundle.points,
+        bundle.point_idx,
+        bundle.image_idx,
+        bundle.bearings,
+        bundle.origins,
     )
     np.testing.assert_allclose(found, bundle.errors_rad(), atol=1e-12)
 

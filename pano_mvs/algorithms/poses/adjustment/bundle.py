@@ -33,6 +33,8 @@ class Bundle:
         image_idx: (T,).
         bearings: (T, 3) unit rays in the camera.
         sigmas: (T,) standard deviation of each ray relative to a typical one, positive; None if all are equal.
+        offsets_m: (T, 3) where each ray starts in its camera's frame, in metres; None if all start at the centre.
+        units_per_m: units of the world per metre, by which the offsets are multiplied; 0 ignores them.
     """
 
     rotations: FloatArray
@@ -42,6 +44,19 @@ class Bundle:
     image_idx: IndexArray
     bearings: FloatArray
     sigmas: FloatArray | None = None
+    offsets_m: FloatArray | None = None
+    units_per_m: float = 0.0
+
+    @property
+    def origins(self) -> FloatArray:
+        """Where each ray starts in its camera's frame, (T, 3), in units of the world."""
+        return np.zeros_like(self.bearings) if self.offsets_m is None else self.units_per_m * self.offsets_m
+
+    def rays_in_cam(self) -> FloatArray:
+        """Return the vectors from the rays' origins to their points, (T, 3), in the camera frames."""
+        towards = self.points[self.point_idx] - self.centers[self.image_idx]
+        rays: FloatArray = np.einsum("tij,tj->ti", self.rotations[self.image_idx], towards)
+        return rays if self.offsets_m is None else rays - self.origins
 
     def check(self) -> None:
         """Raise UsageError unless observations are sorted by point, every point has one, and sigmas are positive."""
@@ -52,9 +67,7 @@ class Bundle:
 
     def errors_rad(self) -> FloatArray:
         """Return the angle between every observed ray and the ray to its point, (T,), in [0, π]."""
-        in_cam = np.einsum(
-            "tij,tj->ti", self.rotations[self.image_idx], self.points[self.point_idx] - self.centers[self.image_idx]
-        )
+        in_cam = self.rays_in_cam()
         sine = np.linalg.norm(np.cross(self.bearings, in_cam), axis=1)
         angles: FloatArray = np.arctan2(sine, np.sum(self.bearings * in_cam, axis=1))
         return angles
@@ -81,8 +94,9 @@ def adjust_bundle(
 ) -> Bundle:
     """Minimise the robust sum of squared angular errors; one camera stays fixed.
 
-    Errors are divided by the sigmas of their observations, so precise rays have more weight than coarse ones. The
-    scale, which only the gauge determines, stays near its initial value because of the damping.
+    Errors are divided by the sigmas of their observations, so precise rays have more weight than coarse ones. If all
+    rays start at the centres, only the gauge determines the scale, which stays near its initial value because of the
+    damping. Rays with offsets determine it.
 
     Args:
         bundle: initial values.
@@ -128,7 +142,7 @@ def _adjust_ordered(
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import ray_errors
 
     layout = _Layout.of(bundle)
-    observed = bundle.point_idx, bundle.image_idx, bundle.bearings
+    observed = bundle.point_idx, bundle.image_idx, bundle.bearings, layout.origins
 
     def scaled_errors_rad(of: Bundle) -> FloatArray:
         errors: FloatArray = ray_errors(of.rotations, of.centers, of.points, *observed)
@@ -197,18 +211,20 @@ class _Layout:
         starts: (P + 1,) the observations of point p are starts[p] to starts[p + 1].
         width: width of the band, see `camera_system`.
         bases: (T, 3, 2) two vectors normal to each observed ray.
+        origins: (T, 3) where each ray starts in its camera's frame.
     """
 
     starts: NDArray[np.intp]
     width: int
     bases: FloatArray
+    origins: FloatArray
 
     @staticmethod
     def of(bundle: Bundle) -> _Layout:
         """Return the layout of a bundle."""
         starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
         width = 6 * (camera_span(starts, bundle.image_idx) + 1)
-        return _Layout(starts, width, tangent_basis(bundle.bearings))
+        return _Layout(starts, width, tangent_basis(bundle.bearings), bundle.origins)
 
 
 def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
@@ -227,6 +243,7 @@ def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, da
             layout.starts,
             bundle.image_idx,
             layout.bases,
+            layout.origins,
             weights,
             damping,
             layout.width,

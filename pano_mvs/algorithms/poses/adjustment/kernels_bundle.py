@@ -1,8 +1,8 @@
 """Compiled: the reduced camera system of bundle adjustment (Schur complement), point by point.
 
-The residual of an observation is r = Bᵀ x / |x| with x = R (X − C) and B (3, 2) the tangent plane of the observed
-ray: it is the sine of the angular error anywhere on the sphere. Triggs et al., "Bundle Adjustment — A Modern
-Synthesis", 2000, section 6.1.
+The residual of an observation is r = Bᵀ x / |x| with x = R (X − C) − o, where o is the origin of the observed ray in
+the camera frame (zero for a central camera) and B (3, 2) the tangent plane of the ray: it is the sine of the angular
+error anywhere on the sphere. Triggs et al., "Bundle Adjustment — A Modern Synthesis", 2000, section 6.1.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ def _derivatives(
     centers: FloatArray,
     points: FloatArray,
     bases: FloatArray,
+    origins: FloatArray,
     weights: FloatArray,
     t: int,
     k: int,
@@ -33,7 +34,8 @@ def _derivatives(
     r00, r01, r02 = rotations[k, 0, 0], rotations[k, 0, 1], rotations[k, 0, 2]
     r10, r11, r12 = rotations[k, 1, 0], rotations[k, 1, 1], rotations[k, 1, 2]
     r20, r21, r22 = rotations[k, 2, 0], rotations[k, 2, 1], rotations[k, 2, 2]
-    x0, x1, x2 = r00 * dx + r01 * dy + r02 * dz, r10 * dx + r11 * dy + r12 * dz, r20 * dx + r21 * dy + r22 * dz
+    y0, y1, y2 = r00 * dx + r01 * dy + r02 * dz, r10 * dx + r11 * dy + r12 * dz, r20 * dx + r21 * dy + r22 * dz
+    x0, x1, x2 = y0 - origins[t, 0], y1 - origins[t, 1], y2 - origins[t, 2]
     inverse = 1.0 / np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
     root = np.sqrt(weights[t])
     for k2 in range(2):
@@ -43,10 +45,10 @@ def _derivatives(
         d0 = root * (b0 - along * x0 * inverse) * inverse
         d1 = root * (b1 - along * x1 * inverse) * inverse
         d2 = root * (b2 - along * x2 * inverse) * inverse
-        # R ← exp(ω) R gives ∂x/∂ω = −[x]×
-        rows[k2, 0] = d2 * x1 - d1 * x2
-        rows[k2, 1] = d0 * x2 - d2 * x0
-        rows[k2, 2] = d1 * x0 - d0 * x1
+        # R ← exp(ω) R gives ∂x/∂ω = −[y]× with y = R (X − C)
+        rows[k2, 0] = d2 * y1 - d1 * y2
+        rows[k2, 1] = d0 * y2 - d2 * y0
+        rows[k2, 2] = d1 * y0 - d0 * y1
         by_x = d0 * r00 + d1 * r10 + d2 * r20
         by_y = d0 * r01 + d1 * r11 + d2 * r21
         by_z = d0 * r02 + d1 * r12 + d2 * r22
@@ -168,6 +170,7 @@ def reduced_system(
     starts: NDArray[np.intp],
     image_idx: NDArray[np.int32],
     bases: FloatArray,
+    origins: FloatArray,
     weights: FloatArray,
     damping: float,
     width: int,
@@ -192,7 +195,7 @@ def reduced_system(
         block[:] = 0.0
         for t in range(starts[p], starts[p + 1]):
             k = image_idx[t]
-            _derivatives(rotations, centers, points, bases, weights, t, k, p, rows)
+            _derivatives(rotations, centers, points, bases, origins, weights, t, k, p, rows)
             _add_observation(rows, t, 6 * k, p, band, gradient, diagonal, couplings, block, point_gradients)
         for i in range(3):
             block[i, i] *= 1.0 + damping
@@ -236,14 +239,15 @@ def ray_errors(
     point_idx: NDArray[np.int32],
     image_idx: NDArray[np.int32],
     bearings: FloatArray,
+    origins: FloatArray,
 ) -> FloatArray:
-    """Return the angle between every observed ray and the one to its point, (T,)."""
+    """Return the angle between every observed ray and the one from its origin to its point, (T,)."""
     errors = np.empty(len(point_idx))
     for t in range(len(point_idx)):
         k, p = image_idx[t], point_idx[t]
         dx, dy, dz = points[p, 0] - centers[k, 0], points[p, 1] - centers[k, 1], points[p, 2] - centers[k, 2]
-        x = rotations[k, 0, 0] * dx + rotations[k, 0, 1] * dy + rotations[k, 0, 2] * dz
-        y = rotations[k, 1, 0] * dx + rotations[k, 1, 1] * dy + rotations[k, 1, 2] * dz
-        z = rotations[k, 2, 0] * dx + rotations[k, 2, 1] * dy + rotations[k, 2, 2] * dz
+        x = rotations[k, 0, 0] * dx + rotations[k, 0, 1] * dy + rotations[k, 0, 2] * dz - origins[t, 0]
+        y = rotations[k, 1, 0] * dx + rotations[k, 1, 1] * dy + rotations[k, 1, 2] * dz - origins[t, 1]
+        z = rotations[k, 2, 0] * dx + rotations[k, 2, 1] * dy + rotations[k, 2, 2] * dz - origins[t, 2]
         errors[t] = angle_between(bearings[t, 0], bearings[t, 1], bearings[t, 2], x, y, z)
     return errors

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated
 
@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.uncertainty import camera_deviations
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
+from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import LensRig
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
@@ -24,6 +27,10 @@ FloatArray = NDArray[np.float64]
 _ROUNDS = 3
 # The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
+_OFFSET_ROUNDS, _WIDE = 10, 4
+_SAME_SCALE = 0.02  # relative difference of two estimates
+# Offsets that determine the unit of length less well than this are too small to matter.
+_MAX_SCALE_STD = 0.1
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 # Sigma of a key point in a panorama of 1024 columns, a fifth of a pixel, to which the scale of the loss refers.
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
@@ -38,6 +45,7 @@ def refine_poses(
     max_error_deg: Annotated[float, Setting("observations with a larger error are dropped", gt=0)] = 0.4,
     max_iterations: Annotated[int, Setting("maximum number of iterations in each round", ge=1)] = 50,
     load: Callable[[str], Picture] | None = None,
+    rigs: Mapping[str, LensRig] | None = None,
 ) -> Poses:
     """Refine poses and points by minimising the robust sum of squared angles between observed and predicted rays.
 
@@ -51,6 +59,11 @@ def refine_poses(
     If the images are given, observations are then refined by aligning patches, each with its precision (see
     `align_tracks`), and everything is adjusted once more. This halves the error if key points are few or coarse.
 
+    Panoramas that were stitched from two lenses are not central cameras: with their rigs, each ray starts at the centre
+    of its lens. The distance of the lenses then also determines the unit of length. If it is determined to 10 %, the
+    poses are in metres, and `scale` states the uncertainty; otherwise the offsets are ignored, unless the poses were in
+    metres before. `track_bearings` remain bearings of the panoramas.
+
     Args:
         poses: poses with tracks; poses without tracks are returned unchanged.
         loss: "huber" or "cauchy".
@@ -59,46 +72,125 @@ def refine_poses(
         max_iterations: maximum number of steps in each round.
         max_error_deg: observations with a larger error are dropped.
         load: returns the panorama and the mask of an image by its name; None keeps the observations as they are.
+        rigs: image name to the lenses of its panorama; other images are central cameras.
 
     Raises:
         UsageError: if a setting is out of bounds.
     """
-    refined = partial(
-        _refined,
-        loss=loss,
-        loss_scale_deg=loss_scale_deg,
-        max_iterations=max_iterations,
-        max_error_deg=max_error_deg,
-    )
+    settings = _Settings(loss, loss_scale_deg, max_error_deg, max_iterations)
+    if rigs:
+        return per_group(poses, lambda group: _refined_with_rigs(group, settings, rigs, load=load))
+    return _refined_centrally(poses, settings, load=load)
+
+
+@dataclass(frozen=True, slots=True)
+class _Settings:
+    """The settings of `refine_poses`."""
+
+    loss: Loss
+    loss_scale_deg: float
+    max_error_deg: float
+    max_iterations: int
+
+
+def _refined_centrally(poses: Poses, settings: _Settings, *, load: Callable[[str], Picture] | None) -> Poses:
+    """Return poses whose rays all start at the centres of their cameras, refined."""
+
+    def refined(group: Poses, rounds: int) -> Poses:
+        bundle, colors = _adjusted(*_bundle(group), settings, rounds=rounds)
+        refined = _with_uncertainty(_poses(group, bundle, colors), bundle, settings, first_neighbour(group.centers))
+        return in_gauge_of(refined, group.centers)
+
     adjusted = per_group(poses, partial(refined, rounds=_ROUNDS))
     return adjusted if load is None else per_group(align_tracks(adjusted, load), partial(refined, rounds=1))
 
 
-def _refined(
-    poses: Poses, *, loss: Loss, loss_scale_deg: float, max_iterations: int, max_error_deg: float, rounds: int
+def _refined_with_rigs(
+    poses: Poses, settings: _Settings, rigs: Mapping[str, LensRig], *, load: Callable[[str], Picture] | None
 ) -> Poses:
-    """Return one group, refined."""
-    bundle, colors = _bundle(poses)
+    """Return one group, refined with the true rays of the lenses."""
+    neighbour = first_neighbour(poses.centers)
+    own_rigs = [rigs.get(name) for name in poses.names]
+    if not neighbour or not any(own_rigs) or not len(poses.track_point_idx):
+        return _refined_centrally(poses, settings, load=load)
+    estimate = partial(_offset_scale, settings=settings, neighbour=neighbour)
+    bundle, colors = _with_offsets(*_bundle(poses), own_rigs)
+    if poses.metric:
+        bundle = replace(bundle, units_per_m=1.0)
+    else:
+        found = _with_unit(bundle, colors, settings, estimate)
+        if found is None:
+            return _refined_centrally(poses, settings, load=load)
+        bundle = found
+    adjusted, colors = _adjusted(bundle, colors, settings, rounds=_ROUNDS)
+    refined = _poses(poses, adjusted, colors, own_rigs)
+    if load is not None:
+        aligned, colors = _with_offsets(*_bundle(align_tracks(refined, load)), own_rigs)
+        adjusted, colors = _adjusted(replace(aligned, units_per_m=bundle.units_per_m), colors, settings, rounds=1)
+        refined = _poses(refined, adjusted, colors, own_rigs)
+    refined = _with_uncertainty(refined, adjusted, settings, neighbour)
+    if poses.metric:
+        return in_gauge_of(refined, poses.centers)
+    return _in_metres(refined, adjusted, own_rigs, std=estimate(adjusted).relative_std)
+
+
+def _with_unit(
+    bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, estimate: Callable[[Bundle], OffsetScale]
+) -> Bundle | None:
+    """Return a bundle with its units per metre and rough cameras; None if the offsets do not determine the unit."""
+    for _ in range(_OFFSET_ROUNDS):
+        # Until the offsets are known in units of the world, no observation can be called an outlier.
+        rough, _unused = _adjusted(bundle, colors, settings, rounds=1, widen=_WIDE)
+        scale = estimate(rough)
+        if not scale.relative_std < _MAX_SCALE_STD:
+            return None
+        known = abs(scale.units_per_m - bundle.units_per_m) < _SAME_SCALE * scale.units_per_m
+        bundle = replace(bundle, rotations=rough.rotations, centers=rough.centers, units_per_m=scale.units_per_m)
+        if known:
+            return bundle
+    return None
+
+
+def _in_metres(poses: Poses, bundle: Bundle, rigs: Sequence[LensRig | None], *, std: float) -> Poses:
+    """Return poses of one group in metres, by the offsets of their lenses."""
+    distance_mm = 2000 * np.median([rig.lens_offset_m for rig in rigs if rig is not None])
+    origin = f"the distance of {distance_mm:.3g} mm between the lens centres, uncertain by {100 * std:.1f} %"
+    return scaled_poses(poses, 1 / bundle.units_per_m, origin=origin)
+
+
+def _offset_scale(bundle: Bundle, *, settings: _Settings, neighbour: int) -> OffsetScale:
+    return estimate_offset_scale(
+        bundle, loss=settings.loss, scale_rad=float(np.deg2rad(settings.loss_scale_deg)), neighbour=neighbour
+    )
+
+
+def _adjusted(
+    bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, *, rounds: int, widen: int = 1
+) -> tuple[Bundle, NDArray[np.uint8]]:
+    """Return one group's bundle after some rounds of adjustment, without outliers."""
+    max_error_rad = float(np.deg2rad(settings.max_error_deg)) * widen
     for round_idx in range(rounds):
         # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
-        widen = 2 ** (rounds - 1 - round_idx)
-        bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg * widen)))
+        wider = 2 ** (rounds - 1 - round_idx) * widen
+        bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)))
         bundle = adjust_bundle(
             bundle,
-            loss=loss,
-            scale_rad=float(np.deg2rad(loss_scale_deg * widen)),
-            max_iterations=max_iterations,
+            loss=settings.loss,
+            scale_rad=float(np.deg2rad(settings.loss_scale_deg * wider)),
+            max_iterations=settings.max_iterations,
             tolerance=_TOLERANCES[round_idx],
         )
-    bundle, colors = _without_outliers(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg)))
-    refined = _poses(poses, bundle, colors)
-    neighbour = first_neighbour(poses.centers)
-    if neighbour and len(bundle.points):
-        centers, rotations = camera_deviations(
-            bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg)), neighbour=neighbour
-        )
-        refined = replace(refined, center_stds=centers, rotation_stds_rad=rotations)
-    return in_gauge_of(refined, poses.centers)
+    return _without_outliers(bundle, colors, max_error_rad=max_error_rad)
+
+
+def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, neighbour: int) -> Poses:
+    """Return refined poses with the standard deviations of their cameras, given the distance of one to the first."""
+    if not neighbour or not len(bundle.points):
+        return poses
+    centers, rotations = camera_deviations(
+        bundle, loss=settings.loss, scale_rad=float(np.deg2rad(settings.loss_scale_deg)), neighbour=neighbour
+    )
+    return replace(poses, center_stds=centers, rotation_stds_rad=rotations)
 
 
 def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
@@ -118,11 +210,38 @@ def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
     return bundle, np.array(poses.point_colors_rgb)[seen]
 
 
+def _with_offsets(
+    bundle: Bundle, colors: NDArray[np.uint8], rigs: Sequence[LensRig | None]
+) -> tuple[Bundle, NDArray[np.uint8]]:
+    """Replace the bearings of stitched panoramas by the rays of their lenses."""
+    offsets_m, bearings = np.zeros_like(bundle.bearings), bundle.bearings.copy()
+    for idx, rig in enumerate(rigs):
+        if rig is not None:
+            own = bundle.image_idx == idx
+            offsets_m[own], bearings[own] = rig.rays_from_bearings(bundle.bearings[own])
+    return replace(bundle, bearings=bearings, offsets_m=offsets_m), colors
+
+
+def _stitched_bearings(bundle: Bundle, rigs: Sequence[LensRig | None]) -> FloatArray:
+    """Return the bearings in the panoramas of the rays of a bundle: `_with_offsets`, inverted."""
+    assert bundle.offsets_m is not None
+    bearings = bundle.bearings.copy()
+    for idx, rig in enumerate(rigs):
+        if rig is not None:
+            own = bundle.image_idx == idx
+            bearings[own] = rig.bearings_from_rays(bundle.offsets_m[own], bundle.bearings[own])
+    return bearings
+
+
 def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
     """Triangulate all points again, and keep the observations and points that fit."""
+    world_from_cam = np.swapaxes(bundle.rotations, 1, 2)[bundle.image_idx]
+    starts = bundle.centers[bundle.image_idx]
+    if bundle.offsets_m is not None:
+        starts = starts + np.einsum("tij,tj->ti", world_from_cam, bundle.origins)
     found = triangulate_observations(
-        bundle.centers[bundle.image_idx],
-        np.einsum("tji,tj->ti", bundle.rotations[bundle.image_idx], bundle.bearings),
+        starts,
+        np.einsum("tij,tj->ti", world_from_cam, bundle.bearings),
         bundle.point_idx,
         count=len(bundle.points),
         max_error_rad=max_error_rad,
@@ -150,11 +269,14 @@ def _selected(
         image_idx=bundle.image_idx[used],
         bearings=bundle.bearings[used],
         sigmas=None if bundle.sigmas is None else bundle.sigmas[used],
+        offsets_m=None if bundle.offsets_m is None else bundle.offsets_m[used],
     )
     return selected, colors[valid]
 
 
-def _poses(poses: Poses, bundle: Bundle, colors: NDArray[np.uint8]) -> Poses:
+def _poses(
+    poses: Poses, bundle: Bundle, colors: NDArray[np.uint8], rigs: Sequence[LensRig | None] | None = None
+) -> Poses:
     count = len(bundle.points)
     sizes = np.maximum(np.bincount(bundle.point_idx, minlength=count), 1)
     errors = np.bincount(bundle.point_idx, bundle.errors_rad(), count) / sizes
@@ -167,6 +289,6 @@ def _poses(poses: Poses, bundle: Bundle, colors: NDArray[np.uint8]) -> Poses:
         point_errors_rad=errors.astype(np.float32),
         track_point_idx=bundle.point_idx,
         track_image_idx=bundle.image_idx,
-        track_bearings=bundle.bearings,
+        track_bearings=bundle.bearings if rigs is None else _stitched_bearings(bundle, rigs),
         track_sigmas_rad=None if bundle.sigmas is None else (bundle.sigmas * _USUAL_SIGMA_RAD).astype(np.float32),
     )

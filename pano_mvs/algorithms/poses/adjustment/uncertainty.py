@@ -2,17 +2,65 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, reduced_cameras, with_camera_order
+from pano_mvs.algorithms.poses.adjustment.bundle import (
+    Bundle,
+    Loss,
+    ReducedCameras,
+    reduced_cameras,
+    with_camera_order,
+)
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, held
 
 FloatArray = NDArray[np.float64]
 
 _COLUMNS_AT_ONCE = 64  # cameras
 _HELD_LENGTH = 1e6  # stiffness of the unit of length, relative to the stiffest camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldCameras:
+    """The reduced system of the cameras with the first camera and the length of the first baseline held.
+
+    Attributes:
+        bundle: the bundle with its cameras in the order of the system.
+        place: (N,) position of each camera in that order.
+        weights: (T,) of the squared errors.
+        system: the reduced system, without the constraints.
+        band: the matrix with the constraints.
+        unseen: (N,) cameras without observations, in the order of the system.
+        variance: of a residual with weight 1.
+    """
+
+    bundle: Bundle
+    place: NDArray[np.intp]
+    weights: FloatArray
+    system: ReducedCameras
+    band: FloatArray
+    unseen: NDArray[np.bool_]
+    variance: float
+
+
+def held_cameras(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> HeldCameras:
+    """Return the system of an adjusted bundle; the parameters are those of `camera_deviations`."""
+    order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
+    place = np.argsort(order)
+    ordered = with_camera_order(bundle, order, place)
+    weights = ordered.weights(ordered.scaled_errors_rad(), loss=loss, scale_rad=scale_rad)
+    errors = ordered.errors_rad()
+    system = reduced_cameras(ordered, weights, damping=0.0)
+    band, _ = held(system.band, system.gradient, int(place[0]))
+    _hold_length(band, ordered.centers, int(place[0]), neighbour=int(place[neighbour]))
+    unseen = system.diagonal.reshape(-1, 6)[:, 0] == 0
+    band[np.repeat(unseen, 6), 0] = 1.0
+    redundancy = 2 * len(errors) - 6 * len(bundle.centers) - 3 * len(bundle.points) + 7
+    variance = float(np.sum(weights * errors**2)) / max(redundancy, 1)
+    return HeldCameras(ordered, place, weights, system, band, unseen, variance)
 
 
 def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> tuple[FloatArray, FloatArray]:
@@ -34,18 +82,9 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
         in radians. Zero for the first camera; NaN if unknown: for a camera without observations, or if the system is
         singular.
     """
-    order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
-    place = np.argsort(order)
-    ordered = with_camera_order(bundle, order, place)
-    weights = ordered.weights(ordered.scaled_errors_rad(), loss=loss, scale_rad=scale_rad)
-    errors = ordered.errors_rad()
-    system = reduced_cameras(ordered, weights, damping=0.0)
-    band, _ = held(system.band, system.gradient, int(place[0]))
-    _hold_length(band, ordered.centers, int(place[0]), neighbour=int(place[neighbour]))
-    unseen = system.diagonal.reshape(-1, 6)[:, 0] == 0
-    band[np.repeat(unseen, 6), 0] = 1.0
-    redundancy = 2 * len(errors) - 6 * len(bundle.centers) - 3 * len(bundle.points) + 7
-    variance = float(np.sum(weights * errors**2)) / max(redundancy, 1)
+    held_system = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
+    place, band, unseen = held_system.place, held_system.band, held_system.unseen
+    variance = held_system.variance
     try:
         diagonal = variance * _inverse_diagonal(band)
     except LinAlgError:
