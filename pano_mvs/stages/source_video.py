@@ -1,4 +1,4 @@
-"""Panoramas from videos: the sharpest frame around each of a series of equally spaced times."""
+"""Panoramas from videos: frames at equally spaced times, or wherever the camera has moved."""
 
 from __future__ import annotations
 
@@ -13,16 +13,27 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
+from pano_mvs.algorithms.keyframes import parallax, selection
+from pano_mvs.algorithms.keyframes.parallax import REDUCED_HW, reduced_grey
+from pano_mvs.algorithms.keyframes.selection import KeyframeSettings, SmallFrame, select_keyframes
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import plural
+from pano_mvs.io.images.keyframe_file import keyframe_file, read_times, store_times
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.stages.source import working_size
 
+# Motion is measured in at most this number of frames per second.
+_MEASURED_PER_S = 15.0
+_TOO_FEW = {
+    "time": "Set a smaller every_s",
+    "motion": "The camera hardly moves. Set a smaller motion_deg, keyframes: time",
+}
 _TIME_IN_NAME = re.compile(r".*_(\d{8,})ms\.png")
 
 
@@ -32,11 +43,29 @@ class VideoParams(Params):
     path: SourcePath | list[SourcePath] = Field(
         description="an equirectangular video, a list of videos, or a folder of videos"
     )
+    keyframes: Literal["time", "motion"] = Field(
+        default="time",
+        description="time: frames at equal steps; motion: a frame wherever the scene has moved by `motion_deg`",
+    )
     every_s: float | None = Field(default=None, gt=0, description="time between frames in seconds; 1 by default")
     every_frames: int | None = Field(default=None, ge=1, description="the same as a number of frames of the video")
     pick: Literal["sharpest", "nearest"] = Field(
         default="sharpest",
         description="frame to use within a quarter of a step: the sharpest, or the nearest",
+    )
+    motion_deg: Annotated[float, NOT_IN_KEY] = Field(
+        default=8.0,
+        ge=1,
+        le=45,
+        description="with keyframes: motion, the median parallax between frames; rotation of the camera does not count",
+    )
+    min_s: Annotated[float, NOT_IN_KEY] = Field(
+        default=0.2, ge=0, description="with keyframes: motion, the minimum time between frames in seconds"
+    )
+    max_s: Annotated[float | None, NOT_IN_KEY] = Field(
+        default=None,
+        gt=0,
+        description="with keyframes: motion, the maximum time between frames, even if the camera stands",
     )
     start_s: Annotated[float, NOT_IN_KEY] = Field(default=0.0, ge=0, description="start time in the video, in seconds")
     end_s: Annotated[float | None, NOT_IN_KEY] = Field(
@@ -54,6 +83,10 @@ class VideoParams(Params):
     def _one_step(self) -> VideoParams:
         if self.every_s is not None and self.every_frames is not None:
             raise ValueError("give every_s or every_frames, not both")
+        if self.keyframes == "motion" and (self.every_s is not None or self.every_frames is not None):
+            raise ValueError("every_s and every_frames are steps in time: use motion_deg with keyframes: motion")
+        if self.max_s is not None and self.max_s < self.min_s:
+            raise ValueError("max_s must not be less than min_s")
         if self.end_s is not None and self.end_s <= self.start_s:
             raise ValueError("end_s must be greater than start_s")
         return self
@@ -61,6 +94,11 @@ class VideoParams(Params):
     def step_s(self, info: VideoInfo) -> float:
         """Return the time between frames in seconds."""
         return self.every_frames / info.frames_per_s if self.every_frames is not None else self.every_s or 1.0
+
+    def reach_s(self, info: VideoInfo) -> float:
+        """Return how far a frame may be from the time in its name, in seconds."""
+        step_s = 2 / _MEASURED_PER_S if self.keyframes == "motion" else self.step_s(info)
+        return max(step_s / 4, 0.51 / info.frames_per_s)
 
 
 def list_frames(params: VideoParams) -> Iterator[SourceItem]:
@@ -82,7 +120,7 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
             raise first_error
         raise InputError(
             f"{items[0].files['video'] if items else params.path}: gives {len(items)} {plural(len(items), 'frame')}; "
-            "depth needs two or more. Set a smaller every_s, or another start_s and end_s"
+            f"depth needs two or more. {_TOO_FEW[params.keyframes]}, or another start_s and end_s"
         )
     yield from (replace(item, notes=tuple(unread)) for item in items)
     yield from failed
@@ -90,10 +128,11 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
 
 @source("source.video", list_items=list_frames)
 def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
-    """Read frames of equirectangular videos at equally spaced times.
+    """Read frames of equirectangular videos, at equally spaced times or by the motion of the camera.
 
-    Around each time, the sharpest frame within a quarter of a step is used. It is stored without loss, as
-    `<video>_<milliseconds of the time>ms.png`. Match the frames with `pairs.sequential`.
+    Around each time, the sharpest frame within a quarter of a step is used. With `keyframes: motion`, a frame is used
+    wherever the scene has moved by `motion_deg` since the last one; a camera that stands or only turns gives none.
+    Frames are stored without loss, as `<video>_<milliseconds of the time>ms.png`. Match them with `pairs.sequential`.
     """
     path = item.files["video"]
     info = describe_video(path)
@@ -142,21 +181,69 @@ def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path,
 
 def _items_of(path: Path, name: str, params: VideoParams) -> Iterator[SourceItem]:
     info = describe_video(path)
-    times = _steps(info, params)
-    if times:
-        first = next(frames_between(path, times[0], times[0] + params.step_s(info)), None)
+    begin_s = params.start_s
+    if begin_s <= _last_s(info, params):
+        first = next(frames_between(path, begin_s, begin_s + params.step_s(info)), None)
         if first is not None and is_dual_fisheye(first[1]):
             raise InputError(_dual_fisheye(path))
+    times = _steps(info, params) if params.keyframes == "time" else _keyframes(path, info, params)
     files = {"video": path} if params.mask is None else {"video": path, "mask": params.mask}
     for time_s in times:
         shown, problem = printable_name(f"{name}_{round(time_s * 1000):08d}ms.png")
         yield SourceItem(shown, files, problem)
 
 
+def _last_s(info: VideoInfo, params: VideoParams) -> float:
+    last_s = (info.frames - 1) / info.frames_per_s
+    return min(last_s, params.end_s if params.end_s is not None else last_s)
+
+
+def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
+    """Return the times of the frames between which the scene moves by the wanted parallax, in seconds.
+
+    The whole video is decoded once; the times are remembered among the user's caches.
+    """
+    settings = KeyframeSettings(params.motion_deg, params.min_s, params.max_s)
+    usable = _usable(path, info, params)
+    code = [digest_from_file(Path(str(module.__file__))) for module in (parallax, selection)]
+    known = keyframe_file(
+        path, [*vars(settings).values(), params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, *code]
+    )
+    times = read_times(known)
+    if times is None:
+        frames = frames_between(
+            path, params.start_s, _last_s(info, params) + 1.0, min_step_s=1 / _MEASURED_PER_S, threads=2
+        )
+        small = (SmallFrame(time_s, reduced_grey(frame), sharpness(_band(frame))) for time_s, frame in frames)
+        times = [frame.time_s for frame in select_keyframes(small, settings, usable)]
+        store_times(known, times)
+    if params.max_frames is not None and len(times) > params.max_frames:
+        kept = np.linspace(0, len(times) - 1, params.max_frames).round().astype(int)
+        times = [times[idx] for idx in kept]
+    return times
+
+
+def _usable(path: Path, info: VideoInfo, params: VideoParams) -> NDArray[np.bool_]:
+    """Return the pixels of the reduced frames that no mask covers."""
+    return Panorama(
+        image=FilePart(path),
+        size_hw=REDUCED_HW,
+        source_size_hw=info.size_hw,
+        mask_file=None if params.mask is None else FilePart(params.mask),
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+    ).load_mask()
+
+
+def _band(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the rows of a frame whose middle half, which is enough to compare sharpness, is near the equator."""
+    return frame[frame.shape[0] // 4 : frame.shape[0] - frame.shape[0] // 4]
+
+
 def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
     """Return the times of the frames, in seconds."""
-    step_s, last_s = params.step_s(info), (info.frames - 1) / info.frames_per_s
-    length_s = min(last_s, params.end_s if params.end_s is not None else last_s) - params.start_s
+    step_s = params.step_s(info)
+    length_s = _last_s(info, params) - params.start_s
     if length_s < 0:
         return []
     count = int(length_s / step_s + 1e-6) + 1
@@ -174,7 +261,7 @@ def _best_frame(
     Raises:
         InputError: if there is no frame that can be decoded.
     """
-    reach_s = max(params.step_s(info) / 4, 0.51 / info.frames_per_s)
+    reach_s = params.reach_s(info)
     best: tuple[float, float, NDArray[np.uint8]] | None = None
     least = np.inf
     for found_s, frame in frames_between(path, time_s - reach_s, time_s + reach_s, threads=threads):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from pano_mvs.stages.source_video import VideoParams
 from tests.cli.conftest import Command, pano_mvs, run_json
@@ -27,11 +29,12 @@ def test_the_workflow_for_a_video_runs(pano_mvs: Command) -> None:
     assert run_json(Path("out"))["stages"][0]["run"] == 3
 
 
-def test_the_command_for_a_folder_of_videos_runs(pano_mvs: Command) -> None:
-    (line,) = [line for line in INPUT.splitlines() if line.startswith("pano-mvs run")]
+@pytest.mark.parametrize(("preset", "last"), [("quickstart", "pairs"), ("walk", "masked")])
+def test_the_commands_for_a_folder_of_videos_run(preset: str, last: str, pano_mvs: Command) -> None:
+    (line,) = [line for line in INPUT.splitlines() if line.startswith(f"pano-mvs run {preset}")]
     Path("videos").mkdir()
     write_video(Path("videos/walk.avi"), 60)
-    result = pano_mvs(*line.split()[1:], "--until", "pairs", "--out", "out")
+    result = pano_mvs(*line.split()[1:], "--set", "images.max_s=1", "--until", last, "--out", "out")
     assert result.code == 0, result.text
 
 

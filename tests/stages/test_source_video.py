@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.keyframes.selection import select_keyframes
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.io.images.video import describe_video, frames_between
 from pano_mvs.scene import Panorama
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.stages.source_video import VideoParams, list_frames, video
+from tests.algorithms.keyframes.walked_room import grey_from
 from tests.io.images.videos import Picture, counted, number_of, retimed, write_video
 
 
@@ -219,9 +221,67 @@ def test_a_video_that_ends_early_gives_what_it_has(tmp_path: Path) -> None:
         video(items[5], params(path, every_s=0.5), context)
 
 
+def walk_and_turn(number: int) -> Picture:
+    """A camera that walks for a second, turns for a second, and walks on."""
+    x = 0.09 * (min(number, 10) + max(0, number - 20)) - 0.9
+    grey = grey_from(x, (0, 18.0 * min(max(number - 10, 0), 10), 0), seed=number)
+    result: Picture = np.repeat(grey[..., None], 3, axis=2)
+    return result
+
+
+def test_keyframes_by_motion_leave_out_where_the_camera_only_turns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    path = write_video(tmp_path / "walk.avi", 30, walk_and_turn, per_s=10)
+    settings = params(path, keyframes="motion", motion_deg=6.0)
+    items = list(list_frames(settings))
+    times_ms = [int(item.name[5:13]) for item in items]
+    assert len(times_ms) == pytest.approx(5, abs=1)
+    assert sum(1150 < time < 1950 for time in times_ms) <= 1
+    fewer = [item.name for item in list_frames(params(path, keyframes="motion", motion_deg=6.0, max_frames=3))]
+    assert (fewer[0], fewer[-1], len(fewer)) == (items[0].name, items[-1].name, 3)
+    context = Context(np.random.default_rng(0), tmp_path)
+    video(items[1], settings, context)
+    assert context.metrics["time_s"] == pytest.approx(times_ms[1] / 1000, abs=0.06)
+
+
+def test_keyframes_by_motion_are_chosen_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    path = write_video(tmp_path / "walk.avi", 12, walk_and_turn, per_s=10)
+    chosen: list[Any] = []
+
+    def counted_choice(*given: Any) -> Any:
+        chosen.append(given)
+        return select_keyframes(*given)
+
+    monkeypatch.setattr("pano_mvs.stages.source_video.select_keyframes", counted_choice)
+    settings = params(path, keyframes="motion", motion_deg=4.0)
+    first = [item.name for item in list_frames(settings)]
+    assert [item.name for item in list_frames(settings)] == first
+    assert len(chosen) == 1
+    (stored,) = (tmp_path / "caches").rglob("*.json")
+    stored.write_text("[NaN]")
+    assert [item.name for item in list_frames(settings)] == first
+    assert len(chosen) == 2
+    list(list_frames(params(path, keyframes="motion", motion_deg=5.0)))
+    write_video(path, 13, walk_and_turn, per_s=10)
+    list(list_frames(settings))
+    assert len(chosen) == 4
+
+
+def test_a_camera_that_never_moves_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    path = write_video(tmp_path / "walk.avi", 12, lambda _: walk_and_turn(0), per_s=10)
+    with pytest.raises(InputError, match=r"walk\.avi: gives 1 frame; .*hardly moves"):
+        list(list_frames(params(path, keyframes="motion")))
+
+
 @pytest.mark.parametrize(
     ("settings", "what"),
     [
+        ({"every_s": 1, "keyframes": "motion"}, "steps in time: use motion_deg"),
+        ({"min_s": 2, "max_s": 1}, "max_s must not be less than min_s"),
         ({"every_s": 1, "every_frames": 3}, "give every_s or every_frames, not both"),
         ({"start_s": 2, "end_s": 1}, "end_s must be greater than start_s"),
     ],

@@ -100,9 +100,9 @@ def describe_video(path: Path) -> VideoInfo:
 
 
 def frames_between(
-    path: Path, begin_s: float, end_s: float, *, threads: int = 1
+    path: Path, begin_s: float, end_s: float, *, min_step_s: float = 0.0, threads: int = 1
 ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """Yield the time in seconds and the frame, (H, W, 3) uint8 BGR, of all frames between two times, inclusive.
+    """Yield the time in seconds and the frame, (H, W, 3) uint8 BGR, of frames between two times, inclusive.
 
     Iteration ends at a frame that cannot be decoded.
 
@@ -110,13 +110,14 @@ def frames_between(
         path: the video.
         begin_s: the first time, from the start of the video.
         end_s: the last time.
+        min_step_s: minimum time between two frames; frames in between are left out. 0 yields all.
         threads: number of threads of the decoder, each of which may hold a frame in memory.
 
     Raises:
         InputError: if the video cannot be opened, or its time stamps do not increase.
     """
     with _opened(path, threads) as capture:
-        previous = -1.0
+        previous, yielded = -1.0, -np.inf
         has_frame = _seek(capture, begin_s)
         while has_frame:
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -127,10 +128,11 @@ def frames_between(
                 )
             if time_s > end_s + _SLACK_S:
                 return
-            if time_s >= begin_s - _SLACK_S:
+            if time_s >= max(begin_s, yielded + min_step_s) - _SLACK_S:
                 is_decoded, frame = capture.retrieve()
                 if not is_decoded:
                     return
+                yielded = time_s
                 yield time_s, frame
             previous = time_s
             has_frame = capture.grab()

@@ -1,0 +1,1 @@
+"""Choose frames of a video by the motion of the camera."""

@@ -1,0 +1,205 @@
+"""Parallax between two frames of a panoramic video, without the rotation of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import (
+    angle_between,
+    geodesic_angle,
+    nearest_rotation,
+    pixel_from_ray,
+    ray_from_pixel,
+    ray_grid,
+)
+
+FloatArray = NDArray[np.float64]
+GreyImage = NDArray[np.uint8]
+
+REDUCED_HW = (128, 256)
+"""Size of the panoramas in which motion is measured."""
+
+_PAD = 24  # columns that are repeated on each side of the seam
+_MAX_POINTS, _MIN_DISTANCE, _QUALITY = 160, 6, 0.005
+_MAX_LATITUDE_DEG = 50.0
+_WINDOW, _LEVELS = (11, 11), 3
+_MAX_RETURN_PX = 0.7
+_LARGE_TURN_RAD = float(np.radians(3))
+_ROUNDS = 3
+_FIT_ROUNDS = 5
+_FIT_SCALE_RAD = float(np.radians(0.5))
+_RECOVERY_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of the camera since the anchor.
+
+    Attributes:
+        parallax_rad: median angle by which points of the scene moved, without the rotation of the camera.
+        seen_share: share of the points of the anchor that were found again.
+    """
+
+    parallax_rad: float
+    seen_share: float
+
+
+class ParallaxTracker:
+    """Measures the motion of frames relative to one frame, the anchor.
+
+    Each frame is turned back into the orientation of the anchor. Points of the anchor are then searched near their last
+    position by pyramidal Lucas–Kanade tracking, always with the anchor's own image as template, so that errors do not
+    add up while the camera stands still. The rotation that explains most of their movement is estimated robustly, and
+    what remains is parallax.
+
+    Args:
+        mask: (128, 256) bool, pixels that may be used; None for all. Points lie within 50° of the equator.
+    """
+
+    def __init__(self, mask: NDArray[np.bool_] | None = None) -> None:
+        rays = ray_grid(REDUCED_HW)
+        usable = np.abs(np.arcsin(rays[..., 1])) < np.radians(_MAX_LATITUDE_DEG)
+        if mask is not None:
+            usable &= mask
+        self._usable = np.zeros((REDUCED_HW[0], REDUCED_HW[1] + 2 * _PAD), np.uint8)
+        self._usable[:, _PAD:-_PAD] = 255 * usable
+        self._rays = rays.reshape(-1, 3).astype(np.float32)
+        self.anchor(np.zeros(REDUCED_HW, np.uint8))
+
+    @property
+    def points(self) -> int:
+        """The number of points of the anchor; with few of them, motion cannot be measured."""
+        return len(self._bearings)
+
+    def anchor(self, grey: GreyImage) -> None:
+        """Set the frame, (128, 256) uint8, to which others are compared."""
+        self._template = _padded(grey)
+        found = cv2.goodFeaturesToTrack(
+            self._template, _MAX_POINTS, _QUALITY, _MIN_DISTANCE, mask=self._usable, useHarrisDetector=False
+        )
+        self._corners = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        self._bearings = _bearings(self._corners)
+        self._guess = self._bearings
+        self._cam_from_anchor = np.eye(3)
+
+    def measure(self, grey: GreyImage) -> Motion:
+        """Return the motion of the camera between the anchor and a frame, (128, 256) uint8.
+
+        Frames must come in the order of the video: the rotation and the positions of the points begin with those of the
+        previous frame.
+        """
+        if not self.points:
+            return Motion(0.0, 0.0)
+        start = self._cam_from_anchor, self._guess
+        motion = self._measured(grey)
+        if motion.seen_share < _RECOVERY_SHARE:
+            # Perhaps the camera turned quickly: begin again at the heading at which both frames look alike.
+            self._cam_from_anchor = start[0] @ _heading(_turned(grey, start[0], self._rays), self._template)
+            self._guess = self._bearings
+            again = self._measured(grey)
+            if again.seen_share > motion.seen_share:
+                return again
+            self._cam_from_anchor, self._guess = start
+        return motion
+
+    def _measured(self, grey: GreyImage) -> Motion:
+        parallax, share = 0.0, 0.0
+        for _ in range(_ROUNDS):
+            found, is_found = self._tracked(_padded(_turned(grey, self._cam_from_anchor, self._rays)))
+            share = float(is_found.mean())
+            if is_found.sum() < 8:
+                return Motion(0.0, share)
+            turn = _robust_rotation(self._bearings[is_found], found[is_found])
+            residuals = angle_between(self._bearings[is_found] @ turn.T, found[is_found])
+            parallax = float(np.median(residuals))
+            self._cam_from_anchor = nearest_rotation(self._cam_from_anchor @ turn)
+            self._guess = np.where(is_found[:, None], found @ turn, self._guess)
+            if float(geodesic_angle(turn, np.eye(3))) < _LARGE_TURN_RAD:
+                break
+        return Motion(parallax, share)
+
+    def _tracked(self, image: GreyImage) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the bearings (N, 3) of the points in an image in the anchor's orientation, and which were found."""
+        guess = pixel_from_ray(self._guess, REDUCED_HW) - 0.5
+        # Across the seam, the nearest copy of the guess is meant.
+        width = REDUCED_HW[1]
+        guess[:, 0] += _PAD
+        guess[:, 0] -= width * np.round((guess[:, 0] - self._corners[:, 0]) / width)
+        before = np.ascontiguousarray(self._corners)
+        after, there = _flow(self._template, image, before, guess=guess.astype(np.float32))
+        back, here = _flow(image, self._template, after, guess=before.copy())
+        returned = np.linalg.norm(back - self._corners, axis=1) < _MAX_RETURN_PX
+        inside = (after[:, 1] > 0) & (after[:, 1] < REDUCED_HW[0] - 1)
+        return _bearings(after), there & here & returned & inside
+
+
+def reduced_grey(frame_bgr: NDArray[np.uint8]) -> GreyImage:
+    """Return a frame, (H, W, 3) uint8 BGR, as a grey image of 128 × 256 pixels."""
+    step = max(1, frame_bgr.shape[1] // (4 * REDUCED_HW[1]))
+    small = cv2.resize(frame_bgr[::step, ::step], REDUCED_HW[::-1], interpolation=cv2.INTER_AREA)
+    grey: GreyImage = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
+    return grey
+
+
+def _flow(
+    first: GreyImage, second: GreyImage, points: NDArray[np.float32], *, guess: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the positions (N, 2) of points of one image in another one, and which were found."""
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, points, guess, winSize=_WINDOW, maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    return found, status.ravel() > 0
+
+
+def _padded(grey: GreyImage) -> GreyImage:
+    return np.ascontiguousarray(np.pad(grey, ((0, 0), (_PAD, _PAD)), mode="wrap"))
+
+
+def _bearings(padded_px: NDArray[np.float32]) -> FloatArray:
+    """Return the rays (N, 3) of positions (N, 2) in a padded image, in which pixel centres have integer positions."""
+    return ray_from_pixel(padded_px + np.array((0.5 - _PAD, 0.5)), REDUCED_HW).reshape(-1, 3)
+
+
+def _turned(grey: GreyImage, cam_from_anchor: FloatArray, rays: NDArray[np.float32]) -> GreyImage:
+    """Return a frame as the camera would see it in the orientation of the anchor."""
+    x, y, z = (rays @ cam_from_anchor.T.astype(np.float32)).T
+    height, width = REDUCED_HW
+    columns = (np.arctan2(x, z) / np.float32(2 * np.pi) + np.float32(0.5)) * width - np.float32(0.5)
+    rows = (np.arcsin(np.clip(y, -1, 1)) / np.float32(np.pi) + np.float32(0.5)) * height - np.float32(0.5)
+    shape = grey.shape
+    turned: GreyImage = cv2.remap(
+        _padded(grey),
+        (columns + _PAD).reshape(shape).astype(np.float32),
+        rows.reshape(shape).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.uint8, copy=False)
+    return turned
+
+
+def _heading(turned: GreyImage, template: GreyImage) -> FloatArray:
+    """Return the rotation about the vertical under which two frames look most alike."""
+    band = slice(REDUCED_HW[0] // 4, -(REDUCED_HW[0] // 4))
+    first = np.fft.rfft(template[band, _PAD:-_PAD].astype(np.float64) - template.mean(), axis=1)
+    second = np.fft.rfft(turned[band].astype(np.float64) - turned.mean(), axis=1)
+    alike = np.fft.irfft((second * first.conj()).sum(axis=0), REDUCED_HW[1])
+    angle = 2 * np.pi * int(np.argmax(alike)) / REDUCED_HW[1]
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+
+
+def _robust_rotation(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the rotation R with after ≈ R before, by iteratively reweighted least squares with a Cauchy-like weight.
+
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976.
+    """
+    weights = np.ones(len(before))
+    turn = np.eye(3)
+    for _ in range(_FIT_ROUNDS):
+        turn = nearest_rotation((after * weights[:, None]).T @ before)
+        weights = 1 / (_FIT_SCALE_RAD + angle_between(before @ turn.T, after))
+    return turn
