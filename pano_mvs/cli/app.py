@@ -360,6 +360,19 @@ def share(
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 
+@app.command("merge")
+@guarded
+def merge_runs(
+    outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="The output folders of the blocks.")],
+    to: Annotated[Path, typer.Option("--out", help="Folder to write the merged results to.")],
+    cache: CacheOption = None,
+) -> None:
+    """Merge runs over overlapping blocks of a capture: poses, points, cloud and range maps."""
+    from pano_mvs.cli.merge_command import merge_blocks_command
+
+    raise typer.Exit(merge_blocks_command(tuple(outs), to, cache=cache, console=Console()))
+
+
 @app.command("inspect")
 @guarded
 def inspect_pixel(

@@ -145,13 +145,41 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
         if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
             images = run.states[stage.name].members
             links = tuple(_link(images[pair], metrics) for pair, metrics in stage.unit_metrics.items())
-    groups = split_groups(poses)
-    heights = _camera_heights(groups, latest(run, PointCloud))
-    return PosesSummary(
-        registered=tuple(poses.names),
+    return poses_summary(
+        poses,
         blocked=blocked,
         rejected={image: why for image, (_, why) in result.rejected.items()},
         doubts={image: result.doubts[image][1] for image in poses.names if image in result.doubts},
+        links=links,
+        heights=_camera_heights(split_groups(poses), latest(run, PointCloud)),
+    )
+
+
+def poses_summary(
+    poses: Poses,
+    *,
+    rejected: Mapping[str, str],
+    doubts: Mapping[str, str],
+    links: tuple[PairLink, ...],
+    blocked: tuple[BlockedUnit, ...] = (),
+    heights: Mapping[int, float] | None = None,
+) -> PosesSummary:
+    """Return the summary of poses.
+
+    Args:
+        poses: the poses.
+        rejected: image without a pose to the reason.
+        doubts: registered image whose pose is doubtful to the reason.
+        links: the pairs that were matched.
+        blocked: units that could not run.
+        heights: group to the height of its cameras above the floor, where it is known.
+    """
+    groups = split_groups(poses)
+    return PosesSummary(
+        registered=tuple(poses.names),
+        blocked=blocked,
+        rejected=rejected,
+        doubts=doubts,
         confirmed=_confirmed(poses),
         centers=poses.centers.tolist(),
         points=len(poses.points_in_world),
@@ -168,7 +196,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
                 points=len(group.points_in_world),
                 up=_up(group),
                 z_up_from_world=_rows(z_up_from_world(world_up(group))),
-                camera_height=heights.get(number),
+                camera_height=(heights or {}).get(number),
                 nearest_pair=nearest_pair(groups[0].names, group.names, links) if number else None,
             )
             for number, group in enumerate(groups)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.clouds.ply_frame import FloatArray, stated_rotation, turned
+from pano_mvs.scene import PointCloud
 
 # PLY's names of number types, old and new.
 _NUMBERS = {
@@ -90,6 +91,30 @@ class PlyPoints:
         if not self.has_normals:
             return points, np.zeros_like(points)
         return points, self.in_world(np.nan_to_num(self._stacked(("nx", "ny", "nz"), slice(None, None, step))))
+
+    def cloud_chunks(self, size: int = 1_000_000) -> Iterator[PointCloud]:
+        """Yield the points in the world with all that our own files hold, up to `size` at a time.
+
+        Colours that the file does not have are grey, and numbers of views 0.
+
+        Raises:
+            InputError: if a position is not finite.
+        """
+        names = set(self.vertices.dtype.names or ())
+        for start in range(0, self.count, size):
+            part = slice(start, min(start + size, self.count))
+            positions, vertices = self._positions(part), self.vertices[part]
+            normals = self._stacked(("nx", "ny", "nz"), part) if self.has_normals else np.zeros_like(positions)
+            has_color = {"red", "green", "blue"} <= names
+            colors = [vertices[name].astype(np.uint8) for name in ("red", "green", "blue")] if has_color else []
+            yield PointCloud(
+                positions,
+                self.in_world(np.nan_to_num(normals)),
+                np.stack(colors, axis=-1) if colors else np.full((len(positions), 3), 128, np.uint8),
+                np.array(vertices["views"], np.uint8) if "views" in names else np.zeros(len(positions), np.uint8),
+                np.array(vertices["confidence"], np.uint8) if "confidence" in names else None,
+                uncertainty=np.array(vertices["uncertainty"], np.float32) if "uncertainty" in names else None,
+            )
 
     def _positions(self, part: slice) -> NDArray[np.float32]:
         points = self._stacked(("x", "y", "z"), part)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
+import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +64,31 @@ def write_ply(
         for chunk in chunks(len(cloud)):
             written = _vertices(cloud, chunk, layout, file_from_world=file_from_world)
             stream.write((written if kept is None else written[kept.within(chunk)]).tobytes())
+
+
+def write_ply_parts(
+    path: Path,
+    parts: Iterable[PointCloud],
+    *,
+    quality: bool = False,
+    uncertainty: bool = False,
+    file_from_world: FloatArray | None = None,
+) -> int:
+    """Write clouds one after the other as one PLY file, and return the number of points; see `write_ply`.
+
+    Only one part is in memory at a time. The vertices are written beside the file first, since its header states their
+    number.
+    """
+    layout, count = _LAYOUTS[quality + 2 * uncertainty], 0
+    with tempfile.TemporaryFile(dir=path.parent) as body:
+        for part in parts:
+            body.write(_vertices(part, slice(0, len(part)), layout, file_from_world=file_from_world).tobytes())
+            count += len(part)
+        body.seek(0)
+        with path.open("wb") as stream:
+            stream.write(_header(count, layout, frame_comments(file_from_world)))
+            shutil.copyfileobj(body, stream, 1 << 20)
+    return count
 
 
 def _vertices(

@@ -1,0 +1,1 @@
+"""Join blocks of a capture that were solved separately and have cameras in common."""

@@ -1,0 +1,1 @@
+"""Merge the output folders of blocks of a capture into one."""

@@ -1,0 +1,167 @@
+"""Write the files of a merged capture; clouds and range maps are read and written piece by piece."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.blocks.merging import MergedBlocks, nearest_owners
+from pano_mvs.core.files import copy_file, replacing, write_text
+from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.geometry import Similarity3
+from pano_mvs.io.clouds.ply_writer import write_ply_parts
+from pano_mvs.io.colmap.model_writer import write_colmap_model
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame
+from pano_mvs.io.nerfstudio.transforms import transforms_document
+from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.run_output import RunView
+from pano_mvs.scene import PointCloud
+from pano_mvs.scene.files import item_stems
+from pano_mvs.scene.upright import world_up, z_up_from_world
+from pano_mvs.session.merging.block import Block
+
+
+@dataclass(frozen=True, eq=False)
+class MergeFiles:
+    """Writes a merged capture.
+
+    Attributes:
+        out: the output folder.
+        blocks: the blocks.
+        world_from_block: the similarity of each.
+        merged: the merged cameras.
+    """
+
+    out: Path
+    blocks: Sequence[Block]
+    world_from_block: Sequence[Similarity3]
+    merged: MergedBlocks
+
+    def write_model(self) -> None:
+        """Write the COLMAP model colmap/sparse/0, transforms.json and poses.json.
+
+        Raises:
+            InputError: if the size of an image is unknown.
+        """
+        poses = self.merged.poses
+        sizes: dict[str, tuple[int, int]] = {}
+        for block in self.blocks:
+            sizes |= block.sizes_hw()
+        folder = self.out / "colmap" / "sparse" / "0"
+        folder.mkdir(parents=True, exist_ok=True)
+        write_colmap_model(folder, poses, sizes)
+        frames = [
+            (name, cam_from_world, _frame(self._image_path(name, number), sizes[name]))
+            for (name, cam_from_world), number in zip(poses.cameras.items(), self.merged.owner.tolist(), strict=True)
+        ]
+        turn = z_up_from_world(world_up(poses))
+        document = transforms_document(
+            "equirectangular",
+            frames,
+            depth_unit=1.0,
+            about={"file_from_world": turn.tolist()},
+            file_from_world=turn,
+            seed="cloud.ply" if is_file(self.out / "cloud.ply") else "",
+        )
+        write_text(self.out / "transforms.json", json.dumps(document, indent=1))
+        views = [
+            {"id": idx, "image": name, "R": pose.rotation.tolist(), "t": pose.translation.tolist()}
+            for idx, (name, pose) in enumerate(poses.cameras.items())
+        ]
+        write_text(self.out / "poses.json", json.dumps({"metric": poses.metric, "views": views}, indent=1))
+
+    def write_cloud(self) -> int:
+        """Write cloud.ply, in which each point is nearest to a camera of its own block; return the number of points."""
+        if not any(is_file(block.run.out / "cloud.ply") or block.run.values.cloud is not None for block in self.blocks):
+            return 0
+        turn = z_up_from_world(world_up(self.merged.poses))
+        path = self.out / "cloud.ply"
+        with replacing(path) as temporary:
+            return write_ply_parts(temporary, self._cloud_parts(), quality=True, uncertainty=True, file_from_world=turn)
+
+    def write_ranges(self) -> list[ViewSummary]:
+        """Write the range map of each camera from its own block, in the merged unit; return what run.json lists."""
+        stems = item_stems(self.merged.poses.names)
+        found = []
+        for name, number in zip(self.merged.poses.names, self.merged.owner.tolist(), strict=True):
+            block, scale = self.blocks[number], self.world_from_block[number].scale
+            listed = {summary.name: summary for summary in block.run.summary.views}
+            item = next((one for one in (name, stems[name]) if one in listed), None)
+            view = block.run.views[item] if item is not None and item in block.run.views else None
+            if view is None or not self._write_range(view, stems[name], scale):
+                continue
+            assert item is not None
+            found.append(listed[item].model_copy(update={"name": name, "preview": self._preview(view, stems[name])}))
+        return found
+
+    def _write_range(self, view: RunView, stem: str, scale: float) -> bool:
+        """Write the range map, confidence and uncertainty of a view; return whether it has a range map."""
+        if view.range_map is None:
+            return False
+        targets = {
+            folder: self.out / folder / f"{stem}{suffix}"
+            for folder, suffix in (("range", ".tiff"), ("confidence", ".png"), ("uncertainty", ".tiff"))
+        }
+        for path in targets.values():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_range_tiff(targets["range"], (view.range_map * np.float32(scale)).astype(np.float32))
+        if view.confidence is not None:
+            write_confidence_png(targets["confidence"], np.ascontiguousarray(view.confidence))
+        if view.uncertainty is not None:
+            write_range_tiff(targets["uncertainty"], np.ascontiguousarray(view.uncertainty))
+        return True
+
+    def _preview(self, view: RunView, stem: str) -> str:
+        if view.preview is None:
+            return ""
+        name = f"preview/{stem}{view.preview.suffix}"
+        (self.out / name).parent.mkdir(parents=True, exist_ok=True)
+        copy_file(view.preview, self.out / name)
+        return name
+
+    def _cloud_parts(self) -> Iterator[PointCloud]:
+        centers = self.merged.poses.centers
+        for number, (block, similarity) in enumerate(zip(self.blocks, self.world_from_block, strict=True)):
+            for part in block.cloud_parts():
+                moved = _moved(part, similarity)
+                own = nearest_owners(moved.points_in_world, centers, self.merged.owner) == number
+                yield _selected(moved, own)
+
+    def _image_path(self, name: str, number: int) -> str:
+        folder = self.blocks[number].run.summary.source_folder
+        if folder is None or not is_file(folder / name):
+            return name
+        return PurePosixPath(Path(os.path.relpath(resolved(folder / name), resolved(self.out)))).as_posix()
+
+
+def _frame(path: str, size_hw: tuple[int, int]) -> NerfstudioFrame:
+    height, width = size_hw
+    rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return NerfstudioFrame("equirectangular", path, "", "", (width, height), (width / 2, float(height)), rows)
+
+
+def _moved(cloud: PointCloud, similarity: Similarity3) -> PointCloud:
+    return replace(
+        cloud,
+        points_in_world=similarity.apply(cloud.points_in_world).astype(np.float32),
+        normals_in_world=(cloud.normals_in_world.astype(np.float64) @ similarity.rotation.T).astype(np.float32),
+        uncertainty=None if cloud.uncertainty is None else cloud.uncertainty * np.float32(similarity.scale),
+    )
+
+
+def _selected(cloud: PointCloud, kept: NDArray[np.bool_]) -> PointCloud:
+    return PointCloud(
+        cloud.points_in_world[kept],
+        cloud.normals_in_world[kept],
+        cloud.colors_rgb[kept],
+        cloud.view_counts[kept],
+        None if cloud.confidence is None else cloud.confidence[kept],
+        uncertainty=None if cloud.uncertainty is None else cloud.uncertainty[kept],
+    )

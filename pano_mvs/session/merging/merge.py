@@ -1,0 +1,182 @@
+"""Merge the output folders of blocks into one output folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pano_mvs
+from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks
+from pano_mvs.algorithms.blocks.merging import MergedBlocks, merge_blocks
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.files import OUTPUT_MARK
+from pano_mvs.core.paths import children, exists, is_folder, resolved
+from pano_mvs.core.text import plural
+from pano_mvs.engine.running.output_lock import output_lock
+from pano_mvs.geometry import Similarity3
+from pano_mvs.io.images.captures import natural_key
+from pano_mvs.report.page import gather_report, write_page
+from pano_mvs.results.records import CloudSummary, ImageReason, PairLink, ViewSummary, WorkflowSummary
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.merging.agreement import (
+    camera_doubts,
+    is_doubtful,
+    link_text,
+    require_agreement,
+    require_connected,
+    scale_notes,
+)
+from pano_mvs.session.merging.block import Block, load_blocks
+from pano_mvs.session.merging.files import MergeFiles
+from pano_mvs.session.summarise import poses_summary
+
+_STAGE = "merge"
+
+
+@dataclass(frozen=True, eq=False)
+class MergeResult:
+    """What a merge found and wrote.
+
+    Attributes:
+        summary: what run.json holds.
+        blocks: the blocks, as given.
+        alignment: their similarities and their agreement.
+        merged: the cameras, and to which block each belongs.
+    """
+
+    summary: RunSummary
+    blocks: tuple[Block, ...]
+    alignment: BlockAlignment
+    merged: MergedBlocks
+
+
+def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) -> MergeResult:
+    """Merge the output folders of blocks that have cameras in common, and write the result to another folder.
+
+    The folder gets the COLMAP model, transforms.json, poses.json, cloud.ply, range maps with their confidence, run.json
+    and a report. The world is that of the largest block whose unit is the metre, or else of the largest block. Nothing
+    is written if the blocks are not connected, or disagree.
+
+    Args:
+        outs: output folders of runs.
+        to: folder to write to: new, empty, or the result of an earlier merge.
+        cache: folder of the cache that all runs used; None for those that their run.json name.
+
+    Raises:
+        UsageError: if the folders cannot be used.
+        InputError: if a run has no poses, blocks are not connected, or disagree about their common cameras.
+        StoreError: if a file cannot be written.
+    """
+    started, clock = datetime.now(UTC), time.perf_counter()
+    blocks = load_blocks(outs, cache)
+    _require_free(to, outs)
+    reference = max(
+        range(len(blocks)), key=lambda number: (blocks[number].poses.metric, len(blocks[number].poses.names), -number)
+    )
+    alignment = align_blocks([block.poses.cameras for block in blocks], reference)
+    require_connected(blocks, alignment)
+    require_agreement(blocks, alignment)
+    similarities = [similarity for similarity in alignment.world_from_block if similarity is not None]
+    order = sorted({name for block in blocks for name in block.poses.names}, key=natural_key)
+    merged = merge_blocks([block.poses for block in blocks], similarities, order=order, reference=reference)
+    doubts = camera_doubts(blocks, alignment)
+    merged = replace(merged, poses=replace(merged.poses, doubts={**merged.poses.doubts, **doubts}))
+    to.mkdir(parents=True, exist_ok=True)
+    (to / OUTPUT_MARK).touch()
+    with output_lock(to):
+        summary = _written(to, blocks, alignment, merged=merged, similarities=similarities)
+        summary = summary.model_copy(
+            update={
+                "started": started.isoformat(timespec="seconds"),
+                "seconds": round(time.perf_counter() - clock, 3),
+            }
+        )
+        report = gather_report(to, summary, StoredValues())
+        summary = summary.model_copy(update={"verdict": report.verdict})
+        summary.write(to)
+        write_page(to, summary, report)
+    return MergeResult(summary, tuple(blocks), alignment, merged)
+
+
+def _require_free(to: Path, outs: Sequence[Path]) -> None:
+    if resolved(to) in {resolved(out) for out in outs}:
+        raise UsageError(f"--out {to}: this is one of the blocks. Choose another folder")
+    if not exists(to):
+        return
+    if not is_folder(to):
+        raise UsageError(f"--out {to}: this is not a folder. Choose another one")
+    if not children(to):
+        return
+    try:
+        is_merge = RunSummary.read(to).workflow.name == _STAGE
+    except InputError:
+        is_merge = False
+    if not is_merge:
+        raise UsageError(f"--out {to}: the folder holds something else. Choose a new or an empty one")
+
+
+def _written(
+    to: Path,
+    blocks: Sequence[Block],
+    alignment: BlockAlignment,
+    *,
+    merged: MergedBlocks,
+    similarities: Sequence[Similarity3],
+) -> RunSummary:
+    """Write all files except run.json and the report, and return the summary."""
+    files = MergeFiles(to, blocks, similarities, merged)
+    points = files.write_cloud()
+    files.write_model()
+    views = files.write_ranges()
+    poses = merged.poses
+    notes = _notes(blocks, alignment)
+    doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
+    is_doubted = bool(doubts) or any(is_doubtful(link) for link in alignment.links)
+    return RunSummary(
+        workflow=WorkflowSummary(name=_STAGE),
+        version=pano_mvs.__version__,
+        exit_code=3 if is_doubted or poses.rejected else 0,
+        rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.rejected.items()},
+        doubts=doubts,
+        warnings=tuple(
+            f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
+            for link in alignment.links
+            if is_doubtful(link)
+        ),
+        notes=notes,
+        poses=poses_summary(poses, rejected=poses.rejected, doubts=poses.doubts, links=_links(blocks)),
+        views=tuple[ViewSummary, ...](views),
+        cloud=CloudSummary(points=points or None),
+        versions=dict(_latest_versions(blocks)),
+    )
+
+
+def _notes(blocks: Sequence[Block], alignment: BlockAlignment) -> tuple[str, ...]:
+    notes = [
+        f"{blocks[link.first].name} and {blocks[link.second].name}: {len(link.names)} common cameras; {link_text(link)}"
+        for link in alignment.links
+    ]
+    for block in blocks:
+        if block.left_out:
+            notes.append(
+                f"{block.name}: {block.left_out} {plural(block.left_out, 'camera')} in smaller groups of its poses "
+                f"{plural(block.left_out, 'is', 'are')} not merged"
+            )
+    return (*notes, *scale_notes(blocks, alignment))
+
+
+def _links(blocks: Sequence[Block]) -> tuple[PairLink, ...]:
+    """Return the matched pairs of all blocks, each once."""
+    found: dict[tuple[str, str], PairLink] = {}
+    for block in blocks:
+        for link in block.run.summary.poses.links:
+            found.setdefault((link.first, link.second), link)
+    return tuple(found.values())
+
+
+def _latest_versions(blocks: Sequence[Block]) -> Mapping[str, str]:
+    return max((block.run.summary for block in blocks), key=lambda summary: summary.started).versions

@@ -1,0 +1,149 @@
+"""Blocks become one capture: cameras, points, cloud and range maps in one world; what does not fit is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.results.run_output import load
+from pano_mvs.session.merging.merge import MergeResult, merge_outputs
+from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
+from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
+
+RANGES = (range(14), range(8, 24), range(20, 34))
+"""A closed walk of 30 cameras in three blocks; the last one meets the first."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three blocks and their merge."""
+    root = tmp_path_factory.mktemp("blocks")
+    for number, chosen in enumerate(RANGES):
+        write_block(root / f"block_{number}", list(chosen), some_world(number))
+    return root
+
+
+@pytest.fixture(scope="module")
+def merged(folder: Path) -> MergeResult:
+    return merge_outputs([folder / f"block_{number}" for number in range(3)], folder / "merged")
+
+
+def test_all_cameras_are_in_the_world_of_the_largest_block(folder: Path, merged: MergeResult) -> None:
+    assert merged.alignment.reference == 1
+    assert merged.summary.exit_code == 0
+    poses = merged.merged.poses
+    poses.check()
+    truth = {name: some_world(1).move_camera(pose) for name, pose in walk(30).items()}
+    assert poses.names == tuple(truth)
+    for name, pose in poses.cameras.items():
+        np.testing.assert_allclose(pose.center, truth[name].center, atol=1e-5 * some_world(1).scale)
+    for file in ("", "transforms.json", "poses.json"):
+        read = read_poses(folder / "merged" / file)
+        np.testing.assert_allclose(read.centers, poses.centers, atol=1e-5)
+        np.testing.assert_allclose(read.rotations, poses.rotations, atol=1e-6)
+
+
+def test_each_camera_belongs_to_one_block_and_overlaps_are_halved(merged: MergeResult) -> None:
+    owner = merged.merged.owner
+    assert owner[:8].tolist() == [2, 2, 0, 0, 0, 0, 0, 0]
+    assert set(owner[8:14].tolist()) == {0, 1}
+    assert np.all(np.diff(owner[8:14]) >= 0)
+    assert owner[24:30].tolist() == [2] * 6
+
+
+def test_tracks_meet_at_common_images(folder: Path, merged: MergeResult) -> None:
+    poses = merged.merged.poses
+    assert np.degrees(poses.point_errors_rad).max() < 0.01
+    positions = np.round(poses.points_in_world / some_world(1).scale, 4)
+    assert len(np.unique(positions, axis=0)) == len(positions)
+    pairs = np.stack([poses.track_point_idx, poses.track_image_idx], axis=1)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    images = [poses.track_image_idx[poses.track_point_idx == point] for point in range(len(positions))]
+    assert any(min(seen) < 8 and max(seen) >= 14 for seen in images if max(seen) < 20), "no track spans two blocks"
+    assert len(read_poses(folder / "merged").points_in_world) == len(positions)
+
+
+def test_no_surface_is_duplicated_and_none_is_lost(folder: Path, merged: MergeResult) -> None:
+    """Every block has all points, and each point is kept from one of them."""
+    cloud = read_ply(folder / "merged/cloud.ply")
+    assert len(cloud) == merged.summary.cloud.points == len(CLOUD)
+    world = some_world(1)
+    back = world.inverse().apply(cloud.points_in_world)
+    order, expected = np.lexsort(back.round(3).T), np.lexsort(CLOUD.round(3).T)
+    np.testing.assert_allclose(back[order], CLOUD[expected], atol=1e-3)
+    np.testing.assert_allclose(cloud.normals_in_world, np.tile(world.rotation @ (0, 1, 0), (len(cloud), 1)), atol=1e-5)
+    assert cloud.uncertainty is not None
+    np.testing.assert_allclose(cloud.uncertainty, 0.5 * world.scale, rtol=1e-4)
+    assert cloud.confidence is not None
+    assert set(cloud.confidence.tolist()) == {200}
+
+
+def test_range_maps_have_the_unit_of_the_merged_world(folder: Path, merged: MergeResult) -> None:
+    assert [view.name for view in merged.summary.views] == list(walk(30))
+    for idx in (0, 10, 29):
+        ranges = read_range_tiff(folder / f"merged/range/{idx:03d}.tiff")
+        np.testing.assert_allclose(ranges, RANGE * some_world(1).scale, rtol=1e-5)
+
+
+def test_the_merged_folder_is_the_output_of_a_run(folder: Path, merged: MergeResult) -> None:
+    run = load(folder / "merged")
+    assert run.poses is not None
+    assert len(run.poses.names) == 30
+    assert len(run.views) == 30
+    assert run.summary.verdict is not None
+    assert sum("common cameras; positions differ by" in note for note in run.summary.notes) == 3
+    links = {(link.first, link.second) for link in run.summary.poses.links}
+    assert len(links) == len(run.summary.poses.links) >= 29
+    assert "<svg" in (folder / "merged/report.html").read_text(encoding="utf-8")
+    again = merge_outputs([folder / f"block_{number}" for number in range(3)], folder / "merged")
+    assert again.summary.poses == merged.summary.poses
+    assert json.loads((folder / "merged/run.json").read_text())["workflow"]["name"] == "merge"
+
+
+def test_blocks_without_common_cameras_are_refused(folder: Path, tmp_path: Path) -> None:
+    write_block(tmp_path / "far", list(range(13, 22)), some_world(9))
+    with pytest.raises(InputError, match=r"far: shares 1 registered camera with .*block_0.* 3 are needed"):
+        merge_outputs([folder / "block_0", tmp_path / "far"], tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
+
+
+def test_blocks_that_disagree_are_refused(folder: Path, tmp_path: Path) -> None:
+    crooked = bent(walk(30), turn_deg=500, stretch=4.0)
+    write_block(tmp_path / "crooked", list(range(5, 20)), some_world(9), cameras=crooked)
+    with pytest.raises(InputError, match=r"crooked disagree about their 9 common cameras: positions differ by"):
+        merge_outputs([folder / "block_0", tmp_path / "crooked"], tmp_path / "merged")
+
+
+def test_a_camera_that_two_blocks_place_differently_is_doubtful(folder: Path, tmp_path: Path) -> None:
+    cameras = walk(30)
+    wrong = cameras["010.png"]
+    cameras["010.png"] = Rigid3.from_center(wrong.rotation, wrong.center + np.array((0.0, 1.5, 0.0)))
+    write_block(tmp_path / "other", list(range(5, 20)), some_world(9), cameras=cameras)
+    result = merge_outputs([folder / "block_0", tmp_path / "other"], tmp_path / "merged")
+    assert list(result.summary.poses.doubts) == ["010.png"]
+    assert "times the distance between neighbouring cameras apart" in result.summary.poses.doubts["010.png"]
+    assert result.summary.exit_code == 3
+
+
+def test_folders_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> None:
+    block = folder / "block_0"
+    with pytest.raises(UsageError, match="two or more output folders"):
+        merge_outputs([block], tmp_path / "merged")
+    with pytest.raises(UsageError, match="the same folder"):
+        merge_outputs([block, block], tmp_path / "merged")
+    with pytest.raises(UsageError, match="one of the blocks"):
+        merge_outputs([block, folder / "block_1"], block)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("x")
+    with pytest.raises(UsageError, match="holds something else"):
+        merge_outputs([block, folder / "block_1"], tmp_path / "mine")
+    with pytest.raises(InputError, match=r"run\.json cannot be read"):
+        merge_outputs([block, tmp_path / "mine"], tmp_path / "merged")
