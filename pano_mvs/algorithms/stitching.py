@@ -20,18 +20,18 @@ _MAX_DENSITY = 1.25
 
 
 def stitch_lenses(
-    pictures: Sequence[Picture], rig: LensRig, *, size_hw: tuple[int, int], blend_deg: float, threads: int = 1
+    pictures: Sequence[Picture], rig: LensRig, *, size_hw: tuple[int, int], threads: int = 1
 ) -> tuple[Picture, NDArray[np.bool_]]:
     """Return the panorama of a rig and its valid pixels.
 
     Each pixel shows what a lens sees at the stitching distance of the rig in that direction (see `LensRig`). The seam
-    is where both lenses see equally far inside their fields of view; in a strip around it, their pictures are mixed.
+    is where both lenses see equally far inside their fields of view. In a strip around it, as wide as `blend_deg` of
+    the rig, their pictures are mixed.
 
     Args:
         pictures: the picture of each lens, (H, W, 3) uint8.
         rig: the rig.
         size_hw: (height, width) of the panorama.
-        blend_deg: width of the strip in which both pictures are mixed, in degrees.
         threads: number of threads.
 
     Returns:
@@ -52,7 +52,7 @@ def stitch_lenses(
             np.broadcast_arrays(np.arange(width) + 0.5, np.arange(first, first + rows)[:, None] + 0.5), -1
         )
         bearings = ray_from_pixel(pixels, size_hw)
-        weights = lens_weights(rig.margins_rad(bearings), blend_rad=float(np.radians(blend_deg)))
+        weights = lens_weights(rig.margins_rad(bearings), blend_rad=float(np.radians(rig.blend_deg)))
         mixed = np.zeros((rows, width, 3))
         for idx, (lens, source) in enumerate(zip(rig.lenses, sources, strict=True)):
             if weights[..., idx].any():

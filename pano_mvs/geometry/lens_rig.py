@@ -33,12 +33,14 @@ class LensRig:
         lenses: the lenses.
         lens_from_rig: pose of each lens, in metres; the mean of their centres is the origin of the rig.
         stitch_distance_m: D, may be inf.
+        blend_deg: width of the strip around the seam in which the panorama mixes both pictures.
     """
 
     names: tuple[str, str]
     lenses: tuple[FisheyeLens, FisheyeLens]
     lens_from_rig: tuple[Rigid3, Rigid3]
     stitch_distance_m: float = float("inf")
+    blend_deg: float = 2.0
 
     @staticmethod
     def centred(
@@ -47,6 +49,7 @@ class LensRig:
         lens_from_body: tuple[Rigid3, Rigid3],
         *,
         stitch_distance_m: float = float("inf"),
+        blend_deg: float = 2.0,
     ) -> LensRig:
         """Return the rig whose frame has the axes of a body frame, and its origin between the lenses.
 
@@ -56,7 +59,7 @@ class LensRig:
         middle = np.mean([pose.center for pose in lens_from_body], axis=0)
         body_from_rig = Rigid3(np.eye(3), middle)
         first, second = (pose @ body_from_rig for pose in lens_from_body)
-        rig = LensRig(names, lenses, (first, second), stitch_distance_m)
+        rig = LensRig(names, lenses, (first, second), stitch_distance_m, blend_deg)
         if stitch_distance_m <= 2 * rig.lens_offset_m:
             raise UsageError(
                 f"the stitching distance of {stitch_distance_m:g} m is not outside of the rig, whose lens centres are "
@@ -92,6 +95,13 @@ class LensRig:
             margin = lens.max_angle_rad - lens.angle_from_axis(rays)
             margins.append(np.where(lens.contains(lens.pixel_from_ray(rays)), margin, -np.inf))
         return np.stack(margins, axis=-1)
+
+    def angle_from_seam(self, bearings: ArrayLike) -> FloatArray:
+        """Return the angle of bearings (..., 3) from the seam, (...,), in radians; inf where one lens or none sees."""
+        margins = self.margins_rad(bearings)
+        both = np.isfinite(margins).all(axis=-1)
+        apart = np.abs(np.subtract(*np.moveaxis(np.where(both[..., None], margins, 0.0), -1, 0)))
+        return np.where(both, apart / 2, np.inf)  # away from the seam, one margin grows as the other shrinks
 
     def lens_of_bearings(self, bearings: ArrayLike) -> NDArray[np.int8]:
         """Return the lens that the panorama shows at bearings (..., 3): 0 or 1, or −1 where no lens sees.
@@ -146,7 +156,7 @@ class LensRig:
             for name, lens, pose in zip(self.names, self.lenses, self.lens_from_rig, strict=True)
         ]
         distance = None if np.isinf(self.stitch_distance_m) else self.stitch_distance_m
-        return {"lenses": lenses, "stitch_distance_m": distance}
+        return {"lenses": lenses, "stitch_distance_m": distance, "blend_deg": self.blend_deg}
 
     @classmethod
     def from_values(cls, values: dict[str, Any]) -> Self:
@@ -168,4 +178,5 @@ class LensRig:
             (lenses[0], lenses[1]),
             (poses[0], poses[1]),
             float("inf") if distance is None else distance,
+            values["blend_deg"],
         )

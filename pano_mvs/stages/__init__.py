@@ -36,6 +36,7 @@ from pano_mvs.stages.poses import from_model, refine, scaled_translation, triang
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_localise import localise
 from pano_mvs.stages.rigs.dual_fisheye import dual_fisheye
+from pano_mvs.stages.rigs.exports import colmap_lenses
 from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
@@ -49,6 +50,7 @@ __all__ = [
     "colmap_dense",
     "colmap_dense_init",
     "colmap_faces",
+    "colmap_lenses",
     "colmap_masks",
     "colmap_poses",
     "colmap_sift_poses",

@@ -32,7 +32,7 @@ def sphere() -> Room:
 
 def test_without_an_offset_it_is_the_panorama() -> None:
     rig = example_rig(size_px=120, offset_m=1e-9)
-    panorama, valid = stitch_lenses(pictures_of(1e-9), rig, size_hw=SIZE_HW, blend_deg=2.0)
+    panorama, valid = stitch_lenses(pictures_of(1e-9), rig, size_hw=SIZE_HW)
     expected, _ = render(ROOM, POSE, SIZE_HW)
     assert valid.all()
     assert np.abs(panorama.astype(int) - expected).mean() < 2.5
@@ -46,7 +46,7 @@ def test_the_stitching_distance_moves_each_lens_to_the_middle() -> None:
     expected, _ = render(sphere(), pose, SIZE_HW)
     errors = []
     for distance in (2.0, np.inf):
-        panorama, _ = stitch_lenses(pictures, replace(rig, stitch_distance_m=distance), size_hw=SIZE_HW, blend_deg=2.0)
+        panorama, _ = stitch_lenses(pictures, replace(rig, stitch_distance_m=distance), size_hw=SIZE_HW)
         errors.append(np.abs(panorama.astype(int) - expected).mean())
     assert errors[0] < 20  # the texture is finer than these pixels
     assert errors[1] > 2 * errors[0]
@@ -55,7 +55,7 @@ def test_the_stitching_distance_moves_each_lens_to_the_middle() -> None:
 def test_pixels_that_no_lens_sees_are_black_and_invalid() -> None:
     rig = example_rig(size_px=120, field_of_view_deg=150.0)
     pictures = tuple(np.full((120, 120, 3), 200, np.uint8) for _ in range(2))
-    panorama, valid = stitch_lenses(pictures, rig, size_hw=SIZE_HW, blend_deg=2.0)
+    panorama, valid = stitch_lenses(pictures, rig, size_hw=SIZE_HW)
     labels = rig.lens_of_bearings(ray_grid(SIZE_HW))
     assert np.array_equal(valid, labels >= 0)
     share = np.average(~valid, weights=np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW))
@@ -67,10 +67,12 @@ def test_pixels_that_no_lens_sees_are_black_and_invalid() -> None:
 def test_outside_of_the_seam_each_pixel_is_that_of_its_lens() -> None:
     rig = example_rig(size_px=120)
     pictures = np.full((120, 120, 3), 50, np.uint8), np.full((120, 120, 3), 150, np.uint8)
-    panorama, _ = stitch_lenses(pictures, rig, size_hw=SIZE_HW, blend_deg=6.0)
+    panorama, _ = stitch_lenses(pictures, replace(rig, blend_deg=6.0), size_hw=SIZE_HW)
     labels = rig.lens_of_bearings(ray_grid(SIZE_HW))
     mixed = (panorama[..., 0] > 50) & (panorama[..., 0] < 150)
     assert (panorama[..., 0][~mixed] == np.where(labels == 0, 50, 150)[~mixed]).all()
+    assert np.degrees(rig.angle_from_seam(ray_grid(SIZE_HW))[mixed]).max() < 3
+    assert np.degrees(rig.angle_from_seam(ray_grid(SIZE_HW))[~mixed]).min() > 2.9
     # A strip of 6° around a great circle is sin 3° of the sphere.
     share = np.average(mixed, weights=np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW))
     assert share == pytest.approx(np.sin(np.radians(3)), rel=0.1)
@@ -88,19 +90,17 @@ def test_large_pictures_are_reduced_without_aliasing() -> None:
     rig = example_rig(size_px=480)
     stripes = np.zeros((480, 480, 3), np.uint8)
     stripes[::2] = 200
-    panorama, _ = stitch_lenses((stripes, stripes), rig, size_hw=SIZE_HW, blend_deg=2.0)
+    panorama, _ = stitch_lenses((stripes, stripes), rig, size_hw=SIZE_HW)
     assert np.abs(panorama.astype(int) - 100).max() <= 8
 
 
 def test_threads_do_not_change_the_result() -> None:
     rig = example_rig(size_px=120, offset_m=0.03, stitch_distance_m=2.0)
-    one, many = (
-        stitch_lenses(pictures_of(0.03), rig, size_hw=SIZE_HW, blend_deg=2.0, threads=threads)[0] for threads in (1, 3)
-    )
+    one, many = (stitch_lenses(pictures_of(0.03), rig, size_hw=SIZE_HW, threads=threads)[0] for threads in (1, 3))
     assert np.array_equal(one, many)
 
 
 def test_pictures_of_another_size_are_refused() -> None:
     rig: LensRig = example_rig(size_px=100)
     with pytest.raises(UsageError, match="the picture of the lens front is"):
-        stitch_lenses(pictures_of(0.03), rig, size_hw=SIZE_HW, blend_deg=2.0)
+        stitch_lenses(pictures_of(0.03), rig, size_hw=SIZE_HW)

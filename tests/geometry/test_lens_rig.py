@@ -62,6 +62,16 @@ def test_the_lens_is_the_one_that_sees_further_inside_its_field_of_view() -> Non
     assert blind.rays_from_bearings((0.0, 1.0, 0.0))[0].tolist() == [0, 0, 0]
 
 
+def test_the_angle_from_the_seam_is_that_from_the_plane_between_opposite_lenses() -> None:
+    lens = FisheyeLens((960, 960), (250.0, 250.0), (480.0, 480.0), (0.0, 0.0, 0.0, 0.0), np.radians(100))
+    back = Rigid3.from_center(rotation_from_rotvec(np.array([0, np.pi, 0])), (0, 0, -0.04))
+    own = LensRig.centred(("a", "b"), (lens, lens), (Rigid3.identity(), back))
+    elevations = np.radians([-9.0, -3.0, 0.0, 2.0, 9.0])
+    rays = np.stack([np.cos(elevations), np.zeros(5), np.sin(elevations)], axis=1)
+    assert own.angle_from_seam(rays) == pytest.approx(np.abs(elevations), abs=1e-12)
+    assert own.angle_from_seam([(0, 0, 1), (0.1, 0, -1)]).tolist() == [np.inf, np.inf]
+
+
 def test_beyond_the_border_of_its_picture_a_lens_sees_nothing() -> None:
     lens = FisheyeLens((300, 960), (250.0, 250.0), (480.0, 150.0), (0.0, 0.0, 0.0, 0.0), np.radians(100))
     both = LensRig.centred(("a", "b"), (lens, lens), (Rigid3.identity(), Rigid3.from_center(BACK, (0, 0, -0.04))))

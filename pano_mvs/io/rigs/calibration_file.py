@@ -48,12 +48,13 @@ _LENS_KEYS = (
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9-]{1,40}")
 
 
-def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf")) -> LensRig:
+def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_deg: float = 2.0) -> LensRig:
     """Return the rig that a calibration file describes.
 
     Args:
         file: the YAML file.
         stitch_distance_m: the distance at which the pictures are stitched.
+        blend_deg: width of the strip around the seam in which both pictures are mixed.
 
     Raises:
         InputError: if the file cannot be read, or a number is missing or impossible; with file, line and remedy.
@@ -83,7 +84,11 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf")) -> Lens
     first, second = (_lens(lenses[name], place, shift_px=0.5 - first_pixel) for name in names)
     try:
         return LensRig.centred(
-            (names[0], names[1]), (first[0], second[0]), (first[1], second[1]), stitch_distance_m=stitch_distance_m
+            (names[0], names[1]),
+            (first[0], second[0]),
+            (first[1], second[1]),
+            stitch_distance_m=stitch_distance_m,
+            blend_deg=blend_deg,
         )
     except UsageError as error:
         raise InputError(f"{file.path}: {error}. Give a larger stitch_distance_m, or translations in metres") from error

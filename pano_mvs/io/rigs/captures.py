@@ -87,6 +87,8 @@ def _pairs(
             continue
         missing = [name for idx, name in enumerate(lens_names) if idx not in files]
         problem = f"the picture of the lens {missing[0]} is missing" if missing else ""
+        if len({file.suffix for file in files.values()}) > 1:
+            problem = "the pictures of its lenses have different formats; save both in the same"
         yield RigPictures(f"{shared}.png", tuple(files[idx] for idx in sorted(files)), problem)
 
 

@@ -41,6 +41,7 @@ from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.stages.rigs.exports import lens_rig_files
 
 
 class ModelParams(Params):
@@ -60,9 +61,12 @@ def colmap(
     """COLMAP model with EQUIRECTANGULAR cameras, points and tracks, in colmap/sparse/0.
 
     Further groups of poses, each in its own frame, are the models sparse/1, sparse/2 … Photographs that poses.localise
-    has placed are in sparse/0, with SIMPLE_RADIAL cameras.
+    has placed are in sparse/0, with SIMPLE_RADIAL cameras. For panoramas of source.dual_fisheye whose poses are in
+    metres, colmap_rig/sparse/0 … are the same models with a rig of two OPENCV_FISHEYE cameras instead, whose pictures
+    export.colmap_lenses writes.
     """
-    return _sparse_models(poses, images, params.format, photographs=photographs, ctx=ctx, target="colmap/sparse")
+    panoramic = _sparse_models(poses, images, params.format, photographs=photographs, ctx=ctx, target="colmap/sparse")
+    return Files({**panoramic.files, **lens_rig_files(poses, images, params.format, ctx=ctx)})
 
 
 class MasksParams(Params):

@@ -62,7 +62,7 @@ class DualFisheyeParams(Params):
     def rig(self, calibration: FilePart) -> LensRig:
         """Return the rig of a calibration file."""
         distance = float("inf") if self.stitch_distance_m is None else self.stitch_distance_m
-        return read_rig(calibration, stitch_distance_m=distance)
+        return read_rig(calibration, stitch_distance_m=distance, blend_deg=self.blend_deg)
 
 
 def list_captures(params: DualFisheyeParams) -> Iterator[SourceItem]:
@@ -120,9 +120,7 @@ def dual_fisheye(item: SourceItem, params: DualFisheyeParams, ctx: Context) -> P
     if second is not None:
         pictures.append(_decoded(second, second.read_bytes(), params))
     size_hw = _panorama_size(rig, params)
-    picture, valid = stitch_lenses(
-        _by_lens(pictures, rig, item, params), rig, size_hw=size_hw, blend_deg=params.blend_deg, threads=ctx.threads
-    )
+    picture, valid = stitch_lenses(_by_lens(pictures, rig, item, params), rig, size_hw=size_hw, threads=ctx.threads)
     del pictures
     write_png(ctx.scratch / "panorama.png", picture)
     panorama = Panorama(

@@ -43,7 +43,7 @@ def test_track_bearings_stay_those_of_the_panoramas() -> None:
     known = refine_poses(capture.poses, rigs=capture.rigs)
     before = {tuple(np.round(ray, 9)) for ray in capture.poses.track_bearings.tolist()}
     after = {tuple(np.round(ray, 9)) for ray in known.track_bearings.tolist()}
-    assert len(after) > 0.95 * len(before)
+    assert 0.9 * len(before) < len(after) < 0.97 * len(before)  # without those next to the seam
     assert len(after - before) < 0.001 * len(after)  # but for rounding
     assert np.median(known.point_errors_rad) < np.radians(0.06)
 
@@ -57,7 +57,7 @@ def test_a_tiny_offset_gives_no_unit_and_changes_nothing() -> None:
 
 
 def test_an_offset_comparable_with_the_room_is_not_trusted_if_it_does_not_converge() -> None:
-    capture = rig_capture(offset_m=0.3, stitch_distance_m=np.inf, points=300)
+    capture = rig_capture(offset_m=0.4, stitch_distance_m=np.inf, points=300, seed=1)
     assert not refine_poses(capture.poses, rigs=capture.rigs).metric
 
 

@@ -44,9 +44,16 @@ def test_other_files_show_both_lenses(tmp_path: Path) -> None:
 
 
 def test_incomplete_captures_are_reported(tmp_path: Path) -> None:
-    assert listed(tmp_path, ["front/1.jpg", "back/1.jpg", "back/2.jpg", "notes/3.jpg"]) == [
+    assert listed(
+        tmp_path, ["front/1.jpg", "back/1.jpg", "back/2.jpg", "notes/3.jpg", "back/4.png", "front/4.jpg"]
+    ) == [
         ("1.png", ["front/1.jpg", "back/1.jpg"], ""),
         ("2.png", ["back/2.jpg"], "the picture of the lens front is missing"),
+        (
+            "4.png",
+            ["front/4.jpg", "back/4.png"],
+            "the pictures of its lenses have different formats; save both in the same",
+        ),
         ("notes/3.jpg", [], "does not belong to a lens: no folders front or back"),
     ]
 
