@@ -10,18 +10,25 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.io.images.videos import tiny_video
+from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.localise": {"path": "{capture}/images"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
+    "source.dual_fisheye": {
+        "path": str(tiny_rig_capture() / "images"),
+        "calibration": str(tiny_rig_capture() / "rig.yaml"),
+        "width": 64,
+    },
     "source.video": {"path": str(tiny_video())},
 }
 FRAME = NerfstudioFrame(
     "equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 )
 INPUTS: dict[str, dict[str, Any]] = {
+    "export.colmap_lenses": {"image": tiny_rig_panorama()},
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
