@@ -360,6 +360,27 @@ def share(
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 
+@app.command("split")
+@guarded
+def split_capture(
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="The folder of the capture, in natural order.")],
+    to: Annotated[Path, typer.Option("--out", help="Folder to write the blocks to.")],
+    size: Annotated[int, typer.Option("--size", min=7, help="Maximum number of images of a block.")] = 2000,
+    overlap: Annotated[int, typer.Option("--overlap", min=3, help="Images that consecutive blocks share.")] = 100,
+    loop: Annotated[bool, typer.Option("--loop", help="The path ends where it began.")] = False,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            "--poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
+        ),
+    ] = None,
+) -> None:
+    """Divide a capture into overlapping blocks: folders of links to its images."""
+    from pano_mvs.cli.merge_command import split_command
+
+    split_command(images, to, size=size, overlap=overlap, loop=loop, poses=poses, console=Console())
+
+
 @app.command("merge")
 @guarded
 def merge_runs(

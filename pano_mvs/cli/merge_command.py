@@ -1,4 +1,4 @@
-"""Merge blocks of a capture."""
+"""Divide a capture into blocks, and merge them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,29 @@ from rich.table import Table
 
 from pano_mvs.session.merging.agreement import is_doubtful
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
+from pano_mvs.session.merging.split import split_images
+
+
+def split_command(
+    images: Path, to: Path, *, size: int, overlap: int, loop: bool, poses: Path | None, console: Console
+) -> None:
+    """Write the blocks of a capture, and print them and the commands that follow.
+
+    Raises:
+        UsageError: if a setting or a folder cannot be used.
+        InputError: if there are no images, or the poses are of other images.
+        StoreError: if a link cannot be made.
+    """
+    blocks = split_images(images, to, size=size, overlap=overlap, loop=loop, poses=poses)
+    outs = [f"out/{block.folder.name}" for block in blocks]
+    for block, out in zip(blocks, outs, strict=True):
+        console.print(
+            f"{escape(str(block.folder))}: {len(block.names)} images\n"
+            f"  pano-mvs run WORKFLOW --images {escape(str(block.folder))} --out {out}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    console.print(f"then: pano-mvs merge {' '.join(outs)} --out out/merged", highlight=False, soft_wrap=True)
 
 
 def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None, console: Console) -> int:

@@ -26,3 +26,14 @@ def test_merge_of_blocks_without_overlap_ends_with_the_reason(pano_mvs: Command,
     result = pano_mvs("merge", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "both")
     assert result.code == 2
     assert "3 are needed" in " ".join(result.text.split())
+
+
+def test_split_prints_the_commands_that_follow(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for number in range(20):
+        (tmp_path / f"walk/{number}.png").write_bytes(b"x")
+    result = pano_mvs("split", tmp_path / "walk", "--out", tmp_path / "blocks", "--size", "12", "--overlap", "4")
+    assert result.code == 0, result.text
+    assert "--out out/block_2" in result.text
+    assert "then: pano-mvs merge out/block_1 out/block_2 --out out/merged" in " ".join(result.text.split())
+    assert (tmp_path / "blocks/block_2/19.png").read_bytes() == b"x"
