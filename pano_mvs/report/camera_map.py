@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
+from pano_mvs.report.walk_path import WalkPath, find_walk
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.scene.upright import states_y_down
@@ -24,7 +25,7 @@ _WIDTH, _HEIGHT, _SIDE_HEIGHT = 360, 320, 180
 _BORDER = 40
 _LETTER, _LINE = 8.6, 16.0
 _NEAR, _TINY_MAP = 9, 140
-_MAX_LABELS, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 1500, 600, 600
+_MAX_LABELS, _MANY, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 150, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
 _ALONG_NORTH = re.compile(r"\bz north\b")
 
@@ -38,12 +39,14 @@ class Link:
         strength: from 0 to 1, by its inliers.
         text: the tooltip.
         rejected: whether no common geometry was found.
+        closure: whether it closes a loop of a walk.
     """
 
     ends: tuple[float, float, float, float]
     strength: float
     text: str
     rejected: bool
+    closure: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class CameraMap:
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
         marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
+        path: an SVG path along the cameras of a walk in their order; empty if they were not taken along one.
+        ends: (x, y) of the first and the last camera of a walk.
     """
 
     title: str
@@ -73,11 +78,18 @@ class CameraMap:
     north: bool = False
     doubtful: tuple[tuple[float, float, str, str], ...] = ()
     marks: tuple[tuple[float, float, int], ...] = ()
+    path: str = ""
+    ends: tuple[tuple[float, float], ...] = ()
 
     @property
     def radius(self) -> float:
         """The radius at which a camera is drawn."""
-        return 4.5 if len(self.cameras) <= _MAX_LABELS else 2.5
+        return 4.5 if len(self.cameras) <= _MAX_LABELS else 2.5 if len(self.cameras) <= _MANY else 1.6
+
+    @property
+    def closures(self) -> int:
+        """The number of drawn pairs that close loops of a walk."""
+        return sum(link.closure for link in self.links)
 
     @property
     def rejected(self) -> int:
@@ -108,7 +120,8 @@ def camera_maps(
     places = np.array([place for _, place in marks], np.float64).reshape(-1, 3) @ level_from_world.T
     unit = "m" if poses.metric else "scene units"
     labels = short_names(names)
-    links = _chosen(poses.links, names, labels, reasons=reasons or {})
+    walk = _walk_of(poses.links, names)
+    links = _chosen(poses.links, names, labels, reasons=reasons or {}, walk=walk)
     north = bool(_ALONG_NORTH.search(poses.frame))
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
@@ -120,6 +133,7 @@ def camera_maps(
             if title == "From above"
             else (),
             links=links,
+            walk=walk,
             doubts=doubts,
             unit=unit,
             tallest=tallest,
@@ -154,23 +168,46 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Joined:
-    """A link to draw: the positions of two cameras, the number of inliers, and the tooltip."""
+    """A link to draw: positions of two cameras, number of inliers, tooltip, and whether it closes a loop of a walk."""
 
     first: int
     second: int
     inliers: int
     text: str
+    closure: bool
+
+
+def _walk_of(links: Sequence[PairLink], names: list[str]) -> WalkPath | None:
+    position = {name: idx for idx, name in enumerate(names)}
+    pairs = [
+        (position[link.first], position[link.second])
+        for link in links
+        if link.inliers and link.first in position and link.second in position
+    ]
+    return find_walk(len(names), pairs)
 
 
 def _chosen(
-    links: Sequence[PairLink], names: list[str], labels: list[str], *, reasons: Mapping[tuple[str, str], str]
+    links: Sequence[PairLink],
+    names: list[str],
+    labels: list[str],
+    *,
+    reasons: Mapping[tuple[str, str], str],
+    walk: WalkPath | None,
 ) -> list[_Joined]:
-    """Return links between registered cameras: some rejected ones, then the strongest, in ascending order."""
+    """Return links between registered cameras: some rejected ones, then the strongest, in ascending order.
+
+    Of a walk, those that close loops come last, so that they are drawn over the others.
+    """
     position = {name: idx for idx, name in enumerate(names)}
     # There may be half a million of them, so only those that are drawn get words.
     found = [link for link in links if link.first in position and link.second in position]
+
     # Of the rejected links, those with the most candidates.
-    found.sort(key=lambda link: (link.inliers, -(link.candidates or 0)))
+    def closes(link: PairLink) -> bool:
+        return walk is not None and bool(link.inliers) and walk.is_closure(position[link.first], position[link.second])
+
+    found.sort(key=lambda link: (closes(link), link.inliers, -(link.candidates or 0)))
     split = sum(not link.inliers for link in found)
     chosen = found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
     return [
@@ -178,7 +215,9 @@ def _chosen(
             first := position[link.first],
             second := position[link.second],
             link.inliers,
-            f"{labels[first]} – {labels[second]}: {_words(link, reasons.get((link.first, link.second), ''))}",
+            f"{labels[first]} – {labels[second]}: {_words(link, reasons.get((link.first, link.second), ''))}"
+            f"{'; closes a loop' if closes(link) else ''}",
+            closes(link),
         )
         for link in chosen
     ]
@@ -203,6 +242,7 @@ def _drawn(
     *,
     marks: Sequence[tuple[int, FloatArray]],
     links: list[_Joined],
+    walk: WalkPath | None,
     doubts: Mapping[int, str],
     unit: str,
     tallest: int,
@@ -226,7 +266,8 @@ def _drawn(
     most = max((link.inliers for link in links), default=1) or 1
     at = [(float(x), float(y)) for x, y in placed]
     lines = tuple(
-        Link((*at[link.first], *at[link.second]), link.inliers / most, link.text, not link.inliers) for link in links
+        Link((*at[link.first], *at[link.second]), link.inliers / most, link.text, not link.inliers, link.closure)
+        for link in links
     )
     named = len(labels) <= _MAX_NAMED
     spots = _label_spots(placed, labels)
@@ -240,7 +281,14 @@ def _drawn(
     text += f", {len(doubts)} of them doubtful" if doubts else ""
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())
     shown = tuple(cameras if named else ())
-    return CameraMap(title, text, (_WIDTH, height), lines, shown, dots, bar, north, doubtful, marked)
+    path = "" if walk is None else "".join(_stretch([at[idx] for idx in stretch]) for stretch in walk.stretches)
+    ends = () if walk is None else (at[0], at[-1])
+    return CameraMap(title, text, (_WIDTH, height), lines, shown, dots, bar, north, doubtful, marked, path, ends)
+
+
+def _stretch(places: Sequence[tuple[float, float]]) -> str:
+    """Return the SVG path through places; empty for a single one."""
+    return f"M{'L'.join(f'{x:g} {y:g}' for x, y in places)}" if len(places) > 1 else ""
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -161,3 +162,54 @@ def test_places_to_stand_are_marked_to_scale_and_within_the_map() -> None:
     assert [mark[2] for mark in above.marks] == [1, 4]
     assert side.marks == ()
     assert above.marks[1][:2] == (above.size_wh[0] - 14, above.size_wh[1] - 14)
+
+
+def walked(count: int, extra: list[tuple[int, int]], window: int = 3) -> dict[str, Any]:
+    """Return poses along a circle, with links of each camera to the next ones and further links."""
+    angles = 2 * np.pi * np.arange(count) / count
+    near = [(idx, idx + step) for idx in range(count) for step in range(1, window + 1) if idx + step < count]
+    names = [f"{idx:03d}.png" for idx in range(count)]
+    return {
+        "registered": names,
+        "centers": np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1).tolist(),
+        "links": [[names[a], names[b], 100] for a, b in [*extra, *near]],
+    }
+
+
+def test_the_path_of_a_walk_is_drawn_with_its_ends_and_loop_closures() -> None:
+    above, side = camera_maps(walked(300, [(0, 299), (3, 290)]))
+    for drawn in (above, side):
+        assert drawn.path.startswith("M")
+        assert drawn.path.count("L") == 299
+        assert drawn.ends == (drawn.cameras[0][:2], drawn.cameras[-1][:2])
+        assert drawn.closures == 2
+        assert [link.closure for link in drawn.links[-2:]] == [True, True], "closures are drawn over the others"
+        assert drawn.links[-1].text.endswith("; closes a loop")
+    assert above.radius < camera_maps(walked(100, []))[0].radius
+
+
+def test_loop_closures_are_drawn_though_other_links_are_stronger() -> None:
+    capture = walked(400, [], window=9)
+    capture["links"].append(["000.png", "399.png", 1])
+    drawn = camera_maps(capture)[0]
+    assert drawn.closures == 1
+    assert len(drawn.links) == 1500
+
+
+def test_a_path_is_interrupted_where_no_pair_leads_on() -> None:
+    capture = walked(60, [])
+    names = capture["registered"]
+    capture["links"] = [link for link in capture["links"] if not link[0] < names[30] <= link[1]]
+    assert camera_maps(capture)[0].path.count("M") == 2
+
+
+def test_captures_without_order_have_no_path() -> None:
+    names = walked(40, [])["registered"]
+    everything = walked(40, []) | {"links": [[a, b, 50] for a in names for b in names if a < b]}
+    shuffled = np.random.default_rng(0).permutation(40)
+    disordered = walked(40, []) | {
+        "links": [[names[a], names[b], 50] for a, b in pairwise(shuffled)]
+    }
+    for capture in (everything, disordered, walked(10, [])):
+        drawn = camera_maps(capture)[0]
+        assert (drawn.path, drawn.ends, drawn.closures) == ("", (), 0)
