@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges, projected, surface_planes
-from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows, next_run
+from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows, nearest_of_cells, next_run
 from pano_mvs.algorithms.patchmatch.kernels_refine import STRETCH
 from pano_mvs.algorithms.patchmatch.refine import reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
@@ -55,6 +55,17 @@ def on_a_surface(truth: NDArray[np.float32]) -> NDArray[np.bool_]:
     smooth: NDArray[np.bool_] = np.ptp(np.log(shifts), axis=0) < 0.2
     smooth[:12] = smooth[-12:] = False
     return smooth
+
+
+@pytest.mark.kernel("patchmatch.kernels_exchange")
+def test_the_nearest_point_of_a_cell_counts_and_the_first_of_equals() -> None:
+    rng = np.random.default_rng(4)
+    cells, distances = rng.integers(0, 40, 300), rng.integers(1, 6, 300).astype(np.float64)
+    order = np.lexsort((distances, cells))
+    expected = np.full(50, -1)
+    occupied, firsts = np.unique(cells[order], return_index=True)
+    expected[occupied] = order[firsts]
+    np.testing.assert_array_equal(nearest_of_cells(cells, distances, 50), expected)
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(0, 3))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, Any
 
 import cv2
@@ -19,6 +18,8 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+
+FloatArray = NDArray[np.float64]
 
 # Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
@@ -192,36 +193,80 @@ def compare_with_sources(
         max_relative_error: largest relative difference of ranges that agree.
         max_angle: largest angle between pixel and reprojection, in radians.
     """
-    import numba  # slow to import
-
     from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
     shape = ranges.shape
-    limits = np.array([max_relative_error, max_angle, _MAX_SURFACE_STEP])
     comparison = Comparison(
         np.zeros(shape, np.int64),
         np.zeros(shape, np.int64),
         np.zeros(shape, np.uint16),
         *(np.zeros(shape) for _ in range(3)),
     )
-    ranges, rays = np.ascontiguousarray(ranges), ray_grid((shape[0], shape[1]))
-    verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
+
+    def add(rows: slice, verdicts: NDArray[np.uint8], supports: FloatArray, motions: FloatArray) -> None:
+        comparison.agreeing[rows] += verdicts == kernels.AGREES
+        comparison.contradicting[rows] += verdicts == kernels.CONTRADICTS
+        comparison.hiding[rows] += verdicts == kernels.HIDDEN
+        # Rounded, so that the sum of a few values does not depend on the order of the sources.
+        comparison.support[rows] += np.rint(supports * 2**40) / 2**40
+        comparison.motion[rows] += np.rint(supports * motions * 2**40) / 2**40
+        # A support is (1 − (error / limit)²)².
+        squared_error = supports * max_angle**2 * (1 - np.sqrt(supports))
+        comparison.squared_error[rows] += np.rint(squared_error * 2**60) / 2**60
+
+    _judge_all(ranges, sources, source_from_reference, limits=(max_relative_error, max_angle), add=add)
+    return comparison
+
+
+def agreeing_sources(
+    ranges: NDArray[np.float32],
+    sources: Sequence[RangeMap],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    max_relative_error: float,
+    max_angle: float,
+) -> NDArray[np.uint8]:
+    """Return the number of sources that agree with each pixel, (H, W), as in `compare_with_sources`, in less time."""
+    from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
+
+    agreeing = np.zeros(ranges.shape, np.uint8)
+
+    def add(rows: slice, verdicts: NDArray[np.uint8], _supports: FloatArray, _motions: FloatArray) -> None:
+        agreeing[rows] += verdicts == kernels.AGREES
+
+    _judge_all(ranges, sources, source_from_reference, limits=(max_relative_error, max_angle), add=add)
+    return agreeing
+
+
+def _judge_all(
+    ranges: NDArray[np.float32],
+    sources: Sequence[RangeMap],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    limits: tuple[float, float],
+    add: Callable[[slice, NDArray[np.uint8], FloatArray, FloatArray], None],
+) -> None:
+    """Call `add(rows, verdicts, supports, motions)` for bands of rows, each source in turn; see `judge_rows`."""
+    import numba  # slow to import
+
+    from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows  # compiles on import
+
+    height, width = ranges.shape
+    ranges, rays = np.ascontiguousarray(ranges), ray_grid((height, width))
+    all_limits = np.array([*limits, _MAX_SURFACE_STEP])
+    verdicts, supports, motions = np.empty(ranges.shape, np.uint8), np.empty(ranges.shape), np.empty(ranges.shape)
     for source, moved in zip(sources, source_from_reference, strict=True):
         view = np.ascontiguousarray(moved.rotation), np.ascontiguousarray(moved.translation)
         known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
-        arguments = ranges, rays, view, known, limits, verdicts, supports, motions
-        judge = partial(_judge, kernel=kernels.judge_rows, arguments=arguments)
-        for_bands(judge, shape[0], threads=numba.get_num_threads())
-        comparison.agreeing[...] += verdicts == kernels.AGREES
-        comparison.contradicting[...] += verdicts == kernels.CONTRADICTS
-        comparison.hiding[...] += verdicts == kernels.HIDDEN
-        # Rounded, so that the sum of a few values does not depend on the order of the sources.
-        comparison.support[...] += np.rint(supports * 2**40) / 2**40
-        comparison.motion[...] += np.rint(supports * motions * 2**40) / 2**40
-        # A support is (1 − (error / limit)²)².
-        squared_error = supports * limits[1] ** 2 * (1 - np.sqrt(supports))
-        comparison.squared_error[...] += np.rint(squared_error * 2**60) / 2**60
-    return comparison
+        arguments = ranges, rays, view, known, all_limits, verdicts, supports, motions
+
+        def judge(first: int, rows: int, *, arguments: tuple[Any, ...] = arguments) -> None:
+            judge_rows(first, rows, *arguments)
+            band = slice(first, first + rows)
+            # In bands, so that the arrays are still in the cache.
+            add(band, verdicts[band], supports[band], motions[band])
+
+        for_bands(judge, height, threads=numba.get_num_threads())
 
 
 def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
@@ -241,10 +286,6 @@ def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
         contradicted & (comparison.hiding >= _ONE_WAY * judges),
     )
     return Agreement(total, *(share(part) / total if total else 0.0 for part in parts))
-
-
-def _judge(first: int, rows: int, *, kernel: Callable[..., object], arguments: tuple[object, ...]) -> None:
-    kernel(first, rows, *arguments)
 
 
 def _step_around(ranges: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -100,14 +100,20 @@ def find_heights(
     """
     keys, starts, own, steps = cells
     a, b, axes = np.empty(6), np.empty(3), np.empty(6)
+    columns = np.empty((len(steps), 2), np.int64)
+    cell = np.int64(-1)
     for number in range(part[0], part[1]):
         i = chosen[number]
+        if own[i] != cell:  # successive points mostly lie in the same cell
+            cell = own[i]
+            for c in range(len(steps)):
+                columns[c, 0], columns[c, 1] = column_range(keys, starts, cell + steps[c])
         axes[0], axes[1], axes[2], axes[3], axes[4], axes[5] = tangents(cloud[1][i])
         a[:] = 0.0
         b[:] = 0.0
         count = 0
-        for step in steps:
-            begin, end = column_range(keys, starts, own[i] + step)
+        for c in range(len(steps)):
+            begin, end = columns[c, 0], columns[c, 1]
             inside = min(end - begin, most)
             for k in range(inside):
                 j = begin + k * (end - begin) // inside

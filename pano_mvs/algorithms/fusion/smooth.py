@@ -23,6 +23,7 @@ _REACH = 2.0
 # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
 _MOST_UNCERTAIN = 0.03
 _POINTS_PER_COLUMN = 12
+_POINTS_AT_ONCE = 1 << 13
 # Points with a smaller standard deviation, relative to the same distance, stay where they are.
 _LEAST_UNCERTAIN = 0.005
 _MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
@@ -89,7 +90,8 @@ def surface_heights(
         arrays = points[order], normals[order], sigmas[order]
         targets = np.flatnonzero(marked[order])
         arguments = arrays, radii[order], targets, cells, per_column, found
-        for_bands(partial(_find, kernel=find_heights, arguments=arguments), len(targets), threads=threads)
+        find = partial(_find, kernel=find_heights, arguments=arguments)
+        for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
         heights[order[targets]] = found[targets]
     return heights
 
@@ -111,10 +113,12 @@ def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) ->
 
 def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, tuple[IntArray, ...]]:
     """Return the order of points by cells of this edge, and the cells as `find_heights` needs them."""
-    places = np.floor((points - points.min(axis=0)) / edge).astype(np.int64) + 1
-    size = places.max(axis=0) + 2
-    strides = np.array([size[1] * size[2], size[2], 1], np.int64)
-    own = places @ strides
+    # One axis at a time: columns of a large (N, 3) array are slow to reduce and to multiply.
+    axes = [np.ascontiguousarray(points[:, axis]) for axis in range(3)]
+    places = [np.floor((axis - axis.min()) / edge).astype(np.int64) + 1 for axis in axes]
+    _, rows, columns = (int(axis.max()) + 2 for axis in places)
+    strides = np.array([rows * columns, columns, 1], np.int64)
+    own = (places[0] * rows + places[1]) * columns + places[2]
     order = np.argsort(own, kind="stable")
     own = own[order]
     starts = np.flatnonzero(np.diff(own, prepend=own[0] - 1))

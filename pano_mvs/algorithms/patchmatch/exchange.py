@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.consistency import Comparison, compare_with_sources
+from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources
 from pano_mvs.algorithms.patchmatch.refine import SOURCE_REACH, reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.bands import for_bands
@@ -102,17 +102,10 @@ def exchange_ranges(
     px_per_rad = reference.shape[1] / (2 * np.pi)
     reprojection = max_reprojection_px / px_per_rad
 
-    def compared(ranges: FloatImage) -> Comparison:
-        return compare_with_sources(
-            ranges,
-            [source.range_map for source in sources],
-            [source.from_reference for source in sources],
-            max_relative_error=max_relative_error,
-            max_angle=reprojection,
-        )
-
+    views = [source.range_map for source in sources], [source.from_reference for source in sources]
+    limits = {"max_relative_error": max_relative_error, "max_angle": reprojection}
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
-    own = compared(np.where(seen, range_map.range, np.float32(np.nan)))
+    own = compare_with_sources(np.where(seen, range_map.range, np.float32(np.nan)), *views, **limits)
     unsure = seen & ((own.agreeing < 1) | (own.support < min_support))
     best = _Best.of(range_map, own.agreeing, agreement)
     match = _Matcher(reference, sources)
@@ -122,7 +115,7 @@ def exchange_ranges(
         ranges, normals = projected(source, (reference.shape[0], reference.shape[1]))
         with np.errstate(invalid="ignore"):
             other = unsure & (ranges < range_map.range * (1 - max_relative_error))
-        agreeing = compared(np.where(other, ranges, np.float32(np.nan))).agreeing
+        agreeing = agreeing_sources(np.where(other, ranges, np.float32(np.nan)), *views, **limits)
         offers.append((ranges, normals, agreeing, other & (agreeing >= least)))
     wanted = np.any([offer[-1] for offer in offers], axis=0)
     best.score[wanted] += match.correlation(range_map.range, range_map.normals_in_cam, wanted)[wanted]
@@ -139,6 +132,8 @@ def projected(source: SourceView, size_hw: tuple[int, int]) -> tuple[FloatImage,
     Every pixel of the source lands in one pixel of the reference; of those that land in the same one, the nearest
     counts.
     """
+    from pano_mvs.algorithms.patchmatch.kernels_exchange import nearest_of_cells  # compiles on import
+
     height, width = size_hw
     ranges = source.range_map.range
     seen = source.range_map.confidence >= WEAK_CONFIDENCE[0]
@@ -147,14 +142,15 @@ def projected(source: SourceView, size_hw: tuple[int, int]) -> tuple[FloatImage,
     distance = np.linalg.norm(points, axis=-1)
     pixels = pixel_from_ray(points, size_hw)
     cell = np.minimum(pixels[:, 1].astype(np.intp), height - 1) * width + pixels[:, 0].astype(np.intp) % width
-    order = np.lexsort((distance, cell))
-    cells, firsts = np.unique(cell[order], return_index=True)
+    nearest = nearest_of_cells(cell, distance, height * width)
+    cells = np.flatnonzero(nearest >= 0)
+    chosen = nearest[cells]
     landed = np.full(height * width, np.nan, np.float32)
-    landed[cells] = distance[order[firsts]]
+    landed[cells] = distance[chosen]
     if source.range_map.normals_in_cam is None:
         return landed.reshape(size_hw), None
     normals = np.full((height * width, 3), np.nan, np.float16)
-    normals[cells] = source.range_map.normals_in_cam[seen][order[firsts]].astype(np.float64) @ back.rotation.T
+    normals[cells] = source.range_map.normals_in_cam[seen][chosen].astype(np.float64) @ back.rotation.T
     return landed.reshape(size_hw), normals.reshape(height, width, 3)
 
 
@@ -202,7 +198,7 @@ class _Matcher:
         self.count = len(sources)
 
     def correlation(self, ranges: FloatImage, normals: NDArray[np.float16] | None, wanted: Mask) -> FloatImage:
-        """Return the mean of the two best correlations, at least 0, (H, W); only where it is wanted."""
+        """Return the mean of the two best correlations, at least 0, (H, W); 0 where it is not wanted."""
         import numba  # slow to import
 
         from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows  # compiles on import
@@ -217,8 +213,10 @@ class _Matcher:
 
         for_bands(match, height, threads=numba.get_num_threads())
         best = min(_BEST, self.count)
-        found = np.partition(found, self.count - best, axis=0)[-best:]
-        return np.asarray(np.maximum(found, 0).mean(axis=0), np.float32)
+        some = np.partition(found[:, wanted], self.count - best, axis=0)[-best:]
+        correlations = np.zeros((height, width), np.float32)
+        correlations[wanted] = np.maximum(some, 0).mean(axis=0)
+        return correlations
 
 
 def surface_planes(

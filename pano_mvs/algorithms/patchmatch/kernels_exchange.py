@@ -74,3 +74,20 @@ def correlate_rows(
             correlate_sources(sums, votes, moments[1], noise, found)
             correlations[:, row, first:stop] = found
             first, stop = next_run(wanted[row], stop)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def nearest_of_cells(cells: NDArray[np.intp], distances: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Return the nearest point of each cell, (count,), the first of equals; −1 where there is none.
+
+    Args:
+        cells: (N,) of each point, from 0 to count − 1.
+        distances: (N,) of each point.
+        count: number of cells.
+    """
+    nearest = np.full(count, -1, np.int64)
+    for i in range(len(cells)):
+        before = nearest[cells[i]]
+        if before < 0 or distances[i] < distances[before]:
+            nearest[cells[i]] = i
+    return nearest

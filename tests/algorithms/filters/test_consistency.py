@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.filters.consistency import _step_around, check_consistency, seen_ranges
+from pano_mvs.algorithms.filters.consistency import (
+    _step_around,
+    agreeing_sources,
+    check_consistency,
+    compare_with_sources,
+    seen_ranges,
+)
 from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama
@@ -52,6 +58,15 @@ def test_compiled_verdicts_equal_the_plain_ones(size: tuple[int, int]) -> None:
         np.testing.assert_array_equal(verdicts, expected)
         np.testing.assert_allclose(supports, expected_supports, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(motions, expected_motions, rtol=1e-3, atol=1e-6)
+
+
+def test_sources_that_agree_are_counted_alone_or_with_all_figures(true_maps: list[RangeMap]) -> None:
+    moved = [pose @ POSES[0].inverse() for pose in POSES[1:]]
+    limits = {"max_relative_error": 0.02, "max_angle": 0.03}
+    found = agreeing_sources(true_maps[0].range, true_maps[1:], moved, **limits)
+    expected = compare_with_sources(true_maps[0].range, true_maps[1:], moved, **limits).agreeing
+    assert found.max() == len(moved)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_true_ranges_confirm_each_other(true_maps: list[RangeMap]) -> None:
