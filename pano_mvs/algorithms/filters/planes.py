@@ -7,6 +7,8 @@ reliable ranges in and around each connected, uniformly coloured part of the pan
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import cv2
@@ -35,6 +37,11 @@ _SECTORS, _MIN_SECTORS = 8, 6
 _STEPS_BEYOND = 0.8, 1.3
 # Ranges within this many tolerances of the plane belong to it, but are imprecise.
 _SAME_SURFACE = 3.0
+# Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
+# has this share of the pixels of that one.
+_CLEAR_SHARE, _NEARLY = 0.8, 0.8
+# Pixels that see a parallel plane at a more grazing angle than this cosine do not vote for its distance.
+_GRAZING = 0.1
 
 
 @checks_settings
@@ -47,6 +54,14 @@ def lay_planes(
     min_area_deg2: Annotated[float, Setting("minimum area of a surface, in square degrees", gt=0)] = 75.0,
     max_relative_error: Annotated[float, Setting("maximum relative error of a pixel on the plane", gt=0)] = 0.02,
     min_share: Annotated[float, Setting("minimum share of reliable pixels on the plane", gt=0, le=1)] = 0.25,
+    parallel_share: Annotated[
+        float,
+        Setting(
+            "share of reliable pixels on a plane below which one parallel to a clear plane is preferred; 0: never",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.35,
     min_confidence: Annotated[
         int, Setting("minimum confidence of reliable pixels", ge=1, le=255)
     ] = CONSISTENT_CONFIDENCE[0],
@@ -61,6 +76,10 @@ def lay_planes(
     not on the plane are then moved to it, with the confidence of filled pixels if they were far off; pixels on it are
     unchanged.
 
+    If less than `parallel_share` of a part's reliable pixels lie on its plane, most of them match by chance, and so may
+    the plane. Rooms have parallel surfaces: a plane parallel to that of another part, on which most reliable pixels
+    lie, is taken instead if it fits nearly as many.
+
     Args:
         range_map: (H, W) with even W, the full sphere.
         guide: (H, W, 3) RGB panorama.
@@ -70,43 +89,126 @@ def lay_planes(
         min_area_deg2: minimum area of a part, in square degrees; smaller ones are unchanged.
         max_relative_error: maximum relative difference of pixels on the plane.
         min_share: minimum share of reliable pixels on the plane, by solid angle.
+        parallel_share: share of reliable pixels on a plane below which a parallel one is preferred; 0: never.
         min_confidence: minimum confidence of reliable pixels; 128 is consistent.
         max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`): a sky is not a wall.
 
     Raises:
         UsageError: if guide and range map differ in size, or a setting is out of bounds.
     """
-    height, width = range_map.range.shape
     require_guide(guide, range_map)
+    rays = ray_grid((guide.shape[0], guide.shape[1]))
+    fits = list(
+        _plane_fits(
+            range_map,
+            guide,
+            rng=rng,
+            contrast=contrast,
+            min_area_deg2=min_area_deg2,
+            max_relative_error=max_relative_error,
+            min_confidence=min_confidence,
+        )
+    )
+    valid = [fit for fit in fits if fit.is_valid(rays, min_share)]
+    clear = [fit.plane / np.linalg.norm(fit.plane) for fit in valid if fit.share >= _CLEAR_SHARE]
+    inverse = 1 / range_map.range.astype(np.float64)
+    open_sky = large_holes(range_map.valid, max_hole_deg)
+    ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
+    for fit in fits:
+        chosen = fit
+        if fit.share < parallel_share:
+            chosen = _parallel_fit(fit, clear, max_relative_error=max_relative_error)
+        if not chosen.is_valid(rays, min_share):
+            continue
+        laid = np.zeros_like(inverse)
+        laid[fit.surface] = rays[fit.surface] @ chosen.plane
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.abs(inverse / laid - 1)
+        off = fit.surface & ~open_sky & ~(error <= max_relative_error)
+        ranges[off] = 1 / laid[off]
+        confidence[off & ~(error <= _SAME_SURFACE * max_relative_error)] = FILLED_CONFIDENCE[1]
+    return with_ranges(range_map, ranges, confidence)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaneFit:
+    """The plane of one plain part.
+
+    Attributes:
+        surface: (H, W) its pixels.
+        rays: (N, 3) of reliable pixels in and around it, drawn by weight.
+        inverse: (N,) their 1 / range.
+        plane: (3,), 1 / range = plane · ray.
+        on_plane: (N,) which of the reliable pixels are on it.
+    """
+
+    surface: Mask
+    rays: FloatArray
+    inverse: FloatArray
+    plane: FloatArray
+    on_plane: Mask
+
+    @property
+    def share(self) -> float:
+        """Share of the reliable pixels on the plane."""
+        return float(self.on_plane.mean())
+
+    def is_valid(self, rays: FloatArray, min_share: float) -> bool:
+        """Return whether enough reliable pixels are on the plane, on most sides; `rays` are those of all pixels."""
+        on = self.on_plane
+        return self.share >= min_share and _is_valid(
+            self.plane, rays[self.surface], self.rays[on], inverse=self.inverse[on]
+        )
+
+
+def _plane_fits(
+    range_map: RangeMap,
+    guide: NDArray[np.uint8],
+    *,
+    rng: np.random.Generator,
+    contrast: float,
+    min_area_deg2: float,
+    max_relative_error: float,
+    min_confidence: int,
+) -> Iterator[_PlaneFit]:
+    """Yield the best plane of each plain part that has enough reliable pixels, largest part first; see `lay_planes`."""
+    height, width = range_map.range.shape
     labels, bare = plain_surfaces(guide, contrast)
     area = np.broadcast_to(pixel_solid_angle((height, width))[:, None], (height, width))
     trusted = range_map.valid & (range_map.confidence >= min_confidence)
     weight = np.where(bare, _BARE_WEIGHT, 1.0) * area
     margin = max(1, round(3 * height / 256))
-    rays = ray_grid((height, width))
-    inverse = 1 / range_map.range.astype(np.float64)
-    open_sky = large_holes(range_map.valid, max_hole_deg)
-    ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
+    rays, inverse = ray_grid((height, width)), 1 / range_map.range.astype(np.float64)
     for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
         support = _dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
         if len(points) < _MIN_POINTS:
             continue
-        plane, on_plane = fit_plane(
-            rays[support][points], inverse[support][points], max_relative_error=max_relative_error, rng=rng
-        )
-        if on_plane.mean() < min_share or not _is_valid(
-            plane, rays[surface], rays[support][points][on_plane], inverse=inverse[support][points][on_plane]
-        ):
-            continue
-        laid = np.zeros_like(inverse)
-        laid[surface] = rays[surface] @ plane
-        with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.abs(inverse / laid - 1)
-        off = surface & ~open_sky & ~(error <= max_relative_error)
-        ranges[off] = 1 / laid[off]
-        confidence[off & ~(error <= _SAME_SURFACE * max_relative_error)] = FILLED_CONFIDENCE[1]
-    return with_ranges(range_map, ranges, confidence)
+        around, seen = rays[support][points], inverse[support][points]
+        plane, on_plane = fit_plane(around, seen, max_relative_error=max_relative_error, rng=rng)
+        yield _PlaneFit(surface, around, seen, plane, on_plane)
+
+
+def _parallel_fit(fit: _PlaneFit, normals: Sequence[FloatArray], *, max_relative_error: float) -> _PlaneFit:
+    """Return the best plane with one of these unit normals, (3,) each, or `fit` if it fits clearly more pixels."""
+    found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in normals]
+    best = max(found, key=lambda other: other.share, default=fit)
+    return best if best.share >= _NEARLY * fit.share else fit
+
+
+def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: float) -> _PlaneFit:
+    """Return the plane with a normal, at the distance for which most reliable pixels vote; they face one side of it."""
+    cosine = fit.rays @ normal
+    if np.median(cosine) < 0:
+        normal, cosine = -normal, -cosine
+    facing = cosine > _GRAZING
+    if not facing.any():
+        return replace(fit, on_plane=np.zeros_like(fit.on_plane))
+    votes = np.sort(np.log(fit.inverse[facing] / cosine[facing]))
+    stop = np.searchsorted(votes, votes + 2 * max_relative_error, side="right")
+    first = int(np.argmax(stop - np.arange(len(votes))))
+    plane = np.exp(np.median(votes[first : stop[first]])) * normal
+    return replace(fit, plane=plane, on_plane=np.abs(fit.rays @ plane / fit.inverse - 1) < max_relative_error)
 
 
 def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[np.int64], Mask]:
