@@ -47,8 +47,9 @@ class SweepParams(Params):
     )
     far: float | None = Field(default=None, gt=0, description="farthest depth hypothesis; null: estimated")
 
-    scale: Literal["sharp", "nominal"] = Field(
-        default="sharp", description="resolution of the sweep: that at which the panorama is sharp, or its own"
+    scale: Literal["finer", "sharp", "nominal"] = Field(
+        default="finer",
+        description="resolution of the sweep: up to twice that at which the panorama is sharp, that one, or its own",
     )
 
     @model_validator(mode="after")
@@ -79,7 +80,8 @@ def sweep(
     """Sphere sweep: select, for each pixel of the reference, the depth hypothesis at which the sources match best.
 
     Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
-    must agree with each other. A blurred panorama is swept at the resolution at which it is sharp.
+    must agree with each other. A blurred panorama is swept at up to twice the resolution at which it is sharp, where
+    edges are still better than at that one.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
@@ -89,7 +91,9 @@ def sweep(
     if near is None or far is None:
         limits = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend, device=params.device)
         near, far = near or limits[0], far or limits[1]
-    halvings = sharp_halvings(pictures[0]) if params.scale == "sharp" else 0
+    halvings = sharp_halvings(pictures[0]) if params.scale != "nominal" else 0
+    if params.scale == "finer":
+        halvings = max(halvings - 1, 0)
     pictures, masks = reduced(pictures, masks, halvings=halvings)
     found = sweep_range(
         pictures[0],
