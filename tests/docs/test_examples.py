@@ -28,6 +28,7 @@ from tests.io.images.videos import tiny_video
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+NO_WORKFLOW = ("<!-- variants -->\n", "<!-- calibration -->\n")
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
     "phone",
@@ -41,7 +42,7 @@ FOLDERS = (
     "truth",
     "videos",
 )
-FILES = ("walk.mp4", "mask.png")
+FILES = ("walk.mp4", "mask.png", "rig.yaml")
 # What the commands of the pages read, where they are run.
 PICTURES = {
     "photos/lobby": ("hall.jpg", "stairs.jpg"),
@@ -56,7 +57,7 @@ def blocks(language: str) -> list[Any]:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for match in FENCED.finditer(text):
-            if match[2] == language and not text[: match.start()].endswith("<!-- variants -->\n"):
+            if match[2] == language and not text[: match.start()].endswith(NO_WORKFLOW):
                 place = f"{page.relative_to(ROOT)}:{text[: match.start()].count(chr(10)) + 1}"
                 found.append(pytest.param(page, textwrap.dedent(match[3]), id=place))
     return found
