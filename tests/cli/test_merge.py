@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from pano_mvs.geometry import ray_grid, similarity_from_points
+from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.testing.room import capture_poses, default_room, range_along, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
-from tests.cli.conftest import Command
+from tests.cli.conftest import SIZE_HW, SMALL, Command
 from tests.session.merging.written_blocks import write_block
 
 
@@ -37,3 +45,35 @@ def test_split_prints_the_commands_that_follow(pano_mvs: Command, tmp_path: Path
     assert "--out out/block_2" in result.text
     assert "then: pano-mvs merge out/block_1 out/block_2 --out out/merged" in " ".join(result.text.split())
     assert (tmp_path / "blocks/block_2/19.png").read_bytes() == b"x"
+
+
+@pytest.mark.slow
+def test_blocks_of_a_rendered_room_become_one_model_of_it(pano_mvs: Command, tmp_path: Path) -> None:
+    room, cameras = default_room(), capture_poses(8, spread=0.4)
+    write_capture(tmp_path / "capture", room, cameras, size_hw=SIZE_HW)
+    result = pano_mvs(
+        "split", tmp_path / "capture/images", "--out", tmp_path / "blocks", "--size", "7", "--overlap", "3"
+    )
+    assert result.code == 0, result.text
+    for number in (1, 2):
+        block = pano_mvs(
+            "run", "quickstart", "--images", tmp_path / f"blocks/block_{number}", "--out", f"out/{number}",
+            "--cache", tmp_path / "cache", *SMALL,
+        )  # fmt: skip
+        assert block.code in (0, 3), block.text
+    result = pano_mvs("merge", "out/1", "out/2", "--out", "out/merged")
+    assert result.code == 0, result.text
+    poses = read_poses(Path("out/merged"))
+    assert len(poses.names) == 8
+    centers = np.array([camera.center for camera in cameras])
+    room_from_merged = similarity_from_points(poses.centers, centers)
+    offsets = np.linalg.norm(room_from_merged.apply(poses.centers) - centers, axis=1)
+    assert offsets.max() < 0.01
+    ranges = read_range_tiff(Path("out/merged/range/007.tiff")) * room_from_merged.scale
+    rays = cameras[7].rotation.T @ ray_grid(ranges.shape).reshape(-1, 3).T
+    errors = np.abs(ranges.ravel() / range_along(room, cameras[7].center, rays.T) - 1)
+    assert np.nanmedian(errors) < 0.02
+    cloud = read_ply(Path("out/merged/cloud.ply"))
+    parts = [len(read_ply(Path(f"out/{number}/cloud.ply"))) for number in (1, 2)]
+    assert max(parts) / 2 < len(cloud) < sum(parts)
+    assert pano_mvs("view", "out/merged", "--screenshot", "merged.png").code == 0
