@@ -28,8 +28,8 @@ _LINES = (-6.0, -1.0, 1.0, 6.0, 8.0)
 _CROSSINGS = (0, 3, 6, 9, 12)
 _COLORS = (OAK, BRICK, LEAVES, STEEL, BLUE, RED)
 _SEEN_FROM = 25.0
-_TWINS = {9: 3, 8: 2}
-"""Columns whose rooms look like those of other columns in a house with twins."""
+_TWINS = {6: 3, 7: 4}
+"""Columns whose rooms and corridors look like those of other columns in a house with twins."""
 # Column and line of the corners of the path: 0 is the first corridor, 7 the second, −3.5 a room beside the first.
 _CORNERS = (
     *((3, 0.0), (3, -3.5), (2, -3.5), (2, 0.0), (0, 0.0), (0, 7.0), (3, 7.0), (3, 0.0)),
@@ -118,14 +118,17 @@ def _house(twins: bool, seed: int) -> tuple[Painted, ...]:
 
 
 def _carpets(column: int, shift: float, seed: int) -> Iterator[Painted]:
-    """Yield floors and ceilings of a column's rooms, so that twins have nothing of their own."""
-    for number, (z0, z1) in enumerate(((_LINES[0], _LINES[1]), (_LINES[2], _LINES[3]))):
-        for top, bottom in ((_CEILING, _CEILING + 0.01), (_FLOOR - 0.01, _FLOOR)):
-            number += 2
-            low, high = (_WIDE * column, top, z0), (_WIDE * (column + 1), bottom, z1)
-            yield _painted(low, high, STONE, seed + 90 + number, shift=shift)
-    low, high = (_WIDE * column, _CEILING, _LINES[0]), (_WIDE * (column + 1), _FLOOR, _LINES[0] + 0.01)
-    yield _painted(low, high, STONE, seed + 99, shift=shift)
+    """Yield floors, ceilings and outer walls of a column, so that twins have nothing of their own."""
+    left, right = _WIDE * column, _WIDE * (column + 1)
+    front, back = _LINES[0], _LINES[-1]
+    boxes: list[tuple[Vector, Vector]] = [
+        ((left, _CEILING, front), (right, _CEILING + 0.01, back)),
+        ((left, _FLOOR - 0.01, front), (right, _FLOOR, back)),
+        ((left, _CEILING, front), (right, _FLOOR, front + 0.01)),
+        ((left, _CEILING, back - 0.01), (right, _FLOOR, back)),
+    ]
+    for number, (low, high) in enumerate(boxes):
+        yield _painted(low, high, STONE, seed + 90 + number, shift=shift)
 
 
 def _walls(column: int, shift: float, seed: int, *, like: int) -> Iterator[Painted]:
