@@ -1,0 +1,239 @@
+"""What the other views of a capture let one expect of a panorama: surfaces, and their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+Plane = NDArray[np.float32]
+
+# Ranges that agree within this share are of one surface.
+_SAME = 0.06
+# The ground is a plane through points this far below the horizon, as flat as this.
+_GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
+_GROUND_TRIALS = 60
+# Views differ by a pixel or two where poses or ranges are not exact: colours around a pixel count as well.
+_AROUND_PX = 2
+_DARK_LEVEL = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OtherView:
+    """Another view of the capture.
+
+    Attributes:
+        picture: (H, W, 3) uint8 RGB.
+        valid: (H, W), False is ignored.
+        range_map: its ranges, of any size.
+        pose: source_from_reference.
+    """
+
+    picture: Picture
+    valid: Mask
+    range_map: RangeMap
+    pose: Rigid3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """What other views expect of a panorama, (H, W) each.
+
+    Attributes:
+        ranges: where they put the nearest surface; NaN if they do not know.
+        ground: whether that is the ground.
+        difference: by how many grey levels the panorama's colour differs from all that the views show there and around
+            it, NaN unless two of them see the surface.
+        ratio: (H, W, 3) the panorama's colours divided by their median.
+        height: the camera's height above the ground, in scene units; NaN if it is not known.
+    """
+
+    ranges: Plane
+    ground: Mask
+    difference: Plane
+    ratio: Plane
+    height: float
+
+
+def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherView]) -> Expected:
+    """Compare a panorama with what other views expect in it.
+
+    A surface is expected where the ranges of two of them agree, or on the plane of the ground. The colours of those
+    that see it, after a factor per channel, and the lightest and the darkest colours within two pixels, are what can be
+    expected there. Where the panorama's own ranges are confirmed, what the views show at these is expected as well.
+
+    Args:
+        picture: (H, W, 3) uint8 RGB, the reference.
+        range_map: its ranges, of the same size.
+        others: views around it, of the same size.
+    """
+    size_hw = (picture.shape[0], picture.shape[1])
+    grid_hw = (size_hw[0] // 2, size_hw[1] // 2)
+    seen = np.array([_projected_ranges(other, grid_hw) for other in others])
+    known = np.where(range_map.confidence >= CONSISTENT_CONFIDENCE[0], range_map.range, np.float32(np.nan))
+    plane = ground_plane(known, seen)
+    ranges = _agreed(seen)
+    on_ground = np.full(grid_hw, np.nan, np.float32)
+    if plane is not None:
+        along = ray_grid(grid_hw) @ plane[:3]
+        on_ground = np.where(along > np.sin(np.radians(8)), plane[3] / np.maximum(along, 1e-6), np.nan).astype(
+            np.float32
+        )
+    ground = ~(ranges < (1 - 2 * _SAME) * on_ground) & np.isfinite(on_ground)
+    ranges = _enlarged(np.where(ground, on_ground, ranges), size_hw)
+    ground = _enlarged(ground.astype(np.float32), size_hw) > 0.5
+    difference, ratio = _differences(picture, ranges, others)
+    # Such as a chair beside the camera that others hardly see.
+    nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
+    if nearer.any():
+        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others)[0]
+        difference = np.fmin(difference, own)
+    height = float("nan") if plane is None else float(plane[3])
+    return Expected(ranges, ground, difference, ratio, height)
+
+
+def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
+    """Return the plane of the ground, n·x = h with n nearly straight down, as (4,): n and h; None without one.
+
+    Args:
+        known: (H, W) ranges of the panorama; NaN is unknown.
+        seen: (V, h, w) ranges as other views see them from there.
+    """
+    points = np.concatenate([_low_points(ranges) for ranges in (known, *seen)])
+    if len(points) < _MIN_GROUND_POINTS:
+        return None
+    rng = np.random.default_rng(0)
+    points = points[rng.permutation(len(points))[:3000]]
+    best: FloatArray | None = None
+    most = _MIN_GROUND_POINTS
+    for _ in range(_GROUND_TRIALS):
+        plane = _plane_through(points[rng.choice(len(points), 3, replace=False)])
+        if plane is None:
+            continue
+        count = int((np.abs(points @ plane[:3] - plane[3]) < 0.03 * plane[3]).sum())
+        if count > most:
+            best, most = plane, count
+    return best
+
+
+def _low_points(ranges: Plane) -> FloatArray:
+    rays = ray_grid((ranges.shape[0], ranges.shape[1]))
+    low = np.isfinite(ranges) & (rays[..., 1] > np.sin(np.radians(_GROUND_FROM_DEG)))
+    return np.asarray(rays[low] * ranges[low, None])
+
+
+def _plane_through(three: FloatArray) -> FloatArray | None:
+    normal = np.cross(three[1] - three[0], three[2] - three[0])
+    length = float(np.linalg.norm(normal))
+    if length < 1e-9:
+        return None
+    normal /= length * np.sign(normal[1] or 1)
+    height = float(normal @ three[0])
+    return np.append(normal, height) if normal[1] > np.cos(np.radians(_MAX_TILT_DEG)) and height > 0 else None
+
+
+def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:
+    """Return the nearest ranges (h, w) that another view's points have from the reference; NaN where there are none."""
+    ranges = np.where(other.range_map.confidence >= WEAK_CONFIDENCE[0], other.range_map.range, np.float32(np.nan))
+    known = np.isfinite(ranges)
+    points = ray_grid((ranges.shape[0], ranges.shape[1]))[known] * ranges[known, None]
+    points = (points - other.pose.translation) @ other.pose.rotation
+    distances = np.linalg.norm(points, axis=1)
+    nearest = np.full(grid_hw, np.inf, np.float32)
+    if len(points):
+        pixels = np.floor(pixel_from_ray(points / np.maximum(distances, 1e-9)[:, None], grid_hw)).astype(np.intp)
+        at = (np.minimum(pixels[:, 1], grid_hw[0] - 1), pixels[:, 0] % grid_hw[1])
+        np.minimum.at(nearest, at, distances.astype(np.float32))
+    found = np.where(np.isfinite(nearest), nearest, np.float32(0))
+    return _with_holes_filled(found)
+
+
+def _with_holes_filled(ranges: Plane) -> Plane:
+    """Return ranges, 0 where unknown, with small holes filled by the mean of those around; NaN elsewhere."""
+    padded = pad_panorama(ranges, 1)
+    count = cv2.blur((padded > 0).astype(np.float32), (3, 3))[1:-1, 1:-1]
+    mean = cv2.blur(padded, (3, 3))[1:-1, 1:-1] / np.maximum(count, 1e-6)
+    filled = np.where(count >= 2.5 / 9, mean, np.float32(np.nan))
+    return np.asarray(np.where(ranges > 0, ranges, filled), np.float32)
+
+
+def _agreed(seen: Plane) -> Plane:
+    """Return the nearest ranges (h, w) on which two views agree; NaN where none do."""
+    best = np.full(seen.shape[1:], np.inf, np.float32)
+    for idx in range(len(seen)):
+        for other in range(len(seen)):
+            if other != idx:
+                with np.errstate(invalid="ignore"):
+                    agrees = np.abs(seen[other] - seen[idx]) < _SAME * seen[idx]
+                best = np.where(agrees & (seen[idx] < best), seen[idx], best)
+    return np.asarray(np.where(np.isfinite(best), best, np.nan), np.float32)
+
+
+def _enlarged(values: Plane, size_hw: tuple[int, int]) -> Plane:
+    rows, columns = (np.arange(size) * small // size for size, small in zip(size_hw, values.shape, strict=True))
+    return np.asarray(values[rows[:, None], columns])
+
+
+def _differences(picture: Picture, ranges: Plane, others: Sequence[OtherView]) -> tuple[Plane, Plane]:
+    """Return the differences of colour, (H, W), and the ratios of the colours, (H, W, 3), see `Expected`."""
+    own = _smooth(picture)
+    points = ray_grid((ranges.shape[0], ranges.shape[1])) * np.nan_to_num(ranges, nan=1.0)[..., None]
+    differences, colors = [], []
+    for other in others:
+        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges))
+        visible = np.isfinite(middle[..., 0])
+        gain = np.ones(3, np.float32)
+        if visible.sum() > 100:
+            gain = np.median((own[visible] + _DARK_LEVEL) / (middle[visible] + _DARK_LEVEL), axis=0)
+        apart = np.maximum(lowest * gain - own, own - highest * gain).max(axis=-1)
+        differences.append(np.where(visible, np.maximum(apart, 0), np.nan))
+        colors.append(middle * gain)
+    stack = np.sort(np.array(differences, np.float32), axis=0)  # NaN last
+    count = np.isfinite(stack).sum(axis=0)
+    # With four views or more, one may differ from the others by chance.
+    which = np.where(count >= 4, 1, 0)
+    difference = np.where(count >= 2, np.take_along_axis(stack, which[None], axis=0)[0], np.nan)
+    with np.errstate(invalid="ignore"):
+        expected = _nan_median(np.array(colors, np.float32))
+    return difference.astype(np.float32), ((own + _DARK_LEVEL) / (expected + _DARK_LEVEL)).astype(np.float32)
+
+
+def _nan_median(values: Plane) -> Plane:
+    """Return the median over the first axis of the values that are not NaN, the lower one of two; NaN without any."""
+    ordered = np.sort(values, axis=0)
+    middle = np.maximum(np.isfinite(ordered).sum(axis=0) - 1, 0) // 2
+    return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
+
+
+def _seen_colors(other: OtherView, points: FloatArray, known: Mask) -> tuple[Plane, Plane, Plane]:
+    """Return the darkest, the mean and the lightest colours (H, W, 3) of points in another view; NaN if hidden."""
+    in_view = points @ other.pose.rotation.T + other.pose.translation
+    distances = np.linalg.norm(in_view, axis=-1)
+    rays = in_view / np.maximum(distances, 1e-9)[..., None]
+    size_hw = (other.picture.shape[0], other.picture.shape[1])
+    x, y = np.floor(pixel_from_ray(rays, size_hw)).astype(np.intp).transpose(2, 0, 1)
+    at = (np.minimum(y, size_hw[0] - 1), x % size_hw[1])
+    seen = _enlarged(other.range_map.range, size_hw)[at]
+    with np.errstate(invalid="ignore"):
+        visible = known & other.valid[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
+    smooth = _smooth(other.picture)
+    padded = pad_panorama(smooth, _AROUND_PX)
+    window = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)
+    inner = (slice(_AROUND_PX, -_AROUND_PX),) * 2
+    found = (cv2.erode(padded, window)[inner][at], smooth[at], cv2.dilate(padded, window)[inner][at])
+    lowest, middle, highest = (np.where(visible[..., None], colors, np.float32(np.nan)) for colors in found)
+    return lowest, middle, highest
+
+
+def _smooth(picture: Picture) -> Plane:
+    return np.ascontiguousarray(cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1])

@@ -1,0 +1,202 @@
+"""Find what moves through the scene: the operator, passers-by and vehicles, from views with poses and ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights
+from pano_mvs.algorithms.masks.expected_view import Expected, OtherView, expected_view
+from pano_mvs.algorithms.masks.people import person_at
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import ray_grid
+from pano_mvs.scene import RangeMap
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+WIDTH = 512
+"""Columns at which views are compared; larger ones have to be reduced."""
+
+MAX_OTHERS = 6
+"""More views around a panorama add nothing."""
+
+_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
+# Differences of colour, in grey levels, from which an area is changed, and at least somewhere in it.
+_CHANGED, _CERTAIN = 10.0, 24.0
+_MIN_CERTAIN_SHARE = 0.15
+# The operator reaches to within this angle of straight down, and no farther from it than the other.
+_NADIR_DEG, _REACH_DEG = 30.0, 75.0
+# The mean probability of a person, by the network.
+_PERSON = 0.5
+# As far around an area, the network's pixels belong to the person.
+_PERSON_REACH_DEG = 4.0
+# A vehicle's length, height and distance, in heights of the camera; it fills much of its outline.
+_VEHICLE_LENGTH, _VEHICLE_HEIGHT = (0.8, 4.5), (0.35, 1.5)
+_MIN_FILLED = 0.55
+_MIN_ON_GROUND, _MIN_ENDS_ON_GROUND = 0.15, 0.5
+# A shadow is at least this bright, at most that bright, and changes the channels alike.
+_SHADOW, _MAX_TINT = (0.28, 0.88), 0.13
+_BESIDE_MASK = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moving:
+    """What moves through the scene, (H, W) each.
+
+    Attributes:
+        pixels: what is found, dilated.
+        shadow: the shadows beside it, or nothing if they were not asked for; a part of `pixels`.
+    """
+
+    pixels: Mask
+    shadow: Mask
+
+
+@checks_settings
+def moving_pixels(
+    picture: Picture,
+    range_map: RangeMap,
+    others: Sequence[OtherView],
+    *,
+    valid: Mask,
+    passers_by: Annotated[bool, Setting("also find people at a distance, not only the operator")] = True,
+    vehicles: Annotated[bool, Setting("also find areas with the size and the shape of vehicles")] = True,
+    shadows: Annotated[bool, Setting("also mask the shadows on the ground beside what is found")] = False,
+    min_area_deg2: Annotated[float, Setting("minimum size of an area, in square degrees", ge=0)] = 12.0,
+    margin_deg: Annotated[float, Setting("angle by which areas are dilated", ge=0, le=20)] = 1.0,
+) -> Moving:
+    """Return the pixels of a panorama whose colours contradict all other views, and that look like people or vehicles.
+
+    The other views expect surfaces (`expected_view`). Where the colour differs from everything that they show there,
+    and around it, the panorama shows something that was there only then. Such an area is accepted if it is the
+    operator, so it reaches to the nadir or to an area that is masked already; or if the network of `people` finds a
+    person in it; or if it stands on the ground and has the size of a vehicle. Other areas, such as reflections and
+    things that the other views do not see, are ignored. Darker areas with unchanged hue on the ground are shadows.
+
+    Args:
+        picture: (H, W, 3) uint8 RGB, at most `WIDTH` columns, masked pixels filled.
+        range_map: its ranges, of the same size, checked against those of the other views.
+        others: two or more views around it.
+        valid: (H, W), False is masked already.
+        passers_by: whether to find people who do not reach to the nadir.
+        vehicles: whether to find vehicles.
+        shadows: whether to find shadows beside what is found.
+        min_area_deg2: minimum size of an area.
+        margin_deg: angle by which areas are dilated.
+
+    Raises:
+        UsageError: if the arrays differ in size, or a setting is out of bounds.
+    """
+    size_hw = (picture.shape[0], picture.shape[1])
+    if range_map.range.shape != size_hw or valid.shape != size_hw:
+        raise UsageError(f"a panorama of {size_hw} needs ranges and a mask of its size, got {range_map.range.shape}")
+    nothing = np.zeros(size_hw, np.bool_)
+    if len(others) < 2 or size_hw[0] < 16:
+        return Moving(nothing, nothing)
+    expected = expected_view(picture, range_map, others)
+    changed = np.nan_to_num(expected.difference, nan=0.0) > _CHANGED
+    shadow = _shadows(expected) & valid
+    found = nothing.copy()
+    for area in _areas(changed & valid & ~shadow, expected, min_area_deg2):
+        if _is_operator(area, ~valid):
+            found |= area
+        elif passers_by and (person := _with_person(picture, area)).any():
+            found |= person
+        elif vehicles and _is_vehicle(area, expected):
+            found |= area
+    if not found.any():
+        return Moving(nothing, nothing)
+    found = _closed(found, size_hw)
+    cast = _beside(shadow, found | ~valid) if shadows else nothing
+    margin = round(margin_deg * size_hw[0] / 180)
+    everything = found | cast
+    return Moving(dilated(everything, margin) & valid if margin else everything, cast)
+
+
+def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask]:
+    """Return the connected areas that are large enough and certain."""
+    opened = dilated(~dilated(~changed, 1), 1) & changed
+    labels, weights = area_labels(opened), pixel_weights(changed.shape)
+    sizes = np.bincount(labels[opened], weights[opened], labels.size)
+    certain = opened & (np.nan_to_num(expected.difference) > _CERTAIN)
+    share = np.bincount(labels[certain], weights[certain], labels.size) / np.maximum(sizes, 1e-9)
+    least = min_area_deg2 / _SQUARE_DEG_OF_SPHERE * weights.sum()
+    return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= _MIN_CERTAIN_SHARE))]
+
+
+def _is_operator(area: Mask, masked: Mask) -> bool:
+    """Return whether an area lies within the operator's reach and extends to the nadir, or to what is masked there."""
+    off_nadir_deg = np.degrees(np.arccos(np.clip(ray_grid((area.shape[0], area.shape[1]))[..., 1], -1, 1)))
+    weights = pixel_weights(area.shape)
+    within = weights[area & (off_nadir_deg < _REACH_DEG)].sum() > 0.9 * weights[area].sum()
+    if not within:
+        return False
+    if off_nadir_deg[area].min() < _NADIR_DEG:
+        return True
+    labels = np.where(area, 0, -1).astype(np.int64)
+    return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
+
+
+def _with_person(picture: Picture, area: Mask) -> Mask:
+    """Return an area with the pixels of the person in it; nothing without a person."""
+    probability, pixels = person_at(picture, area)
+    if probability < _PERSON:
+        return np.zeros_like(area)
+    reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
+    return area | (pixels & dilated(area, reach))
+
+
+def _is_vehicle(area: Mask, expected: Expected) -> bool:
+    """Return whether an area stands on the ground and has the extent of a vehicle."""
+    if not np.isfinite(expected.height):
+        return False
+    # It hides the ground, and ends on it.
+    below = np.roll(area, 2, axis=0) & ~area
+    if expected.ground[area].mean() < _MIN_ON_GROUND or expected.ground[below].mean() < _MIN_ENDS_ON_GROUND:
+        return False
+    rays = ray_grid((area.shape[0], area.shape[1]))
+    elevation = np.arcsin(-rays[..., 1])[area]
+    bottom, top = float(np.quantile(elevation, 0.02)), float(np.quantile(elevation, 0.98))
+    if not (np.radians(-60) < bottom < np.radians(-3)):
+        return False
+    distance = 1 / np.tan(-bottom)  # in heights of the camera, and so are the following
+    height = 1 + distance * np.tan(min(top, 1.3))
+    center = rays[area].mean(axis=0)
+    azimuth = np.angle(np.exp(1j * (np.arctan2(rays[..., 0], rays[..., 2])[area] - np.arctan2(center[0], center[2]))))
+    width = float(np.quantile(azimuth, 0.98) - np.quantile(azimuth, 0.02))
+    length = 2 * distance * np.tan(min(width / 2, 1.3))
+    filled = area.sum() / max((top - bottom) * width * (area.shape[0] / np.pi) ** 2, 1)
+    inside = _VEHICLE_LENGTH[0] < length < _VEHICLE_LENGTH[1] and _VEHICLE_HEIGHT[0] < height < _VEHICLE_HEIGHT[1]
+    return bool(inside and filled > _MIN_FILLED)
+
+
+def _shadows(expected: Expected) -> Mask:
+    """Return the pixels of the ground that are darker than expected, by the same factor in all channels."""
+    ratio = np.nan_to_num(expected.ratio, nan=1.0)
+    mean = ratio.mean(axis=-1)
+    tint = (ratio.max(axis=-1) - ratio.min(axis=-1)) / np.maximum(mean, 1e-6)
+    return np.asarray(expected.ground & (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (tint < _MAX_TINT))
+
+
+def _beside(shadow: Mask, pixels: Mask) -> Mask:
+    """Return the connected shadows that touch some pixels."""
+    labels = area_labels(np.asarray(shadow & ~pixels))
+    touched = np.unique(labels[dilated(pixels, 2) & (labels >= 0)])
+    return np.isin(labels, touched) & (labels >= 0)
+
+
+def _closed(found: Mask, size_hw: tuple[int, int]) -> Mask:
+    """Return areas with gaps of up to two degrees closed, and holes filled."""
+    radius = max(1, round(size_hw[0] / 180))
+    closed = ~dilated(~dilated(found, radius), radius) | found
+    labels, weights = area_labels(~closed), pixel_weights(size_hw)
+    sizes = np.bincount(labels[~closed], weights[~closed], labels.size)
+    hole = np.zeros_like(closed)
+    hole[~closed] = sizes[labels[~closed]] < 0.3 * weights[found].sum()
+    return np.asarray(closed | hole)
