@@ -1,7 +1,8 @@
 """Building blocks for backends of the sweep: the readable backend and its parts.
 
 A backend takes a `SweepInput` and returns `Winners`. `find_winners` is the readable backend in numpy; the other names
-are its parts: weights of the sources, penalties between depth hypotheses, windows and constants of the costs.
+are its parts: weights of the sources, the average of costs among pixels of similar colour, penalties between depth
+hypotheses, windows and constants of the costs.
 """
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners
@@ -15,6 +16,7 @@ from pano_mvs.algorithms.sweep.costs.kernels_constants import (
     ZNCC_NOISE_VARIANCE,
 )
 from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
+from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
@@ -30,6 +32,7 @@ __all__ = [
     "SweepInput",
     "WindowBands",
     "Winners",
+    "average_volume",
     "census_weight",
     "column_offsets",
     "find_winners",

@@ -81,6 +81,9 @@ def sweep_case(number: int) -> SweepCase:
         aggregation=aggregation,
         support=int(rng.choice([1, 3, 5])),
         p2_contrast=float(rng.choice([0.0, 15.0])),
+        p2_falloff=("inverse", "square")[number // 2 % 2],
+        edge_support=(1, 3, 5)[number // 2 % 3],
+        edges=("colors", "grey")[number % 4 == 3],
         derotate=bool(rng.integers(4) == 0),
         exposure=bool(rng.integers(4) == 0),
     )

@@ -8,11 +8,13 @@ pole, or once around. So the costs along these lines, with their warm-up, give t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
+from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged_at
 from pano_mvs.algorithms.sweep.no_match import has_match
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.pixel_costs import costs_at, is_seen, votes_at
@@ -158,9 +160,9 @@ def _path_sums(work: SweepInput, row: int, column: int) -> FloatArray:
     lines = _lines(work, row, column)
     rows, columns = (np.concatenate([line[part] for line in lines]) for part in (0, 1))
     pixels, back = np.unique(rows * work.reference.shape[1] + columns, return_inverse=True)
-    costs = costs_at(work, *np.divmod(pixels, work.reference.shape[1]))
-    stored = np.floor(np.minimum(costs * np.float32(work.settings.cost_scale) + np.float32(0.5), _WORST))
-    of_lines = stored.astype(np.int64)[:, back]
+    pixel_rows, pixel_columns = np.divmod(pixels, work.reference.shape[1])
+    stored = averaged_at(partial(_stored_costs, work), work, rows=pixel_rows, columns=pixel_columns)
+    of_lines = stored[:, back]
     p1, _ = work.settings.penalties(work.reference.shape[0])
     total = np.zeros(len(work.ranges), np.int64)
     start = 0
@@ -172,6 +174,13 @@ def _path_sums(work: SweepInput, row: int, column: int) -> FloatArray:
             path = path_step(line[:, i : i + 1], path, penalty, p1=p1)
         total += path[:, 0]
     return total.astype(np.float64)
+
+
+def _stored_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return the costs of pixels as they are in the volume, (D, N)."""
+    costs = costs_at(work, rows, columns)
+    stored = np.floor(np.minimum(costs * np.float32(work.settings.cost_scale) + np.float32(0.5), _WORST))
+    return np.asarray(stored, np.int64)
 
 
 Line = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]
@@ -200,5 +209,5 @@ def _lines(work: SweepInput, row: int, column: int) -> list[Line]:
 
 
 def _line(work: SweepInput, direction: tuple[int, int], rows: NDArray[np.intp], *, columns: NDArray[np.intp]) -> Line:
-    penalties = step_penalties(work.reference, direction, work.settings)[rows, columns]
+    penalties = step_penalties(work.contrast_picture, direction, work.settings)[rows, columns]
     return rows, columns, penalties.astype(np.int64)[:, None]

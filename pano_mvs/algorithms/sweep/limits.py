@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_limits
-from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
@@ -24,8 +24,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 _STEPS_PER_OCTAVE = 4
 _WIDTH = 256
 _PLANES = 96
-# Heavier penalties than those of a sweep for its own sake: surfaces must agree, not details.
-_P1, _P2 = 80, 1600
 _MAX_PICTURES = 5
 # The small sweeps begin at this share of the mean baseline.
 _NEAREST_BASELINES = 0.05
@@ -121,7 +119,7 @@ def _coarse(
         [poses[other] @ poses[idx].inverse() for other in others],
         near=near,
         far=far,
-        settings=SweepSettings(planes=_PLANES, cost="census", p1=_P1, p2=_P2, no_match="keep"),
+        settings=SURFACE_SETTINGS.replace(planes=_PLANES),
         backend=backend,
         device=device,
         reference_mask=masks[idx],

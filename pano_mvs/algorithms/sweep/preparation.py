@@ -32,6 +32,7 @@ class SweepInput:
         ranges: (D,) float64 depth hypotheses, ascending.
         settings: what was asked for.
         device: where a backend that can choose computes.
+        colors: (H, W, 3) uint8 RGB of the reference, the contrast of which is that of `contrast_picture`; or None.
     """
 
     reference: NDArray[np.uint8]
@@ -41,6 +42,12 @@ class SweepInput:
     ranges: NDArray[np.float64]
     settings: SweepSettings
     device: str = "auto"
+    colors: NDArray[np.uint8] | None = None
+
+    @property
+    def contrast_picture(self) -> NDArray[np.uint8]:
+        """The picture whose edges penalties and supports follow, (H, W, C): the colours of the reference, if given."""
+        return self.reference if self.colors is None else self.colors
 
     @property
     def baseline(self) -> float:
@@ -62,15 +69,19 @@ class SweepInput:
 
 def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
     """Return the picture as it is compared, (H, W, 3) RGB to (H, W, 1) grey or (H, W, 3), prefiltered if asked for."""
-    if settings.prefilter_diameter:
-        picture = _bilateral(picture, settings)
+    picture = prepare_colors(picture, settings)
     if settings.matching_cost.colors:
-        return np.ascontiguousarray(picture)
+        return picture
     grey = np.empty((*picture.shape[:2], 1), np.uint8)
     for first in range(0, len(picture), _ROWS_AT_ONCE):  # 16 bits of all colours at once would be a picture six times
         some = picture[first : first + _ROWS_AT_ONCE].astype(np.uint16)
         grey[first : first + _ROWS_AT_ONCE, :, 0] = (some @ _LUMA.astype(np.uint16) + 128) >> 8
     return grey
+
+
+def prepare_colors(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
+    """Return the colours of a picture, (H, W, 3) RGB, prefiltered if asked for."""
+    return np.ascontiguousarray(_bilateral(picture, settings) if settings.prefilter_diameter else picture)
 
 
 def _bilateral(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:

@@ -25,7 +25,8 @@ class SweepSettings:
     "parallax_weighted" is the parallax by which it would notice a change of range; the cheapest sources that hold half
     of all weight count. SGM's penalties, for costs from 0 to 255, grow with the rows of the picture: along the same
     angle, a path then pays the same for the slant of a surface against what it gathers from the pixels. P2 never falls
-    below P1. The confidence "combined" is the geometric mean of the two others. `derotate` and `exposure` are steps of
+    below P1: it is max(P1, p2 / (1 + (contrast / p2_contrast)ⁿ)), n = 1 for the falloff "inverse" and 2 for "square".
+    The confidence "combined" is the geometric mean of the two others. `derotate` and `exposure` are steps of
     the preparation; census and zncc need no match of exposures. `volume_limit_gb` and `levels` above 1 need the
     backend numba.
     """
@@ -42,7 +43,7 @@ class SweepSettings:
         doc="census, census_gradient (also grey levels and their gradients), zncc (correlation), sad (the "
         "paper's sum of absolute differences), sad_gradient (also gradients of colours), or a plugin's cost",
     )
-    window: int = setting(7, ge=1, le=15, odd=True, doc="side of the window of the cost in pixels, odd")
+    window: int = setting(5, ge=1, le=15, odd=True, doc="side of the window of the cost in pixels, odd")
     spherical_window: bool = setting(True, doc="widen windows towards the poles so that they keep their solid angle")
     combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = setting(
         "best_half",
@@ -52,11 +53,25 @@ class SweepSettings:
     best: int = setting(2, ge=1, doc="number of sources of best_k")
     aggregation: Literal["box", "sgm"] = setting("sgm", doc="average over a box (the paper), or semi-global matching")
     support: int = setting(
-        5, ge=1, le=15, odd=True, doc="side of the box over which census costs, and costs of plugins, are averaged, odd"
+        3, ge=1, le=15, odd=True, doc="side of the box over which census costs, and costs of plugins, are averaged, odd"
     )
-    p1: int = setting(40, ge=0, le=4000, doc="SGM's penalty for a step of one plane, for 512 rows")
-    p2: int = setting(600, ge=0, le=4000, doc="SGM's penalty for a larger step, for 512 rows")
-    p2_contrast: float = setting(15.0, ge=0, doc="contrast in grey levels at which p2 is halved; 0: p2 is constant")
+    edge_support: int = setting(
+        5,
+        ge=1,
+        le=9,
+        odd=True,
+        doc="side of the window over which SGM's costs are averaged again, with little weight for pixels of another "
+        "colour; 1: not averaged",
+    )
+    p1: int = setting(30, ge=0, le=4000, doc="SGM's penalty for a step of one plane, for 512 rows")
+    p2: int = setting(800, ge=0, le=4000, doc="SGM's penalty for a larger step, for 512 rows")
+    p2_contrast: float = setting(8.0, ge=0, doc="contrast in grey levels at which p2 is halved; 0: p2 is constant")
+    p2_falloff: Literal["inverse", "square"] = setting(
+        "square", doc="how p2 falls with contrast: by it, or by its square, which spares noise and yields to edges"
+    )
+    edges: Literal["colors", "grey"] = setting(
+        "colors", doc="contrast for p2 and edge_support: the largest of all colours, or grey if the cost uses grey"
+    )
     selection: Literal["winner", "parabola", "vfit"] = setting(
         "vfit", doc="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
     )
@@ -144,3 +159,18 @@ class SweepSettings:
     def replace(self, **changes: Any) -> SweepSettings:
         """Return the same settings with some changed."""
         return dataclasses.replace(self, **changes)
+
+
+SURFACE_SETTINGS = SweepSettings(
+    cost="census",
+    window=7,
+    support=5,
+    edge_support=1,
+    p1=80,
+    p2=1600,
+    p2_contrast=15.0,
+    p2_falloff="inverse",
+    edges="grey",
+    no_match="keep",
+)
+"""Settings of small sweeps that look for surfaces and not for details."""

@@ -21,10 +21,11 @@ from pano_mvs.algorithms.sweep.preparation import (
     SweepInput,
     derotated,
     pixels_with_valid_window,
+    prepare_colors,
     prepare_picture,
     sees_winner,
 )
-from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS, SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
@@ -144,6 +145,7 @@ def sweep_input(
         ranges=ranges,
         settings=settings,
         device=device,
+        colors=prepare_colors(reference, settings) if settings.edges == "colors" else None,
     )
 
 
@@ -162,9 +164,7 @@ def _rough_range(
 
     `masks` are those of the reference and of the sources.
     """
-    settings = SweepSettings(
-        planes=_ROUGH_PLANES, spacing="inverse", cost="census", window=5, aggregation="box", no_match="keep"
-    )
+    settings = SURFACE_SETTINGS.replace(planes=_ROUGH_PLANES, spacing="inverse", window=5, aggregation="box")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     small_reference = shrink(reference, _ROUGH_ROWS)
     sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]

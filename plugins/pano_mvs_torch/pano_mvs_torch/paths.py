@@ -82,5 +82,5 @@ def path_step(costs: Tensor, before: Tensor, penalty: Tensor, p1: int) -> Tensor
 
 
 def _penalties(work: SweepInput, direction: tuple[int, int], device: torch.device) -> Tensor:
-    penalties: NDArray[np.uint16] = step_penalties(work.reference, direction, work.settings)
+    penalties: NDArray[np.uint16] = step_penalties(work.contrast_picture, direction, work.settings)
     return torch.from_numpy(penalties.astype(np.int16)).to(device)

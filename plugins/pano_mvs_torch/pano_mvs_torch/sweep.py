@@ -11,7 +11,7 @@ from math import ceil
 import numpy as np
 import torch
 from pano_mvs.api import SweepInput, Winners
-from pano_mvs.api.sweep import source_weights
+from pano_mvs.api.sweep import average_volume, source_weights
 from torch import Tensor
 
 from pano_mvs_torch.batch import Batch, batch_for
@@ -37,7 +37,9 @@ def find_winners(work: SweepInput) -> Winners:
     for first, last in bands:
         costs = _band(work, lookups, weights, (first, last), batch)
         volume[first:last] = costs.mul_(scale).add_(0.5).clamp_(max=255).to(torch.uint8).transpose(0, 1)
-    total = sum_of_paths(work, volume)
+    averaged = volume.cpu().numpy()  # shares the memory of a processor's tensor
+    average_volume(averaged, work)
+    total = sum_of_paths(work, torch.from_numpy(averaged).to(batch.device))
     return _joined([winners_of(total[first:last].transpose(0, 1).float()) for first, last in bands])
 
 

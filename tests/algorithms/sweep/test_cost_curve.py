@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
 from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
+from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged
 from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput
@@ -77,7 +78,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
                 volume[row, :, column] = np.rint(costs.raw * 255)
     stored = np.empty((24, 9, 48), np.uint8)
     sweep_band(0, sweep_arguments(work), work.ranges, stored, *fresh_state(24, 48))
-    total = _aggregate(stored.astype(np.int64), work)
+    total = _aggregate(averaged(stored.astype(np.int64), work), work)
     for row in (0, 12, 23):
         for column in (3, 19, 35):
             np.testing.assert_array_equal(volume[row, :, column], stored[row, :, column])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     winners_of_rows,
 )
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, padded_brightness, penalty_table, step_penalties
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, padded_channels, penalty_table, step_penalties
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
@@ -256,17 +256,19 @@ def test_paths_along_a_row_equal_a_walk_pixel_by_pixel(largest: int) -> None:
 
 
 @pytest.mark.kernel("sweep.numba.kernels_sgm")
-@pytest.mark.parametrize("contrast", [15.0, 0.0])
-def test_penalties_are_looked_up_as_they_are_defined(contrast: float) -> None:
+@pytest.mark.parametrize(("contrast", "falloff"), [(15.0, "inverse"), (15.0, "square"), (0.0, "square")])
+def test_penalties_are_looked_up_as_they_are_defined(contrast: float, falloff: Literal["inverse", "square"]) -> None:
     picture = np.random.default_rng(12).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
-    settings = SweepSettings(p1=300, p2=3000, p2_contrast=contrast)
+    settings = SweepSettings(p1=300, p2=3000, p2_contrast=contrast, p2_falloff=falloff)
     found = np.empty((len(DIRECTIONS), 9, SIZE[1]), np.uint16)
-    table = penalty_table(settings, SIZE[0], 3)
-    look_up_penalties(padded_brightness(picture), table, np.array(DIRECTIONS), 4, found)
+    table = penalty_table(settings, SIZE[0])
+    look_up_penalties(padded_channels(picture), table, np.array(DIRECTIONS), 4, found)
     for direction, penalties in zip(DIRECTIONS, found, strict=True):
         np.testing.assert_array_equal(penalties, step_penalties(picture, direction, settings, rows=slice(4, 13)))
-    grey = pad_panorama(picture.astype(np.float64).mean(axis=-1), 1)
-    expected = np.maximum(9, 94 / (1 + np.abs(grey[1:-1, 1:-1] - grey[:-2, 2:]) / contrast)) if contrast else 94.0
+    colors = pad_panorama(picture.astype(np.float64), 1)
+    step = np.abs(colors[1:-1, 1:-1] - colors[:-2, 2:]).max(axis=-1)
+    power = 1 if falloff == "inverse" else 2
+    expected = np.maximum(9, 94 / (1 + (step / contrast) ** power)) if contrast else 94.0
     found = step_penalties(picture, (1, -1), settings)
     np.testing.assert_allclose(found, np.broadcast_to(expected, SIZE), atol=0.5 + 1e-9)
 

@@ -137,7 +137,7 @@ def test_turning_a_source_about_its_centre_changes_little() -> None:
     turn = rotation_from_rotvec((0.9, 0.5, -0.3))
     turned = (pictures[0], rotate_panorama(pictures[1], turn), pictures[2])
     result = _sweep(turned, [Rigid3(turn, np.zeros(3)) @ poses[0], poses[1]])
-    assert _share_within(result, _sweep(pictures, poses).range, 1.05) > 0.88
+    assert _share_within(result, _sweep(pictures, poses).range, 1.05) > 0.86
     assert _share_within(result, truth, 1.1) > 0.95 * _share_within(_sweep(pictures, poses), truth, 1.1)
 
 

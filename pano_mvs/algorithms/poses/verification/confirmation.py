@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama, textured_pixels
-from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
@@ -23,7 +23,7 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 """A panorama (H, W, 3) uint8 RGB with its mask (H, W); False is ignored."""
 
 WIDTH_PX = 256
-_SETTINGS = SweepSettings(planes=64, spacing="inverse", cost="census", p1=80, p2=1600, no_match="keep")
+_SETTINGS = SURFACE_SETTINGS.replace(planes=64, spacing="inverse")
 _SOURCES = 4
 # In units of the median baseline. A near limit from the longest one would lose the foreground if one source is far
 # away.

@@ -24,7 +24,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
 from pano_mvs.algorithms.sweep.numba.kernels_sgm_rows import follow_rows
 from pano_mvs.algorithms.sweep.numba.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
 from pano_mvs.algorithms.sweep.numba.threads import Pool, run_jobs, workers
-from pano_mvs.algorithms.sweep.penalties import padded_brightness, penalty_table, warm_up
+from pano_mvs.algorithms.sweep.penalties import padded_channels, penalty_table, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -138,12 +138,12 @@ def _summed_paths(
     p1 = np.uint16(settings.penalties(size_hw[0])[0])
     beyond_pole, _ = warm_up(size_hw)
 
-    brightness = padded_brightness(work.reference)
-    table = penalty_table(settings, size_hw[0], work.reference.shape[2])
+    channels = padded_channels(work.contrast_picture)
+    table = penalty_table(settings, size_hw[0])
 
     def penalties(*directions: tuple[int, int]) -> NDArray[np.uint16]:
         found = np.empty((len(directions), height, size_hw[1]), np.uint16)
-        look_up_penalties(brightness, table, np.array(directions), top, found)
+        look_up_penalties(channels, table, np.array(directions), top, found)
         return found
 
     total, block = (np.empty((count, *_sum_shape(volume)), np.uint16) for count in (height, min(_BLOCK_ROWS, height)))

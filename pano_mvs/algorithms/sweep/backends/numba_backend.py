@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.compiled_aggregation import keep_band, volume_parts, winners_by_paths
+from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numba.kernels_records import Sweep
@@ -75,4 +76,5 @@ def _volume_of(work: SweepInput, sweep: Sweep, around: slice) -> NDArray[np.uint
 
     with workers() as pool:
         run_jobs(pool, sweep_rows, range(around.start, around.stop, BAND_ROWS))
+    average_volume(volume, work, top=around.start)
     return volume

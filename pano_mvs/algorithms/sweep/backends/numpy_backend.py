@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.costs.cost import checked_cost
 from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
+from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -27,7 +28,7 @@ def find_winners(work: SweepInput) -> Winners:
     volume = np.stack([combined_cost(work, virtual_range) for virtual_range in work.ranges], axis=1)
     if settings.aggregation == "sgm":
         stored = np.floor(np.minimum(volume * settings.cost_scale + 0.5, 255))
-        volume = _aggregate(stored.astype(np.int64), work).astype(np.float64)
+        volume = _aggregate(averaged(stored.astype(np.int64), work), work).astype(np.float64)
     return winners_of(volume)
 
 
@@ -98,7 +99,7 @@ def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]
     before_pole, before_seam = warm_up((height, width))
     total = np.zeros_like(volume)
     for rows, columns in DIRECTIONS:
-        penalties = step_penalties(work.reference, (rows, columns), settings).astype(np.int64)
+        penalties = step_penalties(work.contrast_picture, (rows, columns), settings).astype(np.int64)
         path = np.zeros(volume.shape[1:], np.int64)
         for i in range(-before_pole, height):
             row = i if i >= 0 else -1 - i
@@ -109,7 +110,7 @@ def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]
             if i >= 0:
                 total[row] += path
     for step in (1, -1):
-        penalties = step_penalties(work.reference, (0, step), settings).astype(np.int64)
+        penalties = step_penalties(work.contrast_picture, (0, step), settings).astype(np.int64)
         path = np.zeros((volume.shape[1], height), np.int64)
         for i in range(-before_seam, width):
             column = i % width if step > 0 else width - 1 - i % width

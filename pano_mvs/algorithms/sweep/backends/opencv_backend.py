@@ -19,6 +19,7 @@ from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixe
 from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -62,6 +63,7 @@ def find_winners(work: SweepInput) -> Winners:
         winners_by_paths,  # on use: numba is slow to import
     )
 
+    average_volume(volume, work)
     return winners_by_paths(work, volume)
 
 

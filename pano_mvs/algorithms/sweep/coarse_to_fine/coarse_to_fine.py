@@ -69,6 +69,7 @@ def _coarse_input(work: SweepInput) -> SweepInput | None:
         reference=_halved(work.reference),
         sources=tuple(_halved(source) for source in work.sources),
         source_valid=_halved_masks(work),
+        colors=None if work.colors is None else _halved(work.colors),
         ranges=ranges,
         settings=settings.replace(levels=settings.levels - 1, planes=planes, p1=p1),
     )

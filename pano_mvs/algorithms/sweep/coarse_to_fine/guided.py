@@ -15,6 +15,7 @@ from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
     follow_guided_strip,
 )
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates
+from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
 from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
@@ -70,6 +71,8 @@ class GuidedSweep:
         self.volume[:, _COUNT:] = self.volume[:, :_COUNT]
         self._sweep(1, np.abs(self.guides[1] - self.guides[0]) > _MIN_GAP)
         self._search()
+        if self._by_paths:
+            average_volume(self.volume, self.work)
         return self._decide(self._aggregated() if self._by_paths else self.volume)
 
     def _sweep(self, layer: int, active: NDArray[np.bool_]) -> None:
@@ -143,7 +146,7 @@ class GuidedSweep:
         p1 = np.uint16(_P1_SHARE * settings.penalties(height)[0])
         beyond_pole, before_seam = warm_up((height, width))
         for rows, columns in DIRECTIONS:
-            penalties = step_penalties(self.work.reference, (rows, columns), settings)
+            penalties = step_penalties(self.work.contrast_picture, (rows, columns), settings)
 
             def strip(
                 first: int, *, penalties: NDArray[np.uint16] = penalties, rows: int = rows, columns: int = columns
@@ -154,7 +157,7 @@ class GuidedSweep:
                 )
 
             run_jobs(self._pool, strip, range(0, width, _STRIP_LINES))
-        sideways = np.stack([step_penalties(self.work.reference, (0, step), settings) for step in (1, -1)])
+        sideways = np.stack([step_penalties(self.work.contrast_picture, (0, step), settings) for step in (1, -1)])
 
         def both_ways(first: int) -> None:
             lines = min(_ROW_LINES, height - first)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.numba.kernels_records import I16, I64, U8, U16
+from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, step_lines
 
@@ -29,24 +29,30 @@ DRIFTS = (0, 1, -1)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def look_up_penalties(brightness: I16, table: U16, steps: I64, first: int, penalties: U16) -> None:
+def look_up_penalties(channels: U8, table: U16, steps: I64, first: int, penalties: U16) -> None:
     """Do what `penalties.step_penalties` does for several directions.
 
     Args:
-        brightness: (H + 2, W + 2) int16, see `padded_brightness`.
+        channels: (C, H + 2, W + 2) uint8, see `padded_channels`.
         table: see `penalty_table`.
         steps: (K, 2) int64 rows and columns of each direction.
         first: the first row.
         penalties: (K, rows, W) uint16, written.
     """
+    contrast = np.empty(penalties.shape[2], np.uint8)
     for k in range(_U(penalties.shape[0])):
         for y in range(_U(penalties.shape[1])):
             here = _U(first + 1) + y
             before = _U(first + 1 - steps[k, 0]) + y
             shift = _U(1 - steps[k, 1])
+            contrast[:] = 0
+            for c in range(_U(channels.shape[0])):
+                for x in range(_U(penalties.shape[2])):
+                    a, b = channels[c, here, x + _U(1)], channels[c, before, x + shift]
+                    step = np.uint8(a - b) if a > b else np.uint8(b - a)
+                    contrast[x] = step if step > contrast[x] else contrast[x]
             for x in range(_U(penalties.shape[2])):
-                contrast = np.int16(brightness[here, x + _U(1)] - brightness[before, x + shift])
-                penalties[k, y, x] = table[_U(abs(contrast))]
+                penalties[k, y, x] = table[_U(contrast[x])]
 
 
 class PathCosts(NamedTuple):

@@ -1,0 +1,1 @@
+"""Averages of the costs that follow the edges of the picture."""
