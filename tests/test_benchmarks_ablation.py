@@ -11,8 +11,9 @@ import pytest
 
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.scene import Record
+from pano_mvs.testing.scenes import window_room
 from tests.benchmarks.dense_chain import DenseChain
-from tests.benchmarks.depth import ablation
+from tests.benchmarks.depth import ablation, sky
 from tests.benchmarks.depth.ablation import Ablation, gains, place_lines, real_lines, synthetic_lines
 from tests.benchmarks.depth.ablation_places import SYNTHETIC, AblationPlace, ablation_places, masked
 from tests.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
@@ -108,3 +109,24 @@ def test_places_are_of_every_kind(tmp_path: Path) -> None:
     assert len({place.key for place in places}) == len(places) == len({place.name for place in places})
     assert any(place.soft for place in SYNTHETIC)
     assert any(place.rig for place in SYNTHETIC)
+
+
+def test_the_sky_that_is_found_and_what_is_lost_are_shares_of_the_sphere() -> None:
+    truth = np.full((8, 16), 2.0, np.float32)
+    truth[:4] = np.nan
+    found = np.zeros((8, 16), np.bool_)
+    found[:, :4] = True
+    assert sky.shares(found, truth) == pytest.approx((25, 25))
+    found[:4] = True
+    assert sky.shares(found, truth) == pytest.approx((100, 25))
+
+
+def test_the_sky_is_seen_through_the_windows_of_a_room_alone() -> None:
+    _, ranges = window_room(turned=False).view(0, (64, 128), supersample=1)
+    nothing = np.argwhere(np.isnan(ranges))
+    assert 20 < len(nothing) < 400
+    # Above the horizon, ahead (columns around 64) and to the right (around 96), but not overhead.
+    assert nothing[:, 0].min() > 8
+    assert nothing[:, 0].max() < 34
+    assert nothing[:, 1].min() > 40
+    assert nothing[:, 1].max() < 112

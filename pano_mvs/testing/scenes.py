@@ -21,6 +21,7 @@ from pano_mvs.testing.courtyard import courtyard_surfaces
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Texture
 from pano_mvs.testing.room import Room, default_room, render, write_views
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod, Surface, Vector
+from pano_mvs.testing.window_room import window_room_surfaces
 from pano_mvs.testing.yard import yard_surfaces
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "large_plain_room",
     "poles",
     "white_room",
+    "window_room",
     "write_scene",
     "yard",
 ]
@@ -115,6 +117,24 @@ def yard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float 
     surfaces: list[Painted] = [(surface, "outdoor") for surface in yard_surfaces(seed)]
     room = _painted("yard", surfaces, seed=seed, lamp=(-20.0, -60.0, -30.0), sky=sky)
     return _scene("yard", room, views=views, turned=turned, spread=(0.8, 0.2, 0.8), exposure=exposure, outdoor=True)
+
+
+def window_room(
+    *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "overcast"
+) -> Scene:
+    """Return a room of 6 × 2.8 × 5 with white walls, a balcony door and two windows, through which the sky is seen.
+
+    It is not one of `SCENES`, since its sky is for `filters.sky` alone.
+
+    Args:
+        seed: seed of textures, cameras and exposures.
+        views: number of cameras, about 0.6 apart.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
+        sky: one of `SKIES`.
+    """
+    room = _painted("windows", list(window_room_surfaces()), seed=seed, lamp=(0.4, -1.2, 0.3), sky=sky)
+    return _scene("window_room", room, views=views, turned=turned, spread=(0.7, 0.25, 0.7), exposure=exposure)
 
 
 def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:

@@ -113,7 +113,8 @@ def ablation_places(folders: Sequence[Path], *, width: int) -> tuple[AblationPla
 
 def real_capture(folder: Path, *, width: int, views: int) -> Capture:
     """Return the first photographs of `images/` with their poses in `colmap/`; their true ranges are unknown."""
-    poses = read_poses(folder / "colmap")
+    numbered = folder / "colmap" / "0"
+    poses = read_poses(numbered if numbered.is_dir() else folder / "colmap")
     names = sorted(poses.names)[:views]
     panoramas = {}
     for name in names:
