@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.scenes import weak_room, write_scene
+from pano_mvs.testing.scenes import weak_room, white_room, write_scene
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
+from tests.benchmarks.depth.stored_chain import StoredChain
 from tests.benchmarks.depth_metrics import depth_metrics
 from tests.benchmarks.scenes import line, measure
 from tests.benchmarks.tables import reported
@@ -76,3 +78,13 @@ def test_the_papers_figures_stand_where_they_belong() -> None:
     assert reported("classroom", 4, 7, "estimated") == "0.193 / 27.18"
     assert reported("smallroom", 2, 9, "estimated") == "21.27"
     assert reported("smallroom", 2, 9, "known") == reported("court", 4, 7, "known") == "–"
+
+
+def test_quickstart_gives_a_plain_ceiling_its_plane(tmp_path: Path) -> None:
+    """With census alone, plain surfaces win at chance ranges, and no plane fits them."""
+    room = scene_capture(white_room(views=3, seed=12), tmp_path, width=192)
+    name = "000.png"
+    run = StoredChain("quickstart", overrides=["depth.planes=64"]).run(room, label="room", references=[name])
+    found, truth = run.range_maps["planes"][name], room.ranges[name]
+    above = (ray_grid((96, 192)) @ room.poses[name].rotation)[..., 1] < -0.7
+    assert (np.abs(found.range / truth - 1) < 0.05)[above].mean() > 0.6
