@@ -19,7 +19,7 @@ MAX_PARAMETERS = 12
 MAX_LINES = 60
 CALLED_BY_NAME = {"command", "stage"}
 # Each option of a command is a parameter of its function.
-MANY_PARAMETERS = {"cli/app.py:run", "cli/evaluate/app.py:depth"}
+MANY_PARAMETERS = {"cli/app.py:run", "cli/app.py:view_results", "cli/evaluate/app.py:depth"}
 
 
 @dataclass(frozen=True)

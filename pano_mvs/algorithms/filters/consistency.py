@@ -20,6 +20,7 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
+_Judged = tuple[NDArray[np.uint8], FloatArray, FloatArray]
 
 # Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
@@ -203,7 +204,8 @@ def compare_with_sources(
         *(np.zeros(shape) for _ in range(3)),
     )
 
-    def add(rows: slice, verdicts: NDArray[np.uint8], supports: FloatArray, motions: FloatArray) -> None:
+    def add(rows: slice, judged: _Judged) -> None:
+        verdicts, supports, motions = judged
         comparison.agreeing[rows] += verdicts == kernels.AGREES
         comparison.contradicting[rows] += verdicts == kernels.CONTRADICTS
         comparison.hiding[rows] += verdicts == kernels.HIDDEN
@@ -231,8 +233,8 @@ def agreeing_sources(
 
     agreeing = np.zeros(ranges.shape, np.uint8)
 
-    def add(rows: slice, verdicts: NDArray[np.uint8], _supports: FloatArray, _motions: FloatArray) -> None:
-        agreeing[rows] += verdicts == kernels.AGREES
+    def add(rows: slice, judged: _Judged) -> None:
+        agreeing[rows] += judged[0] == kernels.AGREES
 
     _judge_all(ranges, sources, source_from_reference, limits=(max_relative_error, max_angle), add=add)
     return agreeing
@@ -244,9 +246,9 @@ def _judge_all(
     source_from_reference: Sequence[Rigid3],
     *,
     limits: tuple[float, float],
-    add: Callable[[slice, NDArray[np.uint8], FloatArray, FloatArray], None],
+    add: Callable[[slice, _Judged], None],
 ) -> None:
-    """Call `add(rows, verdicts, supports, motions)` for bands of rows, each source in turn; see `judge_rows`."""
+    """Call `add(rows, (verdicts, supports, motions))` for bands of rows, each source in turn; see `judge_rows`."""
     import numba  # slow to import
 
     from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows  # compiles on import
@@ -264,7 +266,7 @@ def _judge_all(
             judge_rows(first, rows, *arguments)
             band = slice(first, first + rows)
             # In bands, so that the arrays are still in the cache.
-            add(band, verdicts[band], supports[band], motions[band])
+            add(band, (verdicts[band], supports[band], motions[band]))
 
         for_bands(judge, height, threads=numba.get_num_threads())
 
