@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.sharp_scale import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.scene import Record
 from pano_mvs.testing.scenes import window_room
@@ -107,8 +108,16 @@ def test_places_are_of_every_kind(tmp_path: Path) -> None:
     places = ablation_places([tmp_path / "flat", tmp_path / "room"], width=512)
     assert [place.has_rig for place in places[len(SYNTHETIC) :]] == [True, False]
     assert len({place.key for place in places}) == len(places) == len({place.name for place in places})
-    assert any(place.soft for place in SYNTHETIC)
-    assert any(place.rig for place in SYNTHETIC)
+    for needs in ("", "rig", "soft"):
+        assert any(place.is_for(needs) for place in SYNTHETIC)
+    assert [place.is_for("") for place in SYNTHETIC] == [not place.soft for place in SYNTHETIC]
+
+
+@pytest.mark.slow
+def test_a_soft_image_is_reduced(tmp_path: Path) -> None:
+    soft = next(place for place in SYNTHETIC if place.soft)
+    capture = replace(soft, views=1).capture(tmp_path)
+    assert sharp_halvings(next(iter(capture.panoramas.values())).load()) == 1
 
 
 def test_the_sky_that_is_found_and_what_is_lost_are_shares_of_the_sphere() -> None:

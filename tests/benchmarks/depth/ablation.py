@@ -85,7 +85,7 @@ class Ablation:
         for place in places:
             memory: dict[str, Record] = {}
             for mechanism in (FULL, *mechanisms):
-                if mechanism.is_mask and not place.has_rig:
+                if mechanism is not FULL and not place.is_for(mechanism.needs):
                     continue
                 chain = self._chain(mechanism, memory)
                 key = _key(chain, place, mechanism)
@@ -122,7 +122,9 @@ def _measured(chain: StoredChain, place: AblationPlace, mechanism: Mechanism, *,
         if place.has_rig:
             capture = masked(capture, chain.chain, folder=Path(folder))
         # Results that depend on constants or on other masks are not those of other mechanisms.
-        changed = f"{place.key} {sorted(mechanism.constants.items())} {mechanism.name if mechanism.is_mask else ''}"
+        changed = (
+            f"{place.key} {sorted(mechanism.constants.items())} {mechanism.name if mechanism.needs == 'rig' else ''}"
+        )
         run = chain.run(capture, label=changed, references=list(capture.panoramas))
         figures = figures_of(capture, run, chain.chain, drops_uncertainty=mechanism.drops_uncertainty)
     return {**figures, "cpu_s": time.process_time() - started}

@@ -67,6 +67,13 @@ class AblationPlace:
         """Whether something moves with the camera."""
         return bool(self.rig)
 
+    def is_for(self, needs: str) -> bool:
+        """Return whether a mechanism that needs "rig", "soft" or nothing is measured here.
+
+        Soft images are large, since only images of 1024 columns and more are reduced. Nothing else is measured on them.
+        """
+        return self.soft if needs == "soft" else not self.soft and (not needs or self.has_rig)
+
     def capture(self, scratch: Path) -> Capture:
         """Return the capture; what is rendered or changed is stored in sub-folders of `scratch`."""
         if self.folder is None:
@@ -96,7 +103,8 @@ SYNTHETIC = (
     AblationPlace("corridor", 384, 4, arguments=(("seed", 14), ("exposure", 0.03))),
     AblationPlace("courtyard", 384, 4, arguments=(("seed", 11), ("exposure", 0.1))),
     AblationPlace("yard", 384, 3, arguments=(("seed", 21), ("sky", "overcast"))),
-    AblationPlace("weak_room", 384, 3, arguments=(("seed", 15),), soft=True),
+    AblationPlace("weak_room", 384, 3, arguments=(("seed", 15),)),
+    AblationPlace("desk", 1024, 3, arguments=(("seed", 5),), soft=True),
     AblationPlace("desk", 384, 4, arguments=(("seed", 5),), rig="tripod"),
 )
 

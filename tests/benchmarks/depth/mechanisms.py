@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest import mock
 
 
@@ -22,7 +22,8 @@ class Mechanism:
         stages: changes of the workflow's stages, in the notation of workflows; None removes a stage.
         constants: values for constants that are no settings, by their full names.
         is_default: whether the workflow has it; otherwise, the changes switch it on.
-        is_mask: whether it matters only where something moves with the camera, so that only such places are measured.
+        needs: "rig" or "soft" if it matters only where something moves with the camera, or where images are soft; only
+            such places are measured then.
         drops_uncertainty: whether the cloud is fused without the uncertainty of the ranges.
     """
 
@@ -32,7 +33,7 @@ class Mechanism:
     stages: Mapping[str, Any] = field(default_factory=dict)
     constants: Mapping[str, float] = field(default_factory=dict)
     is_default: bool = True
-    is_mask: bool = False
+    needs: Literal["", "rig", "soft"] = ""
     drops_uncertainty: bool = False
 
     def workflow(self, base: str, folder: Path) -> str:
@@ -75,12 +76,14 @@ MECHANISMS = (
         "slanted planes",
         stages={"slanted": None, "checked": {"in": {"range_map": "exchanged", "sources": "depth"}}},
     ),
-    Mechanism("4", "the sharp resolution", "depth.scale=nominal slanted.scale=nominal checked.scale=nominal"),
+    Mechanism(
+        "4", "the sharp resolution", "depth.scale=nominal slanted.scale=nominal checked.scale=nominal", needs="soft"
+    ),
     Mechanism("4", "coarse to fine", "depth.levels=2", is_default=False),
     Mechanism("4", "planes on plain walls", stages={"planes": None}),
     Mechanism("5", "sky", "sky.enabled=false"),
-    Mechanism("6", "mask of what moves with the camera", "static.enabled=false", is_mask=True),
-    Mechanism("6", "mask of the operator", "people.enabled=false", is_mask=True),
+    Mechanism("6", "mask of what moves with the camera", "static.enabled=false", needs="rig"),
+    Mechanism("6", "mask of the operator", "people.enabled=false", needs="rig"),
     Mechanism("7", "uncertainty in the cloud", drops_uncertainty=True),
     Mechanism("7", "limit of the uncertainty", "cloud.max_uncertainty=null"),
     Mechanism("7", "smoothing of the cloud", "cloud.smooth=false"),
