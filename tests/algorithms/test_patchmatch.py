@@ -104,7 +104,8 @@ def test_compiled_planes_equal_least_squares() -> None:
 
 
 @pytest.mark.kernel("patchmatch.kernels_planes", "patchmatch.kernels_refine", "patchmatch.kernels_match")
-def test_compiled_steps_equal_normal_equations() -> None:
+@pytest.mark.parametrize("weighted", [False, True])
+def test_compiled_steps_equal_normal_equations(weighted: bool) -> None:
     """With sources of other sizes, a mask, planes of all slants, over the seam and over the poles."""
     rng = np.random.default_rng(1)
     size = (16, 32)
@@ -120,7 +121,8 @@ def test_compiled_steps_equal_normal_equations() -> None:
     found = np.empty(size, np.float32)
     numbers = (np.float32(1 / 25), np.float32(SETTINGS[0]), *SETTINGS[1:4], np.float32(SETTINGS[4]))
     arrays = (reference_arrays(reference, offsets, stretches), source_arrays(sources, poses, [None, mask], reach=0.0))
-    kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, found)
+    shares = rng.uniform(0.1, 1, (2, *size)).astype(np.float32)
+    kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, weighted, found, correlations := shares.copy())
     grey = [np.rint(256 * (picture @ LUMA)) / 256 for picture in sources]
     rows, off = (-4, -2, 0, 2, 4), []
     for row, column in np.ndindex(size):
@@ -136,11 +138,14 @@ def test_compiled_steps_equal_normal_equations() -> None:
             [(grey[0], poses[0], True), (grey[1], poses[1], votes)],
             steps,
             SETTINGS,
+            shares[:, row, column] if weighted else None,
         )
+        assert (correlations[1, row, column] == -2) == (not votes)
         off.append(abs(found[row, column] - expected) / SETTINGS[4])
     # Slopes between pixels jump: where a sample lies on a pixel's centre both sides are right.
     assert np.quantile(off, 0.98) < 2e-3
     assert np.ptp(found / inverse) > 0.05
+    assert -1.001 < correlations[0].min() < correlations[0].max() < 1.001
 
 
 def oracle_votes(

@@ -72,11 +72,13 @@ def likely_inverse(
     sources: Sequence[tuple[NDArray[Any], Rigid3, bool]],
     steps_uv: NDArray[np.float64],
     settings: tuple[float, ...],
+    shares: Sequence[float] | None = None,
 ) -> float:
     """The most likely inverse range at a window's centre, by normal equations over the better half of the sources.
 
     `seen` holds size, places, values and weights of the window; `sources` (grey, pose, votes) each; `steps_uv` (K, 2)
-    where the samples lie; `settings` (noise, prior of α, prior of β and γ, samples, largest step).
+    where the samples lie; `settings` (noise, prior of α, prior of β and γ, samples, largest step); `shares` the weights
+    of all sources, instead of the better half.
     """
     size, places, values, weights = seen
     noise, prior_q, prior_slope, samples, largest = settings
@@ -85,7 +87,7 @@ def likely_inverse(
     centred = values - weights @ values
     reference_spread = weights @ centred**2 + noise
     found = []
-    for grey, pose, votes in sources:
+    for idx, (grey, pose, votes) in enumerate(sources):
 
         def look(delta: float, grey: NDArray[Any] = grey, pose: Rigid3 = pose) -> NDArray[np.float64]:
             directions = rays @ pose.rotation.T + pose.translation * (rays @ plane + delta)[:, None]
@@ -99,15 +101,17 @@ def likely_inverse(
         spread = weights @ sample**2 + noise
         correlation = weights @ (sample * centred) / np.sqrt(spread * reference_spread)
         if votes:
-            found.append((correlation, centred / np.sqrt(reference_spread), sample, slope, spread))
+            count = samples * (1.0 if shares is None else shares[idx])
+            found.append((correlation, count, centred / np.sqrt(reference_spread), sample, slope, spread))
     found.sort(key=lambda entry: -entry[0])
     normal, right = np.diag([prior_q, prior_slope, prior_slope]), np.zeros(3)
-    for correlation, wanted, sample, slope, spread in found[: (len(found) + 1) // 2]:
+    counted = found if shares is not None else found[: (len(found) + 1) // 2]
+    for correlation, count, wanted, sample, slope, spread in counted:
         if correlation < 0.2:
             continue
         unit, change = sample / np.sqrt(spread), slope / np.sqrt(spread)
         along = (weights * unit) @ change
-        information = samples * spread / (noise + spread * (1 - correlation**2))
+        information = count * spread / (noise + spread * (1 - correlation**2))
         normal += information * ((weights[:, None] * change).T @ change - np.outer(along, along))
         right += information * ((weights * wanted) @ change - correlation * along)
     q = plane @ rays[len(rays) // 2]

@@ -119,17 +119,21 @@ def most_likely_steps(
     noise: np.float32,
     prior: tuple[float, float],
     samples: float,
+    weights: NDArray[np.float32],
+    weighted: bool,
     steps: NDArray[np.float32],
 ) -> None:
     """Write the most likely step of α, (n,), given the pictures and the current planes.
 
     Args:
         sums: (S, SUMS, n) float32 of the windows, see `sum_windows`.
-        correlations: (S, n) float32; only the better half of the sources counts, as the others may be occluded.
+        correlations: (S, n) float32.
         variance: (n,) float32 of the reference's windows.
         noise: variance of a grey level.
         prior: information on α, and on β and γ, of the current planes, in 1 / q².
         samples: number of independent samples that a window counts for.
+        weights: (S, n) float32 of the sources, if `weighted`.
+        weighted: False: the better half of the sources counts, as the others may be occluded.
         steps: (n,) float32, written.
     """
     normal, right = np.empty(6), np.empty(3)
@@ -138,10 +142,13 @@ def most_likely_steps(
         normal[:] = 0.0
         right[:] = 0.0
         normal[0], normal[3], normal[5] = prior[0], prior[1], prior[1]
-        least = max(least_of_best(correlations, i, held), _F(_MIN_CORRELATION))
+        least = _F(_MIN_CORRELATION)
+        if not weighted:
+            least = max(least_of_best(correlations, i, held), least)
         for s in range(correlations.shape[0]):
             if correlations[s, i] >= least:
-                add_source(sums[s], i, np.float64(correlations[s, i]), variance[i], noise, samples, normal, right)
+                count = samples * weights[s, i] if weighted else samples
+                add_source(sums[s], i, np.float64(correlations[s, i]), variance[i], noise, count, normal, right)
         steps[i] = _F(solve_first(normal, right))
 
 
@@ -153,7 +160,9 @@ def refine_rows(
     reference: Reference,
     sources: Sources,
     numbers: Numbers,
+    weighted: bool,
     inverse: NDArray[np.float32],
+    views: NDArray[np.float32],
 ) -> None:
     """Write the refined inverse ranges of some rows.
 
@@ -167,7 +176,9 @@ def refine_rows(
         sources: see `sum_windows`.
         numbers: 1 / width in grey levels of the window's weights, noise, information of the prior on α, the same on β
             and γ, samples, maximum step in q.
+        weighted: whether `views` holds weights; otherwise the better half of the sources counts.
         inverse: (H, W) float32, written.
+        views: (S, H, W) float32 weights of the sources, replaced by their correlations; −2 where one does not count.
     """
     grey, azimuth, pad, stretches, window_rows, window_columns = reference
     color_scale, noise, prior_q, prior_slope, samples, largest = numbers
@@ -187,7 +198,9 @@ def refine_rows(
             weigh_window(grey, place, color_scale, weights, centred, moments)
             sum_windows(part, place, azimuth, (weights, centred, moments[0]), sources, sums, votes)
             correlate_sources(sums, votes, moments[1], noise, correlations)
-            most_likely_steps(sums, correlations, moments[1], noise, prior, samples, steps)
+            given = views[:, row, first : first + n].copy()
+            most_likely_steps(sums, correlations, moments[1], noise, prior, samples, given, weighted, steps)
+            views[:, row, first : first + n] = correlations
             for i in range(_U(n)):
                 x = _U(first) + i
                 q = part[0, i] * (level * turned[0, x]) + part[1, i] * -dip + part[2, i] * (level * turned[1, x])

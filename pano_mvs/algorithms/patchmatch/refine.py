@@ -24,6 +24,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.patchmatch.view_weights import ViewWeights
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.bands import for_bands
@@ -73,6 +74,9 @@ def refine_range(
     sigma_color: Annotated[
         float, Setting("contrast to the window's centre, in grey levels, at which a sample has half weight", gt=0)
     ] = 25.0,
+    view_weights: Annotated[
+        bool, Setting("weight sources by how well they match around a pixel; otherwise the better half counts")
+    ] = True,
     source_masks: Sequence[Mask | None] | None = None,
 ) -> RangeMap:
     """Refine ranges between the depth hypotheses, and estimate normals.
@@ -89,6 +93,8 @@ def refine_range(
         prior_slope: standard deviation of the prior of its slopes, in pixels of parallax per pixel.
         noise: standard deviation of image noise in grey levels, at best agreement.
         sigma_color: difference from the window's centre in grey levels at which a sample has half weight.
+        view_weights: whether sources are weighted from the second round on, see `ViewWeights`. If not, the half of
+            the sources that matches better counts at each pixel.
         source_masks: for each source (Hs, Ws), False where it is ignored, or None.
 
     Returns:
@@ -129,13 +135,16 @@ def refine_range(
         kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes)
 
     def match(first: int, rows: int) -> None:
-        kernels_refine.refine_rows(first, rows, planes, *views, numbers, inverse)
+        kernels_refine.refine_rows(first, rows, planes, *views, numbers, weights.known, inverse, weights.views)
 
     threads = numba.get_num_threads()
+    weights = ViewWeights(len(sources), (height, width))
     for _ in range(rounds):
         for_bands(lay, height, threads=threads)
         for_bands(match, height, threads=threads)
         inverse[~seen] = np.nan
+        if view_weights:
+            weights.update()
     for_bands(lay, height, threads=threads)
     return _range_map_from_planes(planes, range_map, seen)
 
