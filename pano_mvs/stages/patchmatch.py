@@ -24,7 +24,7 @@ class PatchMatchParams(Params):
     )
 
 
-@stage("depth.patchmatch", memory=bytes_per_pixel(140, each_source=16))
+@stage("depth.patchmatch", memory=bytes_per_pixel(140, each_source=20))
 def patchmatch(
     range_map: Each[RangeMap],
     ref: Each[Panorama],
