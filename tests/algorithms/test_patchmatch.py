@@ -138,7 +138,7 @@ def test_compiled_steps_equal_normal_equations(weighted: bool) -> None:
             [(grey[0], poses[0], True), (grey[1], poses[1], votes)],
             steps,
             SETTINGS,
-            shares[:, row, column] if weighted else None,
+            shares[:, row, column].tolist() if weighted else None,
         )
         assert (correlations[1, row, column] == -2) == (not votes)
         off.append(abs(found[row, column] - expected) / SETTINGS[4])

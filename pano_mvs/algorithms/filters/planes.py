@@ -40,7 +40,7 @@ _SAME_SURFACE = 3.0
 # Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
 # has this share of the pixels of that one.
 _CLEAR_SHARE, _NEARLY = 0.8, 0.8
-# Pixels that see a parallel plane at a more grazing angle than this cosine do not vote for its distance.
+# Pixels that see a parallel plane at a more grazing angle than this cosine say nothing about its distance.
 _GRAZING = 0.1
 
 
@@ -197,17 +197,17 @@ def _parallel_fit(fit: _PlaneFit, normals: Sequence[FloatArray], *, max_relative
 
 
 def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: float) -> _PlaneFit:
-    """Return the plane with a normal, at the distance for which most reliable pixels vote; they face one side of it."""
+    """Return the plane with a normal, at the distance on which most reliable pixels agree; they face one side of it."""
     cosine = fit.rays @ normal
     if np.median(cosine) < 0:
         normal, cosine = -normal, -cosine
     facing = cosine > _GRAZING
     if not facing.any():
         return replace(fit, on_plane=np.zeros_like(fit.on_plane))
-    votes = np.sort(np.log(fit.inverse[facing] / cosine[facing]))
-    stop = np.searchsorted(votes, votes + 2 * max_relative_error, side="right")
-    first = int(np.argmax(stop - np.arange(len(votes))))
-    plane = np.exp(np.median(votes[first : stop[first]])) * normal
+    logs = np.sort(np.log(fit.inverse[facing] / cosine[facing]))
+    stop = np.searchsorted(logs, logs + 2 * max_relative_error, side="right")
+    first = int(np.argmax(stop - np.arange(len(logs))))
+    plane = np.exp(np.median(logs[first : stop[first]])) * normal
     return replace(fit, plane=plane, on_plane=np.abs(fit.rays @ plane / fit.inverse - 1) < max_relative_error)
 
 

@@ -58,6 +58,10 @@ def _mean_around(picture: FloatImage) -> FloatImage:
     height, width = picture.shape
     padded = pad_panorama(picture.astype(np.float32), _RADIUS)
     side = 2 * _RADIUS + 1
-    rows = sum(padded[shift : shift + height] for shift in range(side))
-    result = sum(rows[:, shift : shift + width] for shift in range(side))
-    return np.asarray(result / np.float32(side**2), np.float32)
+    rows = np.zeros((height, width + 2 * _RADIUS), np.float32)
+    for shift in range(side):
+        rows += padded[shift : shift + height]
+    result = np.zeros((height, width), np.float32)
+    for shift in range(side):
+        result += rows[:, shift : shift + width]
+    return result / np.float32(side**2)
