@@ -99,9 +99,12 @@ class LensRig:
     def angle_from_seam(self, bearings: ArrayLike) -> FloatArray:
         """Return the angle of bearings (..., 3) from the seam, (...,), in radians; inf where one lens or none sees."""
         margins = self.margins_rad(bearings)
-        both = np.isfinite(margins).all(axis=-1)
-        apart = np.abs(np.subtract(*np.moveaxis(np.where(both[..., None], margins, 0.0), -1, 0)))
-        return np.where(both, apart / 2, np.inf)  # away from the seam, one margin grows as the other shrinks
+        seen = np.isfinite(margins)
+        first, second = np.moveaxis(np.where(seen, margins, 0.0), -1, 0)
+        apart = np.abs(first - second)
+        return np.where(
+            seen[..., 0] & seen[..., 1], apart / 2, np.inf
+        )  # away from the seam, one margin grows as the other shrinks
 
     def lens_of_bearings(self, bearings: ArrayLike) -> NDArray[np.int8]:
         """Return the lens that the panorama shows at bearings (..., 3): 0 or 1, or −1 where no lens sees.

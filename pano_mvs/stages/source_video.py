@@ -286,5 +286,6 @@ def _time_from_name(name: str) -> float:
 def _dual_fisheye(path: Path) -> str:
     return (
         f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as an equirectangular "
-        "video with the camera maker's program first (stitching)"
+        "video with the camera maker's program first (stitching), or, if the calibration of the lenses is known, split "
+        "it into pictures and use source.dual_fisheye (docs/rigs.md)"
     )

@@ -56,6 +56,7 @@ def test_two_fisheyes_among_panoramas_are_told(pano_mvs: Command, tmp_path: Path
     result = pano_mvs("run", tmp_path / "look.yaml", "--out", "out")
     assert result.code == 3
     assert "b.png: two fisheye images side by side" in result.flat
+    assert "if the calibration of the lenses is known, use source.dual_fisheye (docs/rigs.md)" in result.flat
 
 
 def test_a_video_is_read_once_and_only_what_is_new_again(pano_mvs: Command, tmp_path: Path) -> None:

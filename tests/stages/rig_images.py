@@ -21,7 +21,9 @@ def tiny_rig_capture(layout: Layout = "side_by_side") -> Path:
     """Return the folder of a capture of two views with lenses of 48 × 48 pixels: images/ and rig.yaml."""
     _folders.append(TemporaryDirectory(prefix="pano-mvs-rig-"))
     folder = Path(_folders[-1].name)
-    write_rig_capture(folder, default_room(texture="weak"), capture_poses(2), tiny_rig(), layout=layout, supersample=1)
+    write_rig_capture(
+        folder, default_room(texture="weak"), capture_poses(2), rig=tiny_rig(), layout=layout, supersample=1
+    )
     return folder
 
 

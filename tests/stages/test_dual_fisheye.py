@@ -63,7 +63,8 @@ def test_each_layout_gives_the_same_panoramas_with_their_rig(tmp_path: Path, lay
     assert panorama.rig is not None
     assert panorama.rig.centers == pytest.approx(tiny_rig().centers)
     assert panorama.rig.stitch_distance_m == 3.0
-    again = Panorama.from_parts({**panorama.to_parts(), "meta": json.loads(json.dumps(panorama.to_parts()["meta"]))})
+    stored = {**panorama.to_parts()}
+    again = Panorama.from_parts({**stored, "meta": json.loads(json.dumps(stored["meta"]))})
     assert again.rig is not None
     assert again.rig.to_values() == panorama.rig.to_values()
     assert (again.second_lens is None) == (layout == "side_by_side")
@@ -78,7 +79,7 @@ def test_the_panorama_shows_the_room(tmp_path: Path) -> None:
 
 def test_what_no_lens_sees_is_masked(tmp_path: Path) -> None:
     rig = example_rig(size_px=48, field_of_view_deg=160.0)
-    write_rig_capture(tmp_path, default_room(texture="weak"), capture_poses(2), rig, supersample=1)
+    write_rig_capture(tmp_path, default_room(texture="weak"), capture_poses(2), rig=rig, supersample=1)
     panorama = stitched(params(tmp_path, nadir_deg=10), tmp_path)["000.png"]
     valid = panorama.load_mask()
     assert 0.6 < valid.mean() < 0.9
@@ -90,7 +91,8 @@ def test_what_no_lens_sees_is_masked(tmp_path: Path) -> None:
 
 def test_the_width_is_that_of_the_lenses_unless_it_is_given_or_limited(tmp_path: Path) -> None:
     widths = []
-    for number, more in enumerate(({"width": None}, {"width": None, "max_width": 50}, {"width": 100})):
+    settings: list[dict[str, Any]] = [{"width": None}, {"width": None, "max_width": 50}, {"width": 100}]
+    for number, more in enumerate(settings):
         (tmp_path / str(number)).mkdir()
         found = stitched(params(tiny_rig_capture(), **more), tmp_path / str(number))
         widths.append(found["000.png"].size_hw[1])
@@ -141,6 +143,7 @@ def test_the_pictures_of_the_rig_are_exported_unchanged(tmp_path: Path, layout: 
         mask = cv2.imread(str(files[f"colmap_rig/masks/{lens}/{{item}}.png.png"]), cv2.IMREAD_GRAYSCALE)
         assert (exported[mask == 0] == 0).all()
     labels = cv2.imread(str(files["colmap_rig/labels/{item}.png"]), cv2.IMREAD_GRAYSCALE)
+    assert labels is not None
     assert labels.shape == (32, 64)
     assert (labels[16, 32], labels[16, 0]) == (1, 2)
 
@@ -195,7 +198,7 @@ stages:
 def test_a_rendered_rig_becomes_a_metric_model_of_both_lenses(pano_mvs: Command, tmp_path: Path) -> None:
     rig = example_rig(size_px=300, offset_m=0.06)
     poses = capture_poses(4, spread=0.6, seed=3)
-    write_rig_capture(tmp_path, default_room(), poses, rig, layout="folders", supersample=1)
+    write_rig_capture(tmp_path, default_room(), poses, rig=rig, layout="folders", supersample=1)
     (tmp_path / "run.yaml").write_text(RUN)
     result = pano_mvs("run", tmp_path / "run.yaml", "--out", tmp_path / "out", "--cache", tmp_path / "cache")
     assert result.code == 0, result.text

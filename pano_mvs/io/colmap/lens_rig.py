@@ -80,7 +80,7 @@ def write_lens_rig_model(
         bearings = poses.track_bearings[of_panorama]
         labels = own.rig.lens_of_bearings(bearings)
         for lens_idx, (image_id, camera_id) in enumerate(zip(image_ids, camera_ids, strict=True)):
-            kept, pixels = _pixels(own.rig, lens_idx, bearings, labels)
+            kept, pixels = _pixels(own.rig, lens_idx, bearings, labels=labels)
             image_name = own.image_names[lens_idx]
             image = pycolmap.Image(name=image_name, keypoints=pixels, camera_id=camera_id, image_id=image_id)
             image.frame_id = frame_id
@@ -163,7 +163,7 @@ def _rigid(pose: Rigid3) -> Any:
 
 
 def _pixels(
-    rig: LensRig, lens_idx: int, bearings: FloatArray, labels: NDArray[np.int8]
+    rig: LensRig, lens_idx: int, bearings: FloatArray, *, labels: NDArray[np.int8]
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Return which bearings a lens observes, and their pixels in its picture, (n, 2)."""
     lens = rig.lenses[lens_idx]

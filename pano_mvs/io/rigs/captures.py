@@ -51,7 +51,7 @@ def list_rig_pictures(
         layout = _layout(names, lens_names)
     if layout == "side_by_side":
         return [RigPictures(str(name.with_suffix(".png")), (path,)) for name, path in zip(names, paths, strict=True)]
-    found = list(_pairs(paths, names, lens_names, layout))
+    found = list(_pairs(paths, names, lens_names=lens_names, layout=layout))
     if not found:
         example = f"{lens_names[0]}/000.jpg" if layout == "folders" else f"000_{lens_names[0]}.jpg"
         raise InputError(
@@ -69,7 +69,7 @@ def _layout(names: Sequence[PurePosixPath], lens_names: Sequence[str]) -> Layout
 
 
 def _pairs(
-    paths: Sequence[Path], names: Sequence[PurePosixPath], lens_names: Sequence[str], layout: Layout
+    paths: Sequence[Path], names: Sequence[PurePosixPath], *, lens_names: Sequence[str], layout: Layout
 ) -> Iterator[RigPictures]:
     captures: dict[str, dict[int, Path]] = {}
     for path, name in zip(paths, names, strict=True):

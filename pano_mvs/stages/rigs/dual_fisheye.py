@@ -120,7 +120,9 @@ def dual_fisheye(item: SourceItem, params: DualFisheyeParams, ctx: Context) -> P
     if second is not None:
         pictures.append(_decoded(second, second.read_bytes(), params))
     size_hw = _panorama_size(rig, params)
-    picture, valid = stitch_lenses(_by_lens(pictures, rig, item, params), rig, size_hw=size_hw, threads=ctx.threads)
+    picture, valid = stitch_lenses(
+        _by_lens(pictures, rig, item, params=params), rig, size_hw=size_hw, threads=ctx.threads
+    )
     del pictures
     write_png(ctx.scratch / "panorama.png", picture)
     panorama = Panorama(
@@ -150,7 +152,7 @@ def _decoded(file: FilePart, data: bytes, params: DualFisheyeParams) -> NDArray[
 
 
 def _by_lens(
-    pictures: list[NDArray[np.uint8]], rig: LensRig, item: SourceItem, params: DualFisheyeParams
+    pictures: list[NDArray[np.uint8]], rig: LensRig, item: SourceItem, *, params: DualFisheyeParams
 ) -> list[NDArray[np.uint8]]:
     """Return the picture of each lens.
 

@@ -101,7 +101,9 @@ def _refined_centrally(poses: Poses, settings: _Settings, *, load: Callable[[str
 
     def refined(group: Poses, rounds: int) -> Poses:
         bundle, colors = _adjusted(*_bundle(group), settings, rounds=rounds)
-        refined = _with_uncertainty(_poses(group, bundle, colors), bundle, settings, first_neighbour(group.centers))
+        refined = _with_uncertainty(
+            _poses(group, bundle, colors), bundle, settings, neighbour=first_neighbour(group.centers)
+        )
         return in_gauge_of(refined, group.centers)
 
     adjusted = per_group(poses, partial(refined, rounds=_ROUNDS))
@@ -121,24 +123,24 @@ def _refined_with_rigs(
     if poses.metric:
         bundle = replace(bundle, units_per_m=1.0)
     else:
-        found = _with_unit(bundle, colors, settings, estimate)
+        found = _with_unit(bundle, colors, settings, estimate=estimate)
         if found is None:
             return _refined_centrally(poses, settings, load=load)
         bundle = found
     adjusted, colors = _adjusted(bundle, colors, settings, rounds=_ROUNDS)
-    refined = _poses(poses, adjusted, colors, own_rigs)
+    refined = _poses(poses, adjusted, colors, rigs=own_rigs)
     if load is not None:
         aligned, colors = _with_offsets(*_bundle(align_tracks(refined, load)), own_rigs)
         adjusted, colors = _adjusted(replace(aligned, units_per_m=bundle.units_per_m), colors, settings, rounds=1)
-        refined = _poses(refined, adjusted, colors, own_rigs)
-    refined = _with_uncertainty(refined, adjusted, settings, neighbour)
+        refined = _poses(refined, adjusted, colors, rigs=own_rigs)
+    refined = _with_uncertainty(refined, adjusted, settings, neighbour=neighbour)
     if poses.metric:
         return in_gauge_of(refined, poses.centers)
     return _in_metres(refined, adjusted, own_rigs, std=estimate(adjusted).relative_std)
 
 
 def _with_unit(
-    bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, estimate: Callable[[Bundle], OffsetScale]
+    bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, *, estimate: Callable[[Bundle], OffsetScale]
 ) -> Bundle | None:
     """Return a bundle with its units per metre and rough cameras; None if the offsets do not determine the unit."""
     for _ in range(_OFFSET_ROUNDS):
@@ -186,7 +188,7 @@ def _adjusted(
     return _without_outliers(bundle, colors, max_error_rad=max_error_rad)
 
 
-def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, neighbour: int) -> Poses:
+def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, *, neighbour: int) -> Poses:
     """Return refined poses with the standard deviations of their cameras, given the distance of one to the first."""
     if not neighbour or not len(bundle.points):
         return poses
@@ -283,7 +285,7 @@ def _selected(
 
 
 def _poses(
-    poses: Poses, bundle: Bundle, colors: NDArray[np.uint8], rigs: Sequence[LensRig | None] | None = None
+    poses: Poses, bundle: Bundle, colors: NDArray[np.uint8], *, rigs: Sequence[LensRig | None] | None = None
 ) -> Poses:
     count = len(bundle.points)
     sizes = np.maximum(np.bincount(bundle.point_idx, minlength=count), 1)
