@@ -20,6 +20,7 @@ from pano_mvs.scene.masks.cropping import inside_crop, placed_picture, same_shap
 from pano_mvs.scene.masks.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
 
+_OF_RIGS = frozenset({"rig", "first_lens", "second_lens"})
 _RECENT = RecentPictures(limit_bytes=48 << 20)
 
 
@@ -64,13 +65,12 @@ class Panorama(Record):
     second_lens: FilePart | None = None
 
     def to_parts(self) -> Parts:
-        """Return the panorama with its rig as JSON."""
+        """Return the panorama with its rig as JSON; without a rig, nothing is stored about one."""
         parts = dict(super().to_parts())
         meta = parts["meta"]
         assert isinstance(meta, dict)
-        if self.rig is not None:
-            parts["meta"] = meta | {"rig": self.rig.to_values()}
-        return parts
+        plain = {key: value for key, value in meta.items() if key not in _OF_RIGS}
+        return parts | {"meta": plain if self.rig is None else plain | {"rig": self.rig.to_values()}}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
