@@ -14,6 +14,7 @@ from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import rotation_from_rotvec, spiral_rays
+from pano_mvs.scene.pose_groups import join_groups, split_groups
 from tests.algorithms.poses.rig_capture import RigCapture, rig_capture
 
 
@@ -148,3 +149,13 @@ def test_captures_of_the_tests_have_the_truth_that_they_state() -> None:
         translations=np.array([pose.translation for pose in capture.true]),
     )
     assert capture.errors(exact) == pytest.approx((0, 0), abs=1e-5)
+
+
+def test_groups_have_a_unit_each() -> None:
+    first, second = rig_capture(offset_m=0.05, points=200), rig_capture(offset_m=0.05, points=200, unit=0.6, seed=1)
+    renamed = replace(second.poses, names=tuple(f"other_{name}" for name in second.poses.names))
+    rigs = first.rigs | dict.fromkeys(renamed.names, second.rig)
+    refined = split_groups(refine_poses(join_groups([first.poses, renamed]), rigs=rigs))
+    for capture, group in zip((first, second), refined, strict=True):
+        assert group.metric
+        assert capture.scale_error(group) < 0.02
