@@ -125,7 +125,7 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     Between two adjustments, patches of the images are aligned, which locates the observations more precisely than the
     detector and estimates their precision. Groups of poses are adjusted one by one. For panoramas of
     source.dual_fisheye, the ray of each observation starts at the centre of its lens. If the distance of the lenses
-    determines the unit of length to 10 %, the poses are in metres.
+    determines the unit of length to 3 %, the poses are in metres.
     """
     rigs = {name: image.rig for name, image in images.items() if image.rig is not None}
     refined = refine_poses(

@@ -30,7 +30,9 @@ _TOLERANCES = (1e-3, 1e-3, 1e-7)
 _OFFSET_ROUNDS, _WIDE = 10, 4
 _SAME_SCALE = 0.02  # relative difference of two estimates
 # Offsets that determine the unit of length less well than this are too small to matter.
-_MAX_SCALE_STD = 0.1
+_MAX_SCALE_STD = 0.03
+_MIN_USED = 0.5  # share of the observations that fit a solution; a wrong one leaves most of them out
+_MAX_ROUGH_STD = 0.5  # before outliers are dropped and patches are aligned
 # A patch this close to the strip in which two lenses are mixed shows both. Such key points bias the unit of length: by
 # 1.4 % instead of 0.3 % for 30 mm.
 _SEAM_PATCH_DEG = 2.0
@@ -63,7 +65,7 @@ def refine_poses(
     `align_tracks`), and everything is adjusted once more. This halves the error if key points are few or coarse.
 
     Panoramas that were stitched from two lenses are not central cameras: with their rigs, each ray starts at the centre
-    of its lens. The distance of the lenses then also determines the unit of length. If it is determined to 10 %, the
+    of its lens. The distance of the lenses then also determines the unit of length. If it is determined to 3 %, the
     poses are in metres, and `scale` states the uncertainty; otherwise the offsets are ignored, unless the poses were in
     metres before. `track_bearings` remain bearings of the panoramas.
 
@@ -136,7 +138,10 @@ def _refined_with_rigs(
     refined = _with_uncertainty(refined, adjusted, settings, neighbour=neighbour)
     if poses.metric:
         return in_gauge_of(refined, poses.centers)
-    return _in_metres(refined, adjusted, own_rigs, std=estimate(adjusted).relative_std)
+    scale = estimate(adjusted)
+    if not scale.relative_std < _MAX_SCALE_STD or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
+        return _refined_centrally(poses, settings, load=load)
+    return _in_metres(refined, adjusted, own_rigs, std=scale.relative_std)
 
 
 def _with_unit(
@@ -147,7 +152,7 @@ def _with_unit(
         # Until the offsets are known in units of the world, no observation can be called an outlier.
         rough, _unused = _adjusted(bundle, colors, settings, rounds=1, widen=_WIDE)
         scale = estimate(rough)
-        if not scale.relative_std < _MAX_SCALE_STD:
+        if not scale.relative_std < _MAX_ROUGH_STD:
             return None
         known = abs(scale.units_per_m - bundle.units_per_m) < _SAME_SCALE * scale.units_per_m
         bundle = replace(bundle, rotations=rough.rotations, centers=rough.centers, units_per_m=scale.units_per_m)
