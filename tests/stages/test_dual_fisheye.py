@@ -17,6 +17,7 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import Panorama
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.stages.exports.colmap import ModelParams, colmap
+from pano_mvs.stages.poses import RefineParams, refine
 from pano_mvs.stages.rigs.dual_fisheye import (
     DualFisheyeParams,
     dual_fisheye,
@@ -178,6 +179,21 @@ def test_the_model_of_the_rig_is_written_if_the_poses_are_in_metres(tmp_path: Pa
         assert names == {f"{lens}/{number:03d}.png" for lens in ("front", "back") for number in range(3)}
     else:
         assert any("colmap_rig was not written" in note and "poses.scale" in note for note in context.notes)
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "note"),
+    [
+        (0.05, "unit of length: metres, by the distance of 50 mm"),
+        (0.0005, "does not determine the unit of length here"),
+    ],
+)
+def test_refinement_reports_what_the_distance_of_the_lenses_gave(tmp_path: Path, offset_m: float, note: str) -> None:
+    capture = rig_capture(offset_m=offset_m, points=150, count=4)
+    images = {name: replace(tiny_rig_panorama(), rig=capture.rig) for name in capture.poses.names}
+    context = Context(np.random.default_rng(0), tmp_path)
+    refine(poses=capture.poses, images=images, params=RefineParams(align=False), ctx=context)
+    assert any(note in text for text in context.notes)
 
 
 RUN = """\
