@@ -11,6 +11,7 @@ from pydantic import Field
 
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
+from pano_mvs.algorithms.poses.loop_closures import find_false_closures
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
@@ -43,6 +44,9 @@ class ScaledTranslationParams(Params):
     ask_images: bool = Field(
         default=True, description="use the images to decide between poses that the matches support about equally"
     )
+    check_closures: bool = Field(
+        default=True, description="of a walk, leave out pairs that join places far apart along the path"
+    )
 
 
 @stage("poses.scaled_translation")
@@ -57,16 +61,35 @@ def scaled_translation(
 
     Each image is placed by all of its pairs together; if several poses agree with the pairs about equally well, the
     images decide. Images that cannot be placed reliably are left out, each with a reason. Groups of images without a
-    reliable pair between them are solved separately.
+    reliable pair between them are solved separately. If the images were taken along a path, it is solved from the pairs
+    in sequence first; pairs of places that look the same, but are far apart along the path, are left out.
     """
     poses = solve_scaled_translation(
         features,
-        matches,
+        _without_false_closures(features, matches, ctx) if params.check_closures else matches,
         **arguments_from(solve_scaled_translation, params),
         load=panorama_loader(images) if params.ask_images else None,
         rng=ctx.rng,
     )
     return checked_poses(poses, ctx)
+
+
+def _without_false_closures(
+    features: Mapping[str, Features], matches: Mapping[tuple[str, str], TwoView], ctx: Context
+) -> Mapping[tuple[str, str], TwoView]:
+    """Return the pairs without those that contradict the path of a walk, which are reported."""
+    found = find_false_closures(features, matches)
+    if not found:
+        return matches
+    worst = max(found, key=lambda closure: closure.steps)
+    ctx.note(
+        f"{len(found)} {plural(len(found), 'pair')} of images that look alike but are far apart along the path "
+        f"{plural(len(found), 'was', 'were')} left out, such as {worst.pair[0]} and {worst.pair[1]}, {worst.steps:.0f} "
+        "steps apart. If they do show the same place, the path has drifted: set check_closures: false"
+    )
+    ctx.metric("false_closures", len(found))
+    left_out = {closure.pair for closure in found}
+    return {pair: view for pair, view in matches.items() if pair not in left_out}
 
 
 @params_from(verify_poses)

@@ -102,6 +102,12 @@ def test_seeking_finds_what_reading_through_finds(tmp_path: Path, suffix: str) -
         assert found == [number for time_s, number in through if begin - 0.001 <= time_s <= end + 0.001]
 
 
+def test_frames_can_be_left_out_while_reading(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "walk.mp4", 40)
+    found = [number_of(frame) for _, frame in frames_between(path, 0.5, 1.6, min_step_s=0.2)]
+    assert found == [10, 14, 18, 22, 26, 30]
+
+
 def test_a_frame_rate_that_varies_does_no_harm(tmp_path: Path) -> None:
     """OpenCV seeks as if frames came evenly; the container's own time stamps decide."""
     path = write_video(tmp_path / "walk.mp4", 60)

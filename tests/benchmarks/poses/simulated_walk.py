@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.loop_closures import find_false_closures
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import similarity_from_points
@@ -109,6 +110,9 @@ def measure(views: int, *, closures: bool, twins: bool = False, seed: int = 0) -
                 capture.features[names[a]], capture.features[names[b]], matches, rng=rng
             )
     matched = time.process_time()
+    false = [closure.pair for closure in find_false_closures(capture.features, two_views)]
+    two_views = {pair: view for pair, view in two_views.items() if pair not in set(false)}
+    tested = time.process_time()
     poses = solve_scaled_translation(capture.features, two_views, rng=rng)
     solved = time.process_time()
     poses = split_groups(refine_poses(poses))[0]
@@ -120,7 +124,9 @@ def measure(views: int, *, closures: bool, twins: bool = False, seed: int = 0) -
         "registered": len(poses.names),
         "pairs": sum(len(view) > 0 for view in two_views.values()),
         "match_s": matched - start,
-        "solve_s": solved - matched,
+        "test_s": tested - matched,
+        "left_out": len(false),
+        "solve_s": solved - tested,
         "refine_s": refined - solved,
         "rms_percent": 100 * float(np.sqrt(np.mean(errors**2))) / capture.length,
         "max_percent": 100 * float(errors.max()) / capture.length,
