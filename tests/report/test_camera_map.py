@@ -207,9 +207,7 @@ def test_captures_without_order_have_no_path() -> None:
     names = walked(40, [])["registered"]
     everything = walked(40, []) | {"links": [[a, b, 50] for a in names for b in names if a < b]}
     shuffled = np.random.default_rng(0).permutation(40)
-    disordered = walked(40, []) | {
-        "links": [[names[a], names[b], 50] for a, b in pairwise(shuffled)]
-    }
+    disordered = walked(40, []) | {"links": [[names[a], names[b], 50] for a, b in pairwise(shuffled)]}
     for capture in (everything, disordered, walked(10, [])):
         drawn = camera_maps(capture)[0]
         assert (drawn.path, drawn.ends, drawn.closures) == ("", (), 0)

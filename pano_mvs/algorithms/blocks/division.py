@@ -71,7 +71,7 @@ def _with_returns(
     for here, there in permutations(range(len(stretches)), 2):
         if stretches[here] & stretches[there] or not len(centers[here]) or not len(centers[there]):
             continue
-        distances = cKDTree(centers[here]).query(centers[there])[0]
+        distances = np.asarray(cKDTree(centers[here]).query(centers[there])[0])
         nearest = [n for n in np.argsort(distances, kind="stable").tolist() if distances[n] <= reach]
         added = {known[there][n] for n in nearest[: -(-overlap // 2)]}
         found[here] |= added
