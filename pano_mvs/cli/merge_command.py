@@ -6,10 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-from pano_mvs.session.merging.agreement import is_doubtful
-from pano_mvs.session.merging.merge import MergeResult, merge_outputs
+from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.merging.split import split_images
 
 
@@ -44,11 +42,11 @@ def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None
         StoreError: if a file cannot be written.
     """
     with console.status("merging"):
-        result = merge_outputs(outs, to, cache=cache)
-    console.print(_agreement_table(result))
-    summary = result.summary
-    for text in (*summary.warnings, *summary.notes[len(result.alignment.links) :]):
-        console.print(f"note: {escape(text)}", highlight=False, soft_wrap=True)
+        summary = merge_outputs(outs, to, cache=cache).summary
+    for text in summary.notes:
+        console.print(escape(text), highlight=False, soft_wrap=True)
+    for text in summary.warnings:
+        console.print(f"warning: {escape(text)}", highlight=False, soft_wrap=True)
     points = f", cloud of {summary.cloud.points:,} points" if summary.cloud.points else ""
     console.print(
         f"{len(summary.poses.registered)} cameras, {summary.poses.points:,} sparse points, {len(summary.views)} range "
@@ -57,19 +55,3 @@ def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None
         soft_wrap=True,
     )
     return summary.exit_code
-
-
-def _agreement_table(result: MergeResult) -> Table:
-    table = Table("blocks", "common cameras", "offset, % of spacing", "turn, °", "scale", "")
-    scales = [similarity.scale if similarity is not None else 1.0 for similarity in result.alignment.world_from_block]
-    for link in result.alignment.links:
-        names = (result.blocks[link.first].name, result.blocks[link.second].name)
-        table.add_row(
-            escape(" – ".join(names)),
-            str(len(link.names)),
-            f"{100 * link.relative_offset:.3g}",
-            f"{link.turn_deg:.2g}",
-            f"{scales[link.second] / scales[link.first]:.4g}",
-            "doubtful" if is_doubtful(link) else "",
-        )
-    return table

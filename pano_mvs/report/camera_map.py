@@ -65,7 +65,7 @@ class CameraMap:
         north: whether north is upwards.
         marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
         path: an SVG path along the cameras of a walk in their order; empty if they were not taken along one.
-        ends: (x, y) of the first and the last camera of a walk.
+        ends: (x, y) of the first and the last camera of a walk whose cameras have no labels.
     """
 
     title: str
@@ -282,7 +282,7 @@ def _drawn(
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())
     shown = tuple(cameras if named else ())
     path = "" if walk is None else "".join(_stretch([at[idx] for idx in stretch]) for stretch in walk.stretches)
-    ends = () if walk is None else (at[0], at[-1])
+    ends = () if walk is None or len(labels) <= _MAX_LABELS else (at[0], at[-1])
     return CameraMap(title, text, (_WIDTH, height), lines, shown, dots, bar, north, doubtful, marked, path, ends)
 
 

@@ -186,6 +186,8 @@ def test_the_path_of_a_walk_is_drawn_with_its_ends_and_loop_closures() -> None:
         assert [link.closure for link in drawn.links[-2:]] == [True, True], "closures are drawn over the others"
         assert drawn.links[-1].text.endswith("; closes a loop")
     assert above.radius < camera_maps(walked(100, []))[0].radius
+    assert camera_maps(walked(30, []))[0].path
+    assert not camera_maps(walked(30, []))[0].ends, "cameras with labels"
 
 
 def test_loop_closures_are_drawn_though_other_links_are_stronger() -> None:

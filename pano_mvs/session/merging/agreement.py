@@ -62,9 +62,13 @@ def require_agreement(blocks: Sequence[Block], alignment: BlockAlignment) -> Non
 def link_text(link: BlockLink) -> str:
     """Return the agreement of two blocks in words."""
     return (
-        f"positions differ by {100 * link.relative_offset:.2g} % of the distance between neighbouring cameras, "
-        f"orientations by {link.turn_deg:.2g}° (medians)"
+        f"positions differ by {_small(100 * link.relative_offset)} % of the distance between neighbouring cameras, "
+        f"orientations by {_small(link.turn_deg)}° (medians)"
     )
+
+
+def _small(value: float) -> str:
+    return f"{value:.2g}" if value >= 0.001 else "less than 0.001"
 
 
 def is_doubtful(link: BlockLink) -> bool:

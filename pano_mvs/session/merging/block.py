@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError, UsageError
@@ -12,6 +12,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.thinning import chunks
 from pano_mvs.io.colmap.model_reader import model_files, read_cameras, read_images
+from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.pose_groups import split_groups
@@ -115,4 +116,17 @@ def _loaded(out: Path, cache: Path | None) -> Block:
     largest, *others = split_groups(poses)
     if len(largest.names) < 2:
         raise InputError(f"{out}: only {len(largest.names)} {plural(len(largest.names), 'image')} has a pose")
+    if run.values.poses is None:
+        largest = _as_stated(largest, run.summary.poses)
     return Block(run, largest, sum(len(group.names) for group in others))
+
+
+def _as_stated(poses: Poses, stated: PosesSummary) -> Poses:
+    """Return the poses of a COLMAP model with what run.json states about them, which the model does not hold."""
+    return replace(
+        poses,
+        frame=stated.frame or poses.frame,
+        scale=stated.scale or poses.scale,
+        metric=stated.metric,
+        doubts={name: stated.doubts[name] for name in poses.names if name in stated.doubts},
+    )

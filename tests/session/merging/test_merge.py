@@ -14,6 +14,7 @@ from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.results.run_output import load
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
 from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
@@ -131,6 +132,20 @@ def test_a_camera_that_two_blocks_place_differently_is_doubtful(folder: Path, tm
     assert list(result.summary.poses.doubts) == ["010.png"]
     assert "times the distance between neighbouring cameras apart" in result.summary.poses.doubts["010.png"]
     assert result.summary.exit_code == 3
+
+
+def test_metres_and_doubts_of_a_block_are_kept_without_its_cache(folder: Path, tmp_path: Path) -> None:
+    write_block(tmp_path / "metric", list(range(5, 14)), some_world(9))
+    summary = RunSummary.read(tmp_path / "metric")
+    stated = summary.poses.model_copy(
+        update={"metric": True, "scale": "by GPS", "frame": "y down", "doubts": {"013.png": "hardly seen"}}
+    )
+    summary.model_copy(update={"poses": stated}).write(tmp_path / "metric")
+    result = merge_outputs([folder / "block_0", tmp_path / "metric"], tmp_path / "merged")
+    assert result.alignment.reference == 1
+    assert (result.summary.poses.metric, result.summary.poses.scale) == (True, "by GPS")
+    assert set(result.summary.poses.doubts) <= {"013.png"}
+    assert read_poses(tmp_path / "merged/poses.json").metric
 
 
 def test_folders_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> None:
