@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,13 +53,16 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
         two_views: verified pairs.
     """
     place = {name: idx for idx, name in enumerate(features)}
-    valid = {pair: view for pair, view in two_views.items() if view}
-    sequence = {pair: view for pair, view in valid.items() if abs(place[pair[0]] - place[pair[1]]) <= _WINDOW}
-    closures = [pair for pair in valid if pair not in sequence]
+    if not _may_be_walk(place, two_views):
+        return []
+    # Views are read one by one, because those of a large capture do not fit into memory.
+    valid = [pair for pair, view in two_views.items() if view]
+    sequence = [pair for pair in valid if _is_near(place, pair)]
+    closures = [pair for pair in valid if not _is_near(place, pair)]
     if not closures or not _is_walk(place, sequence, count=len(valid)):
         return []
     # The random generator is not used; see `solve_scaled_translation`.
-    poses = solve_scaled_translation(features, sequence, rng=np.random.default_rng(0))
+    poses = solve_scaled_translation(features, _Selected(two_views, sequence), rng=np.random.default_rng(0))
     known = _KnownPoints(poses, features)
     along = _path_lengths(poses)
     found = []
@@ -69,7 +72,7 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
         first, second = (known.position[name] for name in pair)
         if poses.groups[first] != poses.groups[second]:
             continue
-        apart = known.distances(pair, valid[pair])
+        apart = known.distances(pair, two_views[pair])
         step = along.step[poses.groups[first]]
         allowed = max(_DRIFT_STEPS * step, _DRIFT_SHARE * abs(along.at[first] - along.at[second]))
         if len(apart) >= _MIN_POINTS and float(np.median(apart)) > allowed:
@@ -77,7 +80,40 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
     return found
 
 
-def _is_walk(place: Mapping[str, int], sequence: Mapping[Pair, TwoView], *, count: int) -> bool:
+class _Selected(Mapping[Pair, TwoView]):
+    """Some of the pairs, which are read on access."""
+
+    def __init__(self, two_views: Mapping[Pair, TwoView], pairs: Collection[Pair]) -> None:
+        self._two_views = two_views
+        self._pairs = dict.fromkeys(pairs)
+
+    def __getitem__(self, pair: Pair) -> TwoView:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        return self._two_views[pair]
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+
+def _is_near(place: Mapping[str, int], pair: Pair) -> bool:
+    return abs(place[pair[0]] - place[pair[1]]) <= _WINDOW
+
+
+def _may_be_walk(place: Mapping[str, int], pairs: Collection[Pair]) -> bool:
+    """Return whether the pairs, valid or not, may be those of a walk with closures."""
+    consecutive = sum(abs(place[a] - place[b]) == 1 for a, b in pairs)
+    return (
+        len(place) >= _MIN_IMAGES
+        and consecutive >= _CONSECUTIVE_SHARE * (len(place) - 1)
+        and not all(_is_near(place, pair) for pair in pairs)
+    )
+
+
+def _is_walk(place: Mapping[str, int], sequence: Collection[Pair], *, count: int) -> bool:
     consecutive = sum(abs(place[a] - place[b]) == 1 for a, b in sequence)
     return (
         len(place) >= _MIN_IMAGES
