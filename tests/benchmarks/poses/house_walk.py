@@ -20,6 +20,7 @@ from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Surface, Vector
 
 STEP = 0.6
+_VIEWS = 300
 _COLUMNS, _WIDE = 13, 4.0
 _CEILING, _FLOOR, _LINTEL = -1.3, 1.4, -0.8
 _HALF_DOOR, _HALF_WALL = 0.5, 0.06
@@ -56,21 +57,21 @@ Painted = tuple[Bounded, _Paint]
 
 
 def walk_poses(views: int, *, seed: int = 0) -> list[Rigid3]:
-    """Return the first cameras of the walk, 0.6 apart, looking ahead with some swaying."""
+    """Return the first cameras of the walk, 0.6 apart, looking ahead with some swaying; at most 300."""
+    if views > _VIEWS:
+        raise ValueError(f"the walk has {_VIEWS} views, not {views}")
     rng = np.random.default_rng([seed, 0x3A])
     corners = np.array([(_middle(column), line) for column, line in _CORNERS])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    at = np.arange(views) * STEP
-    if at[-1] > along[-1]:
-        raise ValueError(f"the walk has {int(along[-1] / STEP) + 1} views, not {views}")
+    at = np.arange(_VIEWS) * STEP
     flat = np.stack([np.interp(at, along, axis) for axis in corners.T], axis=1)
     ahead = np.stack([np.interp(at + 0.3, along, axis) for axis in corners.T], axis=1) - flat
-    yaws = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 1])) + rng.normal(0, 0.2, views)
-    centers = np.stack([flat[:, 0], np.zeros(views), flat[:, 1]], axis=1) + rng.uniform(-0.1, 0.1, (views, 3))
-    tilts = rng.normal(0, np.radians(4), (views, 3))
+    yaws = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 1])) + rng.normal(0, 0.2, _VIEWS)
+    centers = np.stack([flat[:, 0], np.zeros(_VIEWS), flat[:, 1]], axis=1) + rng.uniform(-0.1, 0.1, (_VIEWS, 3))
+    tilts = rng.normal(0, np.radians(4), (_VIEWS, 3))
     return [
         Rigid3.from_center(rotation_from_rotvec(tilt) @ rotation_from_rotvec((0.0, -yaw, 0.0)), center)
-        for tilt, yaw, center in zip(tilts, yaws, centers, strict=True)
+        for tilt, yaw, center in zip(tilts[:views], yaws[:views], centers[:views], strict=True)
     ]
 
 
