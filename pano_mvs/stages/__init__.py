@@ -27,7 +27,7 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import scale_cloud, vote
-from pano_mvs.stages.masks import apply, color, operator, static
+from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch
@@ -72,6 +72,7 @@ __all__ = [
     "median",
     "mesh",
     "mesh_textured",
+    "moving",
     "nearest",
     "nerfstudio",
     "nerfstudio_frames",

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
+from pano_mvs.algorithms.masks.expected_view import OtherView
+from pano_mvs.algorithms.masks.moving import MAX_OTHERS, moving_pixels
 from pano_mvs.algorithms.masks.one_color import areas_of_color
 from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
-from pano_mvs.api import All, Context, Each, One, Panorama, Params, arguments_from, params_from, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    Each,
+    One,
+    Panorama,
+    Params,
+    Pose,
+    RangeMap,
+    arguments_from,
+    params_from,
+    stage,
+)
 from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
 
 
@@ -91,7 +106,79 @@ def operator(image: Each[Panorama], params: OperatorParams, ctx: Context) -> Pan
         return image
     found = people(image.load(), **arguments_from(people, params))
     ctx.metric("masked", share_of_sphere(found))
-    return image.with_mask(~found, ctx.scratch) if found.any() else image
+    return image.with_mask(~_resized(found, image.size_hw), ctx.scratch) if found.any() else image
+
+
+@params_from(moving_pixels, own_last=True)
+class MovingParams(Params):
+    """Settings of masks.moving."""
+
+    enabled: bool = Field(default=True, description="false masks nothing")
+
+
+@stage("masks.moving", memory="400MB")
+def moving(
+    image: Each[Panorama],
+    images: All[Panorama],
+    ranges: All[RangeMap],
+    poses: All[Pose],
+    params: MovingParams,
+    ctx: Context,
+) -> Panorama:
+    """Mask what moves through the scene: people and vehicles that contradict the other views.
+
+    Use it after filters.consistency. The stages after it, such as fusion and exports, ignore what it masks. Images
+    without a pose or ranges, and those with fewer than two others around them, stay as they are.
+    """
+    ctx.metric("masked", 0.0)
+    name = next((name for name, other in images.items() if other.image == image.image), None)
+    if not params.enabled or name is None or name not in ranges or name not in poses:
+        return image
+    near = _nearest(name, {other: poses[other] for other in poses if other in ranges and other in images})
+    picture, valid = reduced_to_width(image.load(), image.load_mask())
+    found = moving_pixels(
+        picture,
+        _sampled(ranges[name], (valid.shape[0], valid.shape[1])),
+        [_other_view(images[other], ranges[other], poses[other], of=poses[name]) for other in near],
+        valid=valid,
+        **arguments_from(moving_pixels, params),
+    )
+    ctx.metric("masked", share_of_sphere(found.pixels))
+    if not found.pixels.any():
+        return image
+    return image.with_mask(~_resized(found.pixels, image.size_hw), ctx.scratch)
+
+
+def _nearest(name: str, poses: dict[str, Pose]) -> list[str]:
+    """Return the images of the same group around an image, the nearest first."""
+    own = poses[name]
+    distances = {
+        other: float(np.linalg.norm(pose.cam_from_world.center - own.cam_from_world.center))
+        for other, pose in poses.items()
+        if other != name and pose.group == own.group
+    }
+    return sorted(distances, key=lambda other: (distances[other], other))[:MAX_OTHERS]
+
+
+def _other_view(image: Panorama, range_map: RangeMap, pose: Pose, *, of: Pose) -> OtherView:
+    picture, valid = reduced_to_width(image.load(), image.load_mask())
+    sampled = _sampled(range_map, (valid.shape[0], valid.shape[1]))
+    return OtherView(picture, valid, sampled, pose.cam_from_world @ of.cam_from_world.inverse())
+
+
+def _sampled(range_map: RangeMap, size_hw: tuple[int, int]) -> RangeMap:
+    """Return some pixels of a range map, (h, w)."""
+    rows, columns = (
+        (2 * np.arange(size) + 1) * of // (2 * size) for size, of in zip(size_hw, range_map.range.shape, strict=True)
+    )
+    at = (rows[:, None], columns)
+    return RangeMap(range_map.range[at], range_map.confidence[at])
+
+
+def _resized(pixels: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask of the full sphere at another size, with interpolated edges."""
+    shares = cv2.resize(pixels.astype(np.float32), size_hw[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(shares >= 0.5)
 
 
 def _static_content(panoramas: list[Panorama], params: StaticParams) -> StaticContent:

@@ -266,7 +266,7 @@ def _shaded(body: Person, points: FloatArray) -> FloatArray:
             along = (points[on] - first) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
             band = np.abs(along % 0.22 - 0.11) < 0.025
             colors[np.flatnonzero(on)[band]] = (0.78, 0.80, 0.82)
-    return 255 * np.clip(colors * light[:, None], 0, 1)
+    return np.asarray(255 * np.clip(colors * light[:, None], 0, 1))
 
 
 def _shadow(people: Sequence[Person], origin: FloatArray, rays: FloatArray, surface: FloatArray) -> Mask:

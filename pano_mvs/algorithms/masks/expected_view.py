@@ -23,8 +23,8 @@ _SAME = 0.06
 # The ground is a plane through points this far below the horizon, as flat as this.
 _GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
 _GROUND_TRIALS = 60
-# Views differ by a pixel or two where poses or ranges are not exact: colours around a pixel count as well.
-_AROUND_PX = 2
+# Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
+_AROUND_DEG = 1.4
 _DARK_LEVEL = 4.0
 
 
@@ -69,7 +69,7 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     """Compare a panorama with what other views expect in it.
 
     A surface is expected where the ranges of two of them agree, or on the plane of the ground. The colours of those
-    that see it, after a factor per channel, and the lightest and the darkest colours within two pixels, are what can be
+    that see it, after a factor per channel, and the lightest and the darkest colours within 1.4°, are what can be
     expected there. Where the panorama's own ranges are confirmed, what the views show at these is expected as well.
 
     Args:
@@ -227,9 +227,10 @@ def _seen_colors(other: OtherView, points: FloatArray, known: Mask) -> tuple[Pla
     with np.errstate(invalid="ignore"):
         visible = known & other.valid[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
     smooth = _smooth(other.picture)
-    padded = pad_panorama(smooth, _AROUND_PX)
-    window = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)
-    inner = (slice(_AROUND_PX, -_AROUND_PX),) * 2
+    around = max(1, round(_AROUND_DEG * size_hw[0] / 180))
+    padded = pad_panorama(smooth, around)
+    window = np.ones((2 * around + 1,) * 2, np.uint8)
+    inner = (slice(around, -around),) * 2
     found = (cv2.erode(padded, window)[inner][at], smooth[at], cv2.dilate(padded, window)[inner][at])
     lowest, middle, highest = (np.where(visible[..., None], colors, np.float32(np.nan)) for colors in found)
     return lowest, middle, highest

@@ -131,8 +131,8 @@ def person_at(picture: Picture, area: Mask) -> tuple[float, Mask]:
     if coarse.any():
         looks, _ = _views_of(coarse, FINE_HW)
         if max(seen.presence(each) for each in looks) >= _MIN_PRESENCE:
-            mean = np.mean([seen.probability(each, mirrored=True) for each in looks], axis=0, dtype=np.float32)
-            mean = _at_size(mean, (area.shape[0], area.shape[1]))
+            seen_again = [seen.probability(each, mirrored=True) for each in looks]
+            mean = _at_size(np.asarray(np.mean(seen_again, axis=0), np.float32), (area.shape[0], area.shape[1]))
             return float(np.average(mean[area], weights=pixel_weights(area.shape)[area])), mean > _BELONGS
     return 0.0, np.zeros_like(area)
 

@@ -81,7 +81,7 @@ class SeenPanorama:
         padded = self._half if look.wide else self._full
         size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
         at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
-        return np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)  # type: ignore[call-overload]
+        return np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
 
     def probability(self, look: Look, *, mirrored: bool = False) -> Map:
         """Return the probability of a person in each direction of a view's map; 0 outside of the view."""
