@@ -30,7 +30,7 @@ _SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 # Differences of colour, in grey levels, from which an area is changed, and at least somewhere in it.
 _CHANGED, _CERTAIN = 10.0, 24.0
 _MIN_CERTAIN_SHARE = 0.15
-# The operator reaches to within this angle of straight down, and no farther from it than the other.
+# The operator reaches to within this angle of straight down. What touches the operator's mask is within the other.
 _NADIR_DEG, _REACH_DEG = 30.0, 75.0
 # The mean probability of a person, by the network.
 _PERSON = 0.5
@@ -134,11 +134,10 @@ def _is_operator(area: Mask, masked: Mask) -> bool:
     """Return whether an area lies within the operator's reach and extends to the nadir, or to what is masked there."""
     off_nadir_deg = np.degrees(np.arccos(np.clip(ray_grid((area.shape[0], area.shape[1]))[..., 1], -1, 1)))
     weights = pixel_weights(area.shape)
-    within = weights[area & (off_nadir_deg < _REACH_DEG)].sum() > 0.9 * weights[area].sum()
-    if not within:
-        return False
     if off_nadir_deg[area].min() < _NADIR_DEG:
         return True
+    if weights[area & (off_nadir_deg < _REACH_DEG)].sum() < 0.9 * weights[area].sum():
+        return False
     labels = np.where(area, 0, -1).astype(np.int64)
     return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
 

@@ -56,7 +56,8 @@ _BELOW_FOVS_DEG = (110.0, 130.0)
 _MAY_MISS, _MIN_LOW, _MIN_MEAN, _MIN_SEEN_BELOW = 2, 0.65, 0.7, 0.5
 _UNANIMOUS = 0.8
 # People stand on the ground: their heads are not much farther above the horizon than their feet are below it.
-_MAX_HEAD_TO_FEET, _HEAD_ABOVE_DEG = 0.8, 4.0
+# Those beside the camera may be taller than it, and may be seen in part.
+_MAX_HEAD_TO_FEET, _HEAD_ABOVE_DEG, _NEAR_DEG = 0.8, 4.0, -30.0
 _SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 
 
@@ -236,7 +237,7 @@ def _may_stand(area: Mask) -> bool:
     """Return whether an area can be of somebody who stands on the ground, and is not a part of a facade."""
     rows = np.flatnonzero(area.any(axis=1))
     top_deg, bottom_deg = (90 - (row + 0.5) * 180 / len(area) for row in (rows[0], rows[-1]))
-    return bool(top_deg < _HEAD_ABOVE_DEG - _MAX_HEAD_TO_FEET * bottom_deg)
+    return bool(bottom_deg < _NEAR_DEG or top_deg < _HEAD_ABOVE_DEG - _MAX_HEAD_TO_FEET * bottom_deg)
 
 
 def _present(seen: SeenPanorama, looks: list[Look]) -> bool:
