@@ -52,7 +52,7 @@ KINDS = (
     MaskKind("nadir", "cap around the nadir, straight down", (255, 150, 0)),
     MaskKind("zenith", "cap around the zenith, straight up", (255, 215, 0)),
     MaskKind("static", "moves with the camera: tripod, rig, hand", (230, 40, 40)),
-    MaskKind("other", "mask files, people, and other masking stages", (200, 0, 200)),
+    MaskKind("other", "mask files, people and what else moves, other masking stages", (200, 0, 200)),
     MaskKind("sky", "sky: has no range", (40, 120, 255)),
 )
 

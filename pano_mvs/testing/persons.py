@@ -158,8 +158,8 @@ def draw_people(
     picture: Picture,
     ranges: NDArray[np.float32],
     pose: Rigid3,
-    people: Sequence[Person],
     *,
+    people: Sequence[Person],
     shadows: bool = True,
     shadow_level: float = 0.45,
 ) -> Drawn:
@@ -179,11 +179,11 @@ def draw_people(
     colors = picture.reshape(-1, 3).astype(np.float64)
     nearest, shadow = surface.copy(), np.zeros(len(rays), np.bool_)
     if shadows:
-        shadow = _shadow(people, pose.center, rays, surface)
+        shadow = _shadow(people, pose.center, rays, surface=surface)
         colors[shadow] *= shadow_level * np.array([0.95, 1.0, 1.07])
     shown = np.zeros(len(rays), np.bool_)
     for body in people:
-        rows, distances = _traced(body, pose.center, rays, nearest)
+        rows, distances = _traced(body, pose.center, rays, limit=nearest)
         points = pose.center + distances[:, None] * rays[rows]
         colors[rows] = _shaded(body, points)
         nearest[rows] = distances
@@ -204,7 +204,7 @@ def _bounds(body: Person) -> tuple[FloatArray, float]:
 
 
 def _traced(
-    body: Person, origin: FloatArray, rays: FloatArray, limit: FloatArray
+    body: Person, origin: FloatArray, rays: FloatArray, *, limit: FloatArray
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return the rays that meet a body before a distance, and where, by sphere tracing."""
     center, radius = _bounds(body)
@@ -269,7 +269,7 @@ def _shaded(body: Person, points: FloatArray) -> FloatArray:
     return np.asarray(255 * np.clip(colors * light[:, None], 0, 1))
 
 
-def _shadow(people: Sequence[Person], origin: FloatArray, rays: FloatArray, surface: FloatArray) -> Mask:
+def _shadow(people: Sequence[Person], origin: FloatArray, rays: FloatArray, *, surface: FloatArray) -> Mask:
     """Return the rays that meet a surface which people keep from the sun."""
     shadow = np.zeros(len(rays), np.bool_)
     seen = np.flatnonzero(np.isfinite(surface))

@@ -39,7 +39,7 @@ def with_operator(outfit: str = "shirt") -> Drawn:
     """The first view, with somebody who crouches below the camera and casts a shadow."""
     picture, ranges, pose = empty_room()[0]
     operator = person("crouching", outfit, at_xz=(0.1, 0.15), ground_y=FLOOR_Y, heading=0.7)
-    return draw_people(picture, ranges, pose, [operator])
+    return draw_people(picture, ranges, pose, people=[operator])
 
 
 def range_map(ranges: NDArray[np.float32]) -> RangeMap:
@@ -129,8 +129,8 @@ def test_the_ground_is_known_below_the_camera() -> None:
 
 def test_two_other_views_are_needed() -> None:
     drawn = with_operator()
-    settings = {"valid": np.ones(SIZE_HW, np.bool_)}
-    found = moving_pixels(drawn.picture, range_map(drawn.ranges), others()[:1], **settings)
+    valid = np.ones(SIZE_HW, np.bool_)
+    found = moving_pixels(drawn.picture, range_map(drawn.ranges), others()[:1], valid=valid)
     assert not found.pixels.any()
 
 

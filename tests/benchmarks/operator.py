@@ -56,7 +56,7 @@ class Populated:
     @property
     def everybody(self) -> Mask:
         """All pixels of people and their shadows."""
-        return np.logical_or.reduce(list(self.shown.values()))
+        return np.asarray(np.logical_or.reduce(list(self.shown.values())))
 
 
 def synthetic_views(ground: str, *, views: int, seed: int) -> tuple[list[View], float]:
@@ -76,7 +76,7 @@ def captured_views(folder: Path, *, views: int) -> tuple[list[View], float]:
     down = ray_grid(SIZE_HW)[..., 1] > 0.9
     found, heights = [], []
     for idx, file in enumerate(sorted((folder / "rgb").glob("*.png"))[:views]):
-        picture = cv2.resize(cv2.imread(str(file))[..., ::-1], SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(_read(file), SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
         full = stored[file.stem]
         step = full.shape[0] // SIZE_HW[0]
         ranges = full[step // 2 :: step, step // 2 :: step].astype(np.float32)
@@ -101,7 +101,7 @@ def populated(views: Sequence[View], ground_y: float, *, seed: int) -> list[Popu
         shown: dict[str, Mask] = {}
         now, depth = picture, ranges
         for name, body in crew:
-            drawn = draw_people(now, depth, pose, [body])
+            drawn = draw_people(now, depth, pose, people=[body])
             shown = {other: pixels & ~drawn.people for other, pixels in shown.items()}
             now, depth = drawn.picture, drawn.ranges
             shown |= {name: drawn.people}
@@ -137,7 +137,7 @@ def measured(views: Sequence[Populated]) -> Iterator[tuple[Populated, Mask, Mask
 def marked(file: Path, images: Path) -> None:
     """Print what masks.static and masks.operator mask of hand-marked areas."""
     marks = json.loads(file.read_text(encoding="utf-8"))
-    pictures = [cv2.imread(str(images / name))[..., ::-1] for name in marks["polygons"]]
+    pictures = [_read(images / name) for name in marks["polygons"]]
     small = [np.ascontiguousarray(cv2.resize(p, SIZE_HW[::-1], interpolation=cv2.INTER_AREA)) for p in pictures]
     static = static_content(small).pixels
     for (name, polygons), picture in zip(marks["polygons"].items(), pictures, strict=True):
@@ -182,12 +182,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{place:12} elsewhere at most: operator {worst[0]:.2%}, moving {worst[1]:.2%}; "
             f"CPU s: {median[2]:.2f}, {median[3]:.2f}"
         )
-    for kind, shares in sorted(by_kind.items()):
-        mean, least = np.mean(shares, axis=0), np.min(shares, axis=0)
+    for kind, found in sorted(by_kind.items()):
+        mean, least = np.mean(found, axis=0), np.min(found, axis=0)
         print(
-            f"{kind:12} {len(shares):3}  operator {mean[0]:6.1%} (least {least[0]:6.1%})  moving {mean[1]:6.1%} "
+            f"{kind:12} {len(found):3}  operator {mean[0]:6.1%} (least {least[0]:6.1%})  moving {mean[1]:6.1%} "
             f"({least[1]:6.1%})  both {mean[2]:6.1%} ({least[2]:6.1%})"
         )
+
+
+def _read(file: Path) -> Picture:
+    picture = cv2.imread(str(file))
+    assert picture is not None, file
+    return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
 def _somebody(

@@ -35,7 +35,7 @@ class Capture:
             picture, ranges = render(room, pose, SIZE_HW, supersample=1)
             if name == "a.png":
                 operator = person("crouching", "black", at_xz=(0.1, 0.15), ground_y=1.3, heading=0.7)
-                drawn = draw_people(picture, ranges, pose, [operator], shadows=False)
+                drawn = draw_people(picture, ranges, pose, people=[operator], shadows=False)
                 picture, self.people = drawn.picture, drawn.people
             write_png(folder / name, picture)
             self.images[name] = Panorama(FilePart(folder / name), size_hw=SIZE_HW, source_size_hw=SIZE_HW)

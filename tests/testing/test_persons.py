@@ -23,7 +23,9 @@ def blank_view(center: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("pose", POSES)
 def test_another_view_shows_the_same_person(pose: str) -> None:
     somebody = person(pose, "jacket", at_xz=(0.6, 0.8), ground_y=GROUND_Y, heading=0.3)
-    first, second = (draw_people(*blank_view(center), [somebody]) for center in ((0.0, 0.0, 0.0), (1.5, 0.1, 1.2)))
+    first, second = (
+        draw_people(*blank_view(center), people=[somebody]) for center in ((0.0, 0.0, 0.0), (1.5, 0.1, 1.2))
+    )
     assert first.people.sum() > 40
     points = (ray_grid(SIZE_HW) * first.ranges[..., None])[first.people] - (1.5, 0.1, 1.2)
     distances = np.linalg.norm(points, axis=1)
@@ -37,7 +39,7 @@ def test_another_view_shows_the_same_person(pose: str) -> None:
 def test_people_are_hidden_by_what_is_nearer() -> None:
     picture, ranges, pose = blank_view((0.0, 0.0, 0.0))
     somebody = person("standing", "shirt", at_xz=(0.0, 3.0), ground_y=GROUND_Y, heading=0.0)
-    drawn = draw_people(picture, np.full_like(ranges, 1.0), pose, [somebody], shadows=False)
+    drawn = draw_people(picture, np.full_like(ranges, 1.0), pose, people=[somebody], shadows=False)
     assert not drawn.people.any()
     np.testing.assert_array_equal(drawn.picture, picture)
 
@@ -45,18 +47,18 @@ def test_people_are_hidden_by_what_is_nearer() -> None:
 def test_shadows_lie_on_the_ground() -> None:
     picture, ranges, pose = blank_view((0.0, 0.0, 0.0))
     somebody = person("crouching", "black", at_xz=(0.5, 0.0), ground_y=GROUND_Y, heading=0.0)
-    drawn = draw_people(picture, ranges, pose, [somebody])
+    drawn = draw_people(picture, ranges, pose, people=[somebody])
     assert drawn.shadow.sum() > 20
     assert not (drawn.shadow & drawn.people).any()
     assert (drawn.picture[drawn.shadow] < 70).all()
     np.testing.assert_array_equal(drawn.ranges[drawn.shadow], ranges[drawn.shadow])
-    assert not draw_people(picture, ranges, pose, [somebody], shadows=False).shadow.any()
+    assert not draw_people(picture, ranges, pose, people=[somebody], shadows=False).shadow.any()
 
 
 def test_outfits_differ() -> None:
     view = blank_view((0.0, 0.0, 0.0))
     colors = set()
     for outfit in OUTFITS:
-        drawn = draw_people(*view, [person("bent", outfit, at_xz=(0.1, 0.1), ground_y=GROUND_Y, heading=1.0)])
+        drawn = draw_people(*view, people=[person("bent", outfit, at_xz=(0.1, 0.1), ground_y=GROUND_Y, heading=1.0)])
         colors.add(tuple(np.rint(drawn.picture[drawn.people].mean(axis=0) / 8)))
     assert len(colors) == len(OUTFITS)
