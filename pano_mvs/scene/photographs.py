@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.scene.record import Axis, Record, require, require_array
+from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require, require_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,12 @@ class Photographs(Record):
         translations: (N, 3) float64 of cam_from_world, scene units.
         inliers: (N,) int32 number of key points that agree with the pose.
         errors_px: (N,) float32 median reprojection error of the inliers.
+        pictures: (N) the files.
         rejected: name of every photograph that could not be localised, with the reason.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
+    kind_version: ClassVar[int] = 2  # since the pictures are part of it
 
     names: tuple[str, ...]
     sizes_hw: NDArray[np.int32]
@@ -41,6 +43,7 @@ class Photographs(Record):
     translations: NDArray[np.float64]
     inliers: NDArray[np.int32]
     errors_px: NDArray[np.float32]
+    pictures: tuple[FilePart, ...] = ()
     rejected: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -57,7 +60,23 @@ class Photographs(Record):
         require_array(self, "translations", dtype=np.float64, shape=(count, 3))
         require_array(self, "inliers", dtype=np.int32, shape=(count,))
         require_array(self, "errors_px", dtype=np.float32, shape=(count,))
+        require(len(self.pictures) == count, self, f"{count} photographs need as many files")
         require(bool((self.focals_px > 0).all()), self, "focal lengths must be positive")
+
+    def to_parts(self) -> Parts:
+        """Return the record as arrays and JSON, and the files under their positions."""
+        parts = dict(super().to_parts())
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        parts["meta"] = {name: value for name, value in meta.items() if name != "pictures"}
+        return parts | {f"picture_{idx}": picture for idx, picture in enumerate(self.pictures)}
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the record that `to_parts` gave."""
+        files = {name: part for name, part in parts.items() if isinstance(part, FilePart)}
+        bare = super().from_parts({name: part for name, part in parts.items() if name not in files})
+        return replace(bare, pictures=tuple(files[f"picture_{idx}"] for idx in range(len(files))))
 
     def cam_from_world(self, idx: int) -> Rigid3:
         """Return the pose of a photograph."""

@@ -26,7 +26,7 @@ from pano_mvs.stages.filters import (
     speckle,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.fusion import scale_cloud, vote
+from pano_mvs.stages.fusion import photographs, scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
@@ -79,6 +79,7 @@ __all__ = [
     "operator",
     "orb_tangent",
     "patchmatch",
+    "photographs",
     "planes",
     "ply",
     "position",

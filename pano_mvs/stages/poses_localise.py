@@ -18,6 +18,8 @@ from pano_mvs.algorithms.poses.colmap.localise import (
     known_points,
     localise_photograph,
 )
+from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
+from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
 from pano_mvs.api import (
     All,
     Context,
@@ -25,6 +27,7 @@ from pano_mvs.api import (
     InputError,
     InputPath,
     One,
+    Panorama,
     Params,
     Poses,
     RangeMap,
@@ -57,7 +60,12 @@ class LocaliseParams(Params):
 
 @stage("poses.localise", memory=localise_memory_bytes)
 def localise(
-    poses: One[Poses], features: All[Features], ranges: All[RangeMap], params: LocaliseParams, ctx: Context
+    poses: One[Poses],
+    features: All[Features],
+    ranges: All[RangeMap],
+    images: All[Panorama],
+    params: LocaliseParams,
+    ctx: Context,
 ) -> Photographs:
     """Find where ordinary photographs were taken, and their focal lengths, by the panoramas and their ranges.
 
@@ -65,13 +73,14 @@ def localise(
     cannot be localised reliably are left out, each with a reason. Only the largest group of poses is used.
     """
     group = split_groups(poses)[0]
-    known = {
-        name: known_points(
-            features[name], group.cam_from_world(idx), ranges[name], min_confidence=params.min_confidence
-        )
-        for idx, name in enumerate(group.names)
-        if name in features and name in ranges and has_sift(features[name])
-    }
+    known: dict[str, KnownPoints] = {}
+    surfaces: dict[str, SurfacePoints] = {}
+    for idx, name in enumerate(group.names):
+        if name in features and name in ranges and name in images and has_sift(features[name]):
+            given = features[name], group.cam_from_world(idx), ranges[name]
+            known[name] = known_points(*given, min_confidence=params.min_confidence)
+            surfaces[name] = surface_points(*given, min_confidence=params.min_confidence)
+    patches = PanoramaPatches(surfaces, lambda name: images[name].load())
     if not known:
         ctx.note("no panorama has both a range map and SIFT key points (features.sift_tangent)")
     folder, paths = _photographs(params.path)
@@ -80,7 +89,7 @@ def localise(
     for path in paths:
         name = path.relative_to(folder).as_posix()
         try:
-            size_hw, result = _localised(path, known, params=params, ctx=ctx)
+            size_hw, result = _localised(path, known, patches, params=params, ctx=ctx)
         except InputError as error:
             result = str(error)
         if isinstance(result, Localised):
@@ -90,11 +99,11 @@ def localise(
             ctx.note(f"{name} was not localised: {result}")
     ctx.note(f"{len(found)} of {len(paths)} photographs were localised")
     ctx.metric("localised", len(found) / max(1, len(paths)))
-    return _record(found, rejected)
+    return _record(found, rejected, {path.relative_to(folder).as_posix(): path for path in paths}, ctx=ctx)
 
 
 def _localised(
-    path: Path, known: dict[str, KnownPoints], *, params: LocaliseParams, ctx: Context
+    path: Path, known: dict[str, KnownPoints], patches: PanoramaPatches, *, params: LocaliseParams, ctx: Context
 ) -> tuple[tuple[int, int], Localised | str]:
     data = FilePart(path).read_bytes()
     picture = decode_image(path, data)
@@ -104,6 +113,7 @@ def _localised(
         size_hw,
         known,
         focal_px=focal_from_exif(read_container(data).exif, size_hw),
+        patches=PhotographPatches(picture, patches),
         **arguments_from(localise_photograph, params),
         rng=ctx.rng,
     )
@@ -116,7 +126,20 @@ def _photographs(path: Path) -> tuple[Path, list[Path]]:
     return path.parent, list_pictures(path)
 
 
-def _record(found: dict[str, tuple[tuple[int, int], Localised]], rejected: dict[str, str]) -> Photographs:
+def _copied(path: Path, number: int, ctx: Context) -> FilePart:
+    """Return a copy of a file, which the store takes over."""
+    copy = ctx.scratch / f"photograph_{number}{path.suffix.lower()}"
+    copy.write_bytes(FilePart(path).read_bytes())
+    return FilePart(copy)
+
+
+def _record(
+    found: dict[str, tuple[tuple[int, int], Localised]],
+    rejected: dict[str, str],
+    paths: dict[str, Path],
+    *,
+    ctx: Context,
+) -> Photographs:
     def each(values: Iterable[object], dtype: type[np.generic], *shape: int) -> NDArray[Any]:
         return np.array(list(values), dtype).reshape(len(found), *shape)
 
@@ -130,5 +153,6 @@ def _record(found: dict[str, tuple[tuple[int, int], Localised]], rejected: dict[
         translations=each((result.cam_from_world.translation for result in results), np.float64, 3),
         inliers=each((result.inliers for result in results), np.int32),
         errors_px=each((result.error_px for result in results), np.float32),
+        pictures=tuple(_copied(paths[name], number, ctx) for number, name in enumerate(found)),
         rejected=rejected,
     )

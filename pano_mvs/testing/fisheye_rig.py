@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec
 from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.testing.room import Room, color_along
+from pano_mvs.testing.room import Room, colors_along
 
 Layout = Literal["side_by_side", "folders", "suffixes"]
 
@@ -66,7 +66,7 @@ def render_lens(room: Room, lens: FisheyeLens, lens_from_world: Rigid3, *, super
             rays = lens.ray_from_pixel(pixels)
             seen = np.isfinite(rays).all(axis=1)
             in_world = rays[seen] @ lens_from_world.rotation
-            colors[seen] += color_along(room, lens_from_world.center, in_world, pixel_rad=pixel_rad)
+            colors[seen] += colors_along(room, lens_from_world.center, in_world, pixel_rad=pixel_rad)
     picture: NDArray[np.uint8] = np.rint(colors * (255 / supersample**2)).astype(np.uint8)
     return picture.reshape(height, width, 3)
 

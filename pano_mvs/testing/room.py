@@ -111,8 +111,15 @@ def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArr
     return _first_hit(room, origin_in_world, rays_in_world)[0]
 
 
-def color_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray, *, pixel_rad: float) -> FloatArray:
-    """Return the colours (N, 3) in [0, 1] that a point (3,) sees along unit rays (N, 3), for pixels of that width."""
+def colors_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray, *, pixel_rad: float) -> FloatArray:
+    """Return the colours (N, 3) in [0, 1] that a camera at a point (3,) sees along unit rays (N, 3).
+
+    Args:
+        room: the room.
+        origin_in_world: centre of the camera.
+        rays_in_world: directions.
+        pixel_rad: width of a pixel in radians, over which fine texture fades.
+    """
     colors = np.zeros_like(rays_in_world)
     for start in range(0, len(rays_in_world), _RAYS_AT_ONCE):
         block = slice(start, start + _RAYS_AT_ONCE)

@@ -268,6 +268,9 @@ class TinyCapture:
     def _photographs(self) -> Photographs:
         """Return a photograph that was taken from the place of the first image."""
         pose = self.poses[0]
+        picture = self.folder / "phone1.png"
+        if not exists(picture):
+            write_png(picture, np.random.default_rng(11).integers(0, 256, (30, 40, 3), np.uint8))
         return frozen(
             Photographs(
                 names=("phone/1.jpg",),
@@ -278,6 +281,7 @@ class TinyCapture:
                 translations=pose.translation[None].copy(),
                 inliers=np.array([50], np.int32),
                 errors_px=np.array([0.5], np.float32),
+                pictures=(FilePart(picture),),
             )
         )
 

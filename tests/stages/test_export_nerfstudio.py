@@ -68,7 +68,7 @@ def exported(
     scratch.mkdir()
     poses = capture.whole(Poses)
     seeds = NerfstudioParams(seed_points=seed_points, frame=frame)
-    files = nerfstudio(frames, poses, cloud, seeds, Context(np.random.default_rng(0), scratch))
+    files = nerfstudio(frames, poses, cloud, None, seeds, Context(np.random.default_rng(0), scratch))
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
 
@@ -305,14 +305,14 @@ def test_panoramas_without_frames_are_told_and_none_at_all_is_refused(tmp_path: 
     params = NerfstudioFramesParams.model_validate({"variants": ("faces",), "size_px": 32})
     made = nerfstudio_frames(capture.images["002.png"], None, params, Context(np.random.default_rng(0), tmp_path / "a"))
     ctx = Context(np.random.default_rng(0), tmp_path)
-    files = nerfstudio({"002.png": made}, poses, None, NerfstudioParams(seed_points=0), ctx).files
+    files = nerfstudio({"002.png": made}, poses, None, None, NerfstudioParams(seed_points=0), ctx).files
     assert set(files) == {"nerfstudio/faces/transforms.json"}
     document = json.loads(files["nerfstudio/faces/transforms.json"].read_text())
     assert "ply_file_path" not in document
     assert not any("depth_file_path" in frame for frame in document["frames"])
     assert ctx.notes == ["3 of 4 registered panoramas have no ranges and are not in transforms.json"]
     with pytest.raises(InputError, match="no panorama has both a pose and frames"):
-        nerfstudio({}, poses, None, NerfstudioParams(), ctx)
+        nerfstudio({}, poses, None, None, NerfstudioParams(), ctx)
 
 
 def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:

@@ -296,7 +296,9 @@ def test_each_room_of_a_splat_bundle_has_its_own_model(rooms: Rooms, ctx: Contex
 def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
     frames = {name: NerfstudioFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
     cloud = _fused(rooms)
-    files = nerfstudio(frames=frames, poses=rooms.poses, cloud=cloud, params=NerfstudioParams(), ctx=ctx)
+    files = nerfstudio(
+        frames=frames, poses=rooms.poses, cloud=cloud, photographs=None, params=NerfstudioParams(), ctx=ctx
+    )
     out = _placed(files, tmp_path) / "nerfstudio" / "equirectangular"
     for number, (names, suffix) in enumerate(((_LARGE, ""), (tuple(_SMALL), "_1"))):
         document = json.loads((out / f"transforms{suffix}.json").read_text())

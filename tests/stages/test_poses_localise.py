@@ -13,7 +13,7 @@ from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
-from pano_mvs.scene import Features, Poses, RangeMap
+from pano_mvs.scene import Features, FilePart, Panorama, Poses, RangeMap
 from pano_mvs.stages.poses_localise import LocaliseParams, localise
 from pano_mvs.testing.room import default_room, render
 
@@ -22,19 +22,22 @@ CENTERS = {"a.png": (0.0, 0.0, 0.0), "b.png": (0.5, 0.1, 0.2), "unswept.png": (-
 TURN = rotation_from_rotvec(np.array([0.1, 0.6, -0.1]))
 PHOTO_HW, FOCAL_PX = (240, 320), 250.0
 
-Inputs = tuple[Poses, dict[str, Features], dict[str, RangeMap]]
+Inputs = tuple[Poses, dict[str, Features], dict[str, RangeMap], dict[str, Panorama]]
 
 
 @pytest.fixture(scope="module")
-def capture() -> Inputs:
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    pictures = tmp_path_factory.mktemp("panoramas")
     poses = {name: Rigid3.from_center(np.eye(3), np.array(center)) for name, center in CENTERS.items()}
-    features, ranges = {}, {}
+    features, ranges, images = {}, {}, {}
     for name, pose in poses.items():
         picture, true = render(default_room(), pose, SIZE_HW, supersample=2)
+        Image.fromarray(picture).save(pictures / name)
+        images[name] = Panorama(FilePart(pictures / name), SIZE_HW, SIZE_HW)
         features[name] = extract_sift(picture, np.ones(SIZE_HW, np.bool_))
         if name != "unswept.png":
             ranges[name] = RangeMap(true.astype(np.float32), np.full(SIZE_HW, 255, np.uint8))
-    return Poses.without_points(poses, frame="test", scale="metres", metric=True), features, ranges
+    return Poses.without_points(poses, frame="test", scale="metres", metric=True), features, ranges, images
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +57,11 @@ def test_a_folder_is_localised_and_the_rest_is_named(capture: Inputs, folder: Pa
     found = localise(*capture, LocaliseParams(path=folder), ctx)
     found.check()
     assert found.names == ("phone/2.png",), found.rejected
-    assert np.degrees(geodesic_angle(found.cam_from_world(0).rotation, TURN)) < 1.0
-    assert np.linalg.norm(found.cam_from_world(0).center - [0.2, 0.1, 0.1]) < 0.12
-    assert found.focals_px[0] == pytest.approx(FOCAL_PX, rel=0.05)
+    assert np.degrees(geodesic_angle(found.cam_from_world(0).rotation, TURN)) < 0.2
+    assert np.linalg.norm(found.cam_from_world(0).center - [0.2, 0.1, 0.1]) < 0.04
+    assert found.focals_px[0] == pytest.approx(FOCAL_PX, rel=0.01)
     assert found.sizes_hw.tolist() == [list(PHOTO_HW)]
+    assert found.pictures[0].read_bytes() == (folder / "2.png").read_bytes()
     assert found.rejected.keys() == {"phone/10.jpg", "phone/broken.jpg"}
     assert "only 0 of its 0 key points" in found.rejected["phone/10.jpg"]
     assert "not an image" in found.rejected["phone/broken.jpg"]

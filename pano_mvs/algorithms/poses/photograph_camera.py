@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,38 @@ _STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
 _RADIAL_STD = 0.1
 # Errors beyond this many times the median of the inliers' count less and less (Cauchy's loss).
 _ROBUST = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Where a photograph shows points.
+
+    Attributes:
+        pixels_px: (N, 2) float64.
+        points_in_world: (N, 3) float64.
+        whitening: (N, 2, 2) matrices W that turn errors in pixels into independent ones with a deviation of 1.
+        tested: number of points that could have been seen.
+    """
+
+    pixels_px: FloatArray
+    points_in_world: FloatArray
+    whitening: FloatArray
+    tested: int
+
+    @staticmethod
+    def joined(parts: Sequence[Sightings]) -> Sightings:
+        """Return the sightings of several panoramas."""
+        return Sightings(
+            np.concatenate([np.zeros((0, 2)), *(part.pixels_px for part in parts)]),
+            np.concatenate([np.zeros((0, 3)), *(part.points_in_world for part in parts)]),
+            np.concatenate([np.zeros((0, 2, 2)), *(part.whitening for part in parts)]),
+            sum(part.tested for part in parts),
+        )
+
+    def errors(self, camera: PhotographCamera, size_hw: tuple[int, int]) -> FloatArray:
+        """Return the errors (N, 2) of a camera in standard deviations."""
+        away = camera.project(self.points_in_world, size_hw)[0] - self.pixels_px
+        return np.asarray(np.einsum("nij,nj->ni", self.whitening, away))
 
 
 class FocalPrior(NamedTuple):
@@ -46,11 +79,17 @@ class PhotographCamera:
     focal_px: float
     radial: float
 
+    def fov_deg(self, size_hw: tuple[int, int]) -> float:
+        """Return the angle that the longer side of a photograph covers, without the distortion."""
+        return float(np.degrees(2 * np.arctan(max(size_hw) / 2 / self.focal_px)))
+
     def project(self, points_in_world: FloatArray, size_hw: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the pixels (N, 2) of points (N, 3), and which of them are before the camera, (N,)."""
         in_cam = self.cam_from_world.apply(points_in_world)
         before = in_cam[:, 2] > 1e-9
         plane = in_cam[:, :2] / np.where(before, in_cam[:, 2], 1.0)[:, None]
+        if self.radial < 0:  # beyond this radius, the distortion folds back into the picture
+            before &= (plane**2).sum(axis=1) < -1 / (3 * self.radial)
         distorted = (1 + self.radial * (plane**2).sum(axis=1, keepdims=True)) * plane
         return self.focal_px * distorted + np.array(size_hw[::-1]) / 2, before
 
@@ -92,6 +131,33 @@ def refine_camera(
             pixels_px[inliers], points_in_world[inliers], camera, size_hw=size_hw, prior=prior, scale_px=scale_px
         )
     return camera
+
+
+def refine_by_sightings(
+    camera: PhotographCamera, sightings: Sightings, *, size_hw: tuple[int, int], prior: FocalPrior
+) -> PhotographCamera:
+    """Return the camera that minimises the robust errors of sightings, each in units of its standard deviation.
+
+    A sighting is less certain along the direction in which an error of the point's range moves it, so that points of
+    distant panoramas count mainly by their epipolar lines.
+
+    Args:
+        camera: the camera to start from.
+        sightings: where the photograph shows points.
+        size_hw: (height, width) of the photograph.
+        prior: what is known about the focal length.
+    """
+    from scipy.optimize import least_squares
+
+    def residuals(change: FloatArray) -> FloatArray:
+        moved = _moved(camera, change)
+        errors = sightings.errors(moved, size_hw) / scale
+        squared = (errors**2).sum(axis=1, keepdims=True) + 1e-12
+        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
+        return np.concatenate([(errors * np.sqrt(np.log1p(squared) / squared)).ravel(), own])
+
+    scale = max(1.0, _ROBUST * float(np.median(np.linalg.norm(sightings.errors(camera, size_hw), axis=1))))
+    return _moved(camera, least_squares(residuals, np.zeros(8), x_scale=_STEPS).x)
 
 
 def _adjusted(

@@ -29,6 +29,7 @@ class NerfstudioFrame:
         frame_from_cam: rotation from the panorama's camera frame (y down, z forward), as three rows.
         normal: path of the normals; empty without any.
         confidence: path of the confidence; empty without one.
+        radial: coefficient k1 of the lens's distortion; only photographs have one.
     """
 
     variant: Variant
@@ -40,10 +41,11 @@ class NerfstudioFrame:
     frame_from_cam: tuple[tuple[float, ...], ...]
     normal: str = ""
     confidence: str = ""
+    radial: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """Return the frame as a JSON object, without the paths of layers that nerfstudio does not read if empty."""
-        optional = ("normal", "confidence")
+        optional = ("normal", "confidence", "radial")
         return {key: value for key, value in asdict(self).items() if value or key not in optional}
 
     def cam_from_world(self, panorama_from_world: Rigid3) -> Rigid3:

@@ -26,6 +26,7 @@ from pano_mvs.scene.image_files.header import PNG_START
 from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
 CAMERA_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
+_DISTORTED = "OPENCV"
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
 _OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
 _PNG_RGB_8_BIT = bytes([8, 2])
@@ -65,7 +66,8 @@ def transforms_document(
     else:
         common = {}
         listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
-    document = {"camera_model": CAMERA_MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    model = _DISTORTED if any(frame.radial for _, _, frame in frames) else CAMERA_MODELS[variant]
+    document = {"camera_model": model, **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
     if with_depth:
         document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
     return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}
@@ -120,4 +122,4 @@ def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
         "fl_y": frame.focal_xy[1],
         "cx": width / 2,
         "cy": height / 2,
-    }
+    } | ({"k1": frame.radial} if frame.radial else {})

@@ -38,6 +38,7 @@ from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, Varia
 from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, transforms_document
 from pano_mvs.io.ranges.files import write_confidence_png, write_normals_png, write_range_png
 from pano_mvs.scene.files import group_file
+from pano_mvs.scene.photographs import Photographs
 
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MUCH = 0.01
@@ -286,6 +287,64 @@ def write_transforms(
         files |= _open_masks([frame for _, frame in listed], folder, scratch)
         ctx.metric(variant, ctx.metrics.get(variant, 0) + len(listed))
     return files
+
+
+def write_photographs(
+    root: str,
+    group: PosedGroup,
+    photographs: Photographs,
+    *,
+    seed: bool,
+    ctx: Context,
+    file_from_world: NDArray[np.float64] | None = None,
+) -> dict[str, Path]:
+    """Write transforms_photographs.json, which lists photographs after the faces, and the photographs themselves.
+
+    Photographs have no depths, so the list has none: a list has depths of all frames or of none.
+
+    Args:
+        root: folder of the variants in the output folder.
+        group: poses and frames of the panoramas in whose world the photographs are.
+        photographs: the photographs; their files are copied unchanged.
+        seed: whether there are initial points.
+        ctx: of the stage.
+        file_from_world: as in `write_transforms`.
+    """
+    faces = group.listed().get("faces", [])
+    if not faces or not len(photographs):
+        return {}
+    frames = [(name, group.poses.cameras[name], frame) for name, frame in faces]
+    folder = f"{root}/faces"
+    files: dict[str, Path] = {}
+    for idx, name in enumerate(photographs.names):
+        height, width = photographs.sizes_hw[idx].tolist()
+        focal = float(photographs.focals_px[idx])
+        frame = NerfstudioFrame(
+            "faces",
+            f"images/{name}",
+            "",
+            "",
+            (width, height),
+            (focal, focal),
+            _NO_TURN,
+            radial=float(photographs.radials[idx]),
+        )
+        frames.append((name, photographs.cam_from_world(idx), frame))
+        files[f"{folder}/images/{name}"] = photographs.pictures[idx].path
+    document = transforms_document(
+        "faces",
+        frames,
+        depth_unit=group.depth_unit,
+        about={"world_frame": group.poses.frame}
+        | ({} if file_from_world is None else {"file_from_world": file_from_world.tolist()}),
+        file_from_world=file_from_world,
+        seed="seed.ply" if seed else "",
+    )
+    scratch = ctx.scratch / "photographs"
+    scratch.mkdir()
+    files[f"{folder}/transforms_photographs.json"] = scratch / "transforms.json"
+    (scratch / "transforms.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    return files | _open_masks([frame for _, _, frame in frames], folder, scratch)
 
 
 def _write_seed(

@@ -23,6 +23,7 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.stages.exports.axes import FrameParams, files_from_world
 from pano_mvs.stages.exports.frame_files import (
@@ -32,6 +33,7 @@ from pano_mvs.stages.exports.frame_files import (
     PosedGroup,
     SeedParams,
     frames_with_poses,
+    write_photographs,
     write_transforms,
 )
 
@@ -77,6 +79,7 @@ def nerfstudio(
     frames: All[NerfstudioFrames],
     poses: One[Poses],
     cloud: One[PointCloud] | None,
+    photographs: One[Photographs] | None,
     params: NerfstudioParams,
     ctx: Context,
 ) -> Files:
@@ -84,7 +87,8 @@ def nerfstudio(
 
     Cameras and points are turned so that z points up; `file_from_world` states the rotation from the world of the poses
     and of COLMAP models. Without a cloud, the sparse points of the poses are used. A file has one frame: further groups
-    of poses are transforms_1.json with seed_1.ply, transforms_2.json …
+    of poses are transforms_1.json with seed_1.ply, transforms_2.json … Photographs that poses.localise has placed are
+    listed after the faces in faces/transforms_photographs.json, each with its own focal length and distortion.
     """
     loaded = frames_with_poses(poses, frames, ctx)
     files: dict[str, Path] = {}
@@ -97,6 +101,9 @@ def nerfstudio(
             (turn,) = files_from_world(params, group, groups=1)
             posed = PosedGroup(number, group, own)
             files |= write_transforms(_ROOT, posed, given, params=params, ctx=ctx, file_from_world=turn)
+            if photographs is not None and number == 0:
+                seed = f"{_ROOT}/faces/seed.ply" in files
+                files |= write_photographs(_ROOT, posed, photographs, seed=seed, ctx=ctx, file_from_world=turn)
     if len(groups) > 1:
         ctx.note(
             f"the poses are in {len(groups)} groups, each in its own frame: transforms.json lists the largest group, "

@@ -19,8 +19,11 @@ from pano_mvs.algorithms.poses.colmap.localise import (
     known_points,
     localise_photograph,
 )
+from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
+from pano_mvs.algorithms.poses.photograph_surface import surface_points
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
+from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, render
 
 SIZE_HW = (256, 512)
@@ -30,16 +33,28 @@ PHOTO_HW, FOCAL_PX = (360, 480), 380.0
 Picture = NDArray[np.uint8]
 
 
+Model = tuple[dict[str, KnownPoints], PanoramaPatches]
+
+
 @pytest.fixture(scope="module")
-def panoramas() -> dict[str, KnownPoints]:
-    known = {}
+def model() -> Model:
+    """The panoramas' key points, and their patches."""
+    known, surfaces, pictures = {}, {}, {}
     for number, center in enumerate(CENTERS):
         pose = Rigid3.from_center(np.eye(3), np.array(center))
         picture, ranges = render(default_room(), pose, SIZE_HW, supersample=1)
         features = extract_sift(picture, np.ones(SIZE_HW, np.bool_))
         range_map = RangeMap(ranges.astype(np.float32), np.full(SIZE_HW, 255, np.uint8))
-        known[f"{number}.png"] = known_points(features, pose, range_map, min_confidence=128)
-    return known
+        name = f"{number}.png"
+        known[name] = known_points(features, pose, range_map, min_confidence=128)
+        surfaces[name] = surface_points(features, pose, range_map, min_confidence=128)
+        pictures[name] = picture
+    return known, PanoramaPatches(surfaces, pictures.__getitem__)
+
+
+@pytest.fixture(scope="module")
+def panoramas(model: Model) -> dict[str, KnownPoints]:
+    return model[0]
 
 
 def photograph(rotvec: tuple[float, float, float], center: tuple[float, float, float]) -> tuple[Picture, Rigid3]:
@@ -51,11 +66,22 @@ def photograph(rotvec: tuple[float, float, float], center: tuple[float, float, f
 
 
 def localised(
-    picture: Picture, panoramas: Mapping[str, KnownPoints], *, focal_px: float | None = None
+    picture: Picture,
+    panoramas: Mapping[str, KnownPoints],
+    *,
+    focal_px: float | None = None,
+    patches: PanoramaPatches | None = None,
+    max_keypoints: int = 6000,
 ) -> Localised | str:
     size_hw = (picture.shape[0], picture.shape[1])
-    keypoints = photograph_keypoints(picture)
-    return localise_photograph(keypoints, size_hw, panoramas, focal_px=focal_px, rng=np.random.default_rng(0))
+    return localise_photograph(
+        photograph_keypoints(picture, max_keypoints=max_keypoints),
+        size_hw,
+        panoramas,
+        focal_px=focal_px,
+        patches=None if patches is None else PhotographPatches(picture, patches),
+        rng=np.random.default_rng(0),
+    )
 
 
 @pytest.fixture(scope="module", params=[((0.1, 0.6, -0.2), (0.2, 0.1, 0.1)), ((-0.2, 2.8, 0.1), (-0.1, 0.2, 0.4))])
@@ -77,6 +103,35 @@ def test_a_photograph_is_localised(
     assert abs(found.radial) < 0.02
     assert found.inliers > 60
     assert 0 < found.error_px < 2
+
+
+@pytest.mark.parametrize("focal_px", [None, 1.05 * FOCAL_PX])
+def test_patches_refine_the_camera(model: Model, focal_px: float | None) -> None:
+    """A sharp picture with distortion, as a phone takes it: a fifth of the error that key points alone may have."""
+    pose = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))
+    picture = render_photograph(default_room(), pose, PHOTO_HW, focal_px=FOCAL_PX, radial=-0.05, supersample=1)
+    found = localised(picture, model[0], focal_px=focal_px, patches=model[1])
+    assert isinstance(found, Localised), found
+    assert np.degrees(geodesic_angle(found.cam_from_world.rotation, pose.rotation)) < 0.05
+    assert np.linalg.norm(found.cam_from_world.center - pose.center) < 0.006
+    assert found.focal_px == pytest.approx(FOCAL_PX, rel=0.003)
+    assert found.radial == pytest.approx(-0.05, abs=0.01)
+
+
+def test_patches_confirm_a_pose_of_few_key_points(model: Model, taken: tuple[Picture, Rigid3]) -> None:
+    picture, pose = taken
+    refused = localised(picture, model[0], focal_px=FOCAL_PX, max_keypoints=60)
+    found = localised(picture, model[0], focal_px=FOCAL_PX, max_keypoints=60, patches=model[1])
+    assert isinstance(refused, str)
+    assert isinstance(found, Localised), found
+    assert np.degrees(geodesic_angle(found.cam_from_world.rotation, pose.rotation)) < 0.1
+
+
+@pytest.mark.slow
+def test_patches_do_not_confirm_another_room(model: Model) -> None:
+    pose = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))
+    picture = render_photograph(default_room(5), pose, PHOTO_HW, focal_px=FOCAL_PX, supersample=1)
+    assert isinstance(localised(picture, model[0], focal_px=FOCAL_PX, patches=model[1]), str)
 
 
 def test_distortion_is_found(panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]) -> None:

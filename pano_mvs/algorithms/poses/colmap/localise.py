@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
+from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pixel_from_ray
+from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_from_ray
 from pano_mvs.scene import Features, RangeMap
 
 FloatArray = NDArray[np.float64]
@@ -33,6 +34,13 @@ _GUIDED_ROUNDS, _GUIDED, _GUIDED_RATIO, _MAX_DISTANCE = 2, 2.0, 0.9, 300.0
 _MIN_INLIER_SHARE = 0.15
 # The inliers must spread over the picture: the standard deviation of their pixels, as a share of its diagonal.
 _MIN_SPREAD = 0.05
+# A pose that fewer key points suggest is accepted if the patches of the panoramas confirm it: this many, and this share
+# of those that the photograph could show.
+_FEW, _SINGLE_PANORAMAS, _LOOSE_RATIO = 8, 5, 0.9
+_MIN_CONFIRMED, _MIN_CONFIRMED_SHARE = 60, 0.3
+_ALIGNED_PANORAMAS = 8
+# Patches refine a pose if there are at least this many, and if they turn the camera by less than this.
+_MIN_ALIGNED, _MAX_TURN = 40, float(np.radians(2.0))
 
 
 class Localised(NamedTuple):
@@ -106,6 +114,7 @@ def localise_photograph(
     panoramas: Mapping[str, KnownPoints],
     *,
     focal_px: float | None,
+    patches: PhotographPatches | None = None,
     min_inliers: Annotated[int, Setting("minimum number of key points that agree with the pose", ge=6)] = 30,
     max_error_deg: Annotated[float, Setting("maximum error of a key point that agrees", gt=0, le=5)] = 0.4,
     rng: np.random.Generator,
@@ -114,110 +123,231 @@ def localise_photograph(
 
     Its key points are matched with those of each panorama. LO-RANSAC finds the pose, with the focal length unless it is
     known (as implemented by COLMAP). Pose, focal length and one coefficient of radial distortion are then refined, with
-    more matches, which are looked for near the places that the pose predicts.
+    more matches, which are looked for near the places that the pose predicts, and with patches of the panoramas. If the
+    key points alone are too few, the patches decide: also between the poses that single panoramas suggest.
 
     Args:
         keypoints: of the photograph.
         size_hw: (height, width) of the photograph.
         panoramas: key points with positions, by name.
         focal_px: focal length if it is known, None otherwise.
+        patches: the photograph and the panoramas, to align patches; None: key points only.
         min_inliers: minimum number of key points that agree with the pose.
         max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
-    import pycolmap
-
-    pixels, points = _matches(keypoints, panoramas)
-    if len(pixels) < min_inliers:
-        return f"only {len(pixels)} of its {len(keypoints.pixels_px)} key points match points of the panoramas"
-    height, width = size_hw
-    guess_px = focal_px or max(size_hw) / 2 / float(np.tan(np.radians(_GUESSED_FOV_DEG) / 2))
-    camera = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=width, height=height, params=[guess_px, width / 2, height / 2, 0.0]
-    )
-    estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = focal_px is None
-    estimation.ransac.max_error = guess_px * float(np.radians(max_error_deg))
-    estimation.ransac.random_seed = int(rng.integers(1, _SEED_LIMIT))
-    found = pycolmap.estimate_absolute_pose(pixels, points, camera, estimation)
-    if found is None:
-        return f"no pose agrees with its {len(pixels)} matches"
-    first = PhotographCamera(_rigid(found["cam_from_world"]), float(camera.params[0]), 0.0)
+    each = {name: _matches(keypoints, known) for name, known in panoramas.items()}
+    matches = _joined(each.values())
+    if len(matches.pixels_px) < (min_inliers if patches is None else _FEW):
+        return (
+            f"only {len(matches.pixels_px)} of its {len(keypoints.pixels_px)} key points match points of the panoramas"
+        )
     if focal_px is None:
         prior = FocalPrior(max(size_hw) / 2 / float(np.tan(np.radians(_GUESSED_FOV_DEG) / 2)), _GUESSED_LOG_STD)
     else:
         prior = FocalPrior(focal_px, _EXIF_LOG_STD)
-    max_error = float(np.radians(max_error_deg))
-    refined = refine_camera(pixels, points, first, size_hw=size_hw, prior=prior, max_error=max_error)
-    errors = refined.errors(pixels, points, size_hw)
-    inliers = errors < refined.focal_px * max_error
-    # Guided matches confirm any pose to some degree, so these have to be enough without them.
-    if reason := _implausible(pixels[inliers], size_hw, camera=refined, matches=len(pixels), min_inliers=min_inliers):
-        return reason
-    for _ in range(_GUIDED_ROUNDS):
-        guided = _guided_matches(keypoints, panoramas, refined, size_hw=size_hw, max_error=_GUIDED * max_error)
-        pixels, points = np.concatenate([pixels, guided[0]]), np.concatenate([points, guided[1]])
-        refined = refine_camera(pixels, points, refined, size_hw=size_hw, prior=prior, max_error=max_error)
-        errors = refined.errors(pixels, points, size_hw)
-        inliers = errors < refined.focal_px * max_error
-        pixels, points, errors = pixels[inliers], points[inliers], errors[inliers]
-    reason = _implausible(pixels, size_hw, camera=refined, matches=len(pixels), min_inliers=min_inliers)
-    return reason or Localised(
-        refined.cam_from_world,
-        refined.focal_px,
-        refined.radial,
-        inliers=len(np.unique(pixels, axis=0)),
-        error_px=float(np.median(errors)),
+    search = _Search(
+        keypoints=keypoints,
+        size_hw=size_hw,
+        panoramas=panoramas,
+        prior=prior,
+        focal_known=focal_px is not None,
+        patches=patches,
+        min_inliers=min_inliers,
+        max_error=float(np.radians(max_error_deg)),
     )
+    found = search.located(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+    if isinstance(found, Localised) or patches is None:
+        return found
+    most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
+    singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO) for name in most]
+    return search.confirmed([matches, *(one for one in singly if len(one.pixels_px) >= _FEW)], rng) or found
+
+
+class _Matches(NamedTuple):
+    """Pixels (M, 2) of key points, and the points (M, 3) that they show."""
+
+    pixels_px: FloatArray
+    points_in_world: FloatArray
+
+
+def _joined(matches: Iterable[_Matches]) -> _Matches:
+    each = list(matches)
+    return _Matches(
+        np.concatenate([np.zeros((0, 2)), *(one.pixels_px for one in each)]),
+        np.concatenate([np.zeros((0, 3)), *(one.points_in_world for one in each)]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """What is known about one photograph while its camera is looked for; see `localise_photograph`."""
+
+    keypoints: PhotographKeypoints
+    size_hw: tuple[int, int]
+    panoramas: Mapping[str, KnownPoints]
+    prior: FocalPrior
+    focal_known: bool
+    patches: PhotographPatches | None
+    min_inliers: int
+    max_error: float
+
+    def located(self, matches: _Matches, *, seed: int) -> Localised | str:
+        """Return the camera by the agreement of key points, or the reason why there is none."""
+        count = len(matches.pixels_px)
+        if count < self.min_inliers:
+            return f"only {count} of its {len(self.keypoints.pixels_px)} key points match points of the panoramas"
+        first = self.first(matches, seed=seed)
+        if first is None:
+            return f"no pose agrees with its {count} matches"
+        camera = self.refined(matches, first)
+        # Guided matches confirm any pose to some degree, so these have to be enough without them.
+        inliers = self.agreeing(matches, camera)
+        if reason := _implausible(
+            inliers.pixels_px, self.size_hw, camera=camera, matches=count, min_inliers=self.min_inliers
+        ):
+            return reason
+        agreeing, names, camera = self.guided(matches, camera)
+        if reason := _implausible(
+            agreeing.pixels_px,
+            self.size_hw,
+            camera=camera,
+            matches=len(agreeing.pixels_px),
+            min_inliers=self.min_inliers,
+        ):
+            return reason
+        if self.patches is not None:
+            aligned = self.patches.aligned(camera, names, prior=self.prior)
+            if aligned.confirmed >= _MIN_ALIGNED and self._close(camera, aligned.camera):
+                camera = aligned.camera
+        return self.localised(camera, agreeing)
+
+    def confirmed(self, candidates: Sequence[_Matches], rng: np.random.Generator) -> Localised | None:
+        """Return the camera that patches confirm best among those that few key points suggest; None if none is sure."""
+        assert self.patches is not None
+        best: tuple[Aligned, _Matches] | None = None
+        for matches in candidates:
+            first = self.first(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+            if first is None:
+                continue
+            camera = self.refined(matches, first)
+            agreeing, names, camera = self.guided(self.agreeing(matches, camera), camera)
+            if len(np.unique(agreeing.pixels_px, axis=0)) < _FEW:
+                continue
+            aligned = self.patches.aligned(camera, names, prior=self.prior)
+            if best is None or aligned.confirmed > best[0].confirmed:
+                best = aligned, agreeing
+        if best is None or best[0].confirmed < _MIN_CONFIRMED or best[0].share < _MIN_CONFIRMED_SHARE:
+            return None
+        aligned, _ = best
+        matches, _, _ = self.guided(_joined([]), aligned.camera)
+        agreeing = self.agreeing(matches, aligned.camera)
+        distinct = len(np.unique(agreeing.pixels_px, axis=0))
+        if distinct < _FEW or _implausible(
+            agreeing.pixels_px, self.size_hw, camera=aligned.camera, matches=len(agreeing.pixels_px), min_inliers=_FEW
+        ):
+            return None
+        return self.localised(aligned.camera, agreeing)
+
+    def first(self, matches: _Matches, *, seed: int) -> PhotographCamera | None:
+        """Return the camera that LO-RANSAC finds."""
+        import pycolmap
+
+        height, width = self.size_hw
+        params = [self.prior.focal_px, width / 2, height / 2, 0.0]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+        estimation = pycolmap.AbsolutePoseEstimationOptions()
+        estimation.estimate_focal_length = not self.focal_known
+        estimation.ransac.max_error = self.prior.focal_px * self.max_error
+        estimation.ransac.random_seed = seed
+        found = pycolmap.estimate_absolute_pose(matches.pixels_px, matches.points_in_world, camera, estimation)
+        if found is None:
+            return None
+        return PhotographCamera(_rigid(found["cam_from_world"]), float(camera.params[0]), 0.0)
+
+    def refined(self, matches: _Matches, camera: PhotographCamera) -> PhotographCamera:
+        """Return the camera with the smallest errors of its inliers."""
+        return refine_camera(*matches, camera, size_hw=self.size_hw, prior=self.prior, max_error=self.max_error)
+
+    def agreeing(self, matches: _Matches, camera: PhotographCamera) -> _Matches:
+        """Return the inliers of a camera."""
+        inliers = camera.errors(*matches, self.size_hw) < camera.focal_px * self.max_error
+        return _Matches(matches.pixels_px[inliers], matches.points_in_world[inliers])
+
+    def guided(self, matches: _Matches, camera: PhotographCamera) -> tuple[_Matches, list[str], PhotographCamera]:
+        """Return matches near the places that a camera predicts, the panoramas with most of them, and the camera."""
+        names: list[str] = []
+        for _ in range(_GUIDED_ROUNDS):
+            each = {
+                name: _guided_matches(
+                    self.keypoints, known, camera, size_hw=self.size_hw, max_error=_GUIDED * self.max_error
+                )
+                for name, known in self.panoramas.items()
+            }
+            matches = _joined([matches, *each.values()])
+            camera = self.refined(matches, camera)
+            matches = self.agreeing(matches, camera)
+            counts = {name: len(self.agreeing(found, camera).pixels_px) for name, found in each.items()}
+            names = sorted((name for name in each if counts[name]), key=lambda name: -counts[name])
+        return matches, names[:_ALIGNED_PANORAMAS], camera
+
+    def localised(self, camera: PhotographCamera, matches: _Matches) -> Localised:
+        """Return the result for a camera and the matches that agree with it."""
+        errors = camera.errors(*matches, self.size_hw)
+        return Localised(
+            camera.cam_from_world,
+            camera.focal_px,
+            camera.radial,
+            inliers=len(np.unique(matches.pixels_px, axis=0)),
+            error_px=float(np.median(errors)),
+        )
+
+    def _close(self, camera: PhotographCamera, aligned: PhotographCamera) -> bool:
+        """Return whether patches left the camera about where key points had put it."""
+        turn = geodesic_angle(camera.cam_from_world.rotation, aligned.cam_from_world.rotation)
+        return bool(turn < _MAX_TURN) and _FOV_BOUNDS_DEG[0] < aligned.fov_deg(self.size_hw) < _FOV_BOUNDS_DEG[1]
 
 
 def _rigid(pose: Any) -> Rigid3:
     return Rigid3(pose.rotation.matrix(), np.array(pose.translation))
 
 
-def _matches(keypoints: PhotographKeypoints, panoramas: Mapping[str, KnownPoints]) -> tuple[FloatArray, FloatArray]:
-    """Return the pixels (M, 2) of matched key points, and the points (M, 3) that they show."""
-    pixels, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
-    for known in panoramas.values():
-        if min(len(keypoints.descriptors), len(known.descriptors)) < 2:
-            continue
-        matched = match_l2(keypoints.descriptors, known.descriptors)
-        pixels.append(keypoints.pixels_px[matched[:, 0]])
-        points.append(known.points_in_world[matched[:, 1]])
-    return np.concatenate(pixels), np.concatenate(points)
+def _matches(keypoints: PhotographKeypoints, known: KnownPoints, *, ratio: float = 0.8) -> _Matches:
+    """Return the matches of a photograph with one panorama."""
+    if min(len(keypoints.descriptors), len(known.descriptors)) < 2:
+        return _joined([])
+    matched = match_l2(keypoints.descriptors, known.descriptors, ratio=ratio)
+    return _Matches(keypoints.pixels_px[matched[:, 0]], known.points_in_world[matched[:, 1]])
 
 
 def _guided_matches(
     keypoints: PhotographKeypoints,
-    panoramas: Mapping[str, KnownPoints],
+    known: KnownPoints,
     camera: PhotographCamera,
     *,
     size_hw: tuple[int, int],
     max_error: float,
-) -> tuple[FloatArray, FloatArray]:
+) -> _Matches:
     """Match each known point with the most similar of the key points near its place in the photograph.
 
     These are many more matches than those without a pose, because only key points nearby compete.
-
-    Returns:
-        (M, 2) pixels and (M, 3) points.
     """
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(keypoints.pixels_px)
-    pixels, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
-    for known in panoramas.values():
-        seen, before = camera.project(known.points_in_world, size_hw)
-        inside = np.flatnonzero(before & ((seen >= 0) & (seen < size_hw[::-1])).all(axis=1))
-        chosen: dict[int, tuple[float, int]] = {}
+    seen, before = camera.project(known.points_in_world, size_hw)
+    inside = np.flatnonzero(before & ((seen >= 0) & (seen < size_hw[::-1])).all(axis=1))
+    chosen: dict[int, tuple[float, int]] = {}
+    if len(inside) and len(keypoints.pixels_px):
+        tree = cKDTree(keypoints.pixels_px)
         for idx in inside.tolist():
             nearby = tree.query_ball_point(seen[idx], camera.focal_px * max_error, return_sorted=True)
             distance, key = _most_similar(keypoints.descriptors, nearby, known.descriptors[idx].astype(np.float32))
             if distance < chosen.get(key, (_MAX_DISTANCE, 0))[0]:
                 chosen[key] = distance, idx
-        pixels.append(keypoints.pixels_px[list(chosen)].reshape(-1, 2))
-        points.append(known.points_in_world[[idx for _, idx in chosen.values()]].reshape(-1, 3))
-    return np.concatenate(pixels), np.concatenate(points)
+    return _Matches(
+        keypoints.pixels_px[list(chosen)].reshape(-1, 2),
+        known.points_in_world[[idx for _, idx in chosen.values()]].reshape(-1, 3),
+    )
 
 
 def _most_similar(
@@ -241,7 +371,7 @@ def _implausible(
     distinct = len(np.unique(inliers_px, axis=0))
     if distinct < min_inliers or len(inliers_px) < _MIN_INLIER_SHARE * matches:
         return f"only {len(inliers_px)} of its {matches} matches, of {distinct} key points, agree with one pose"
-    fov_deg = float(np.degrees(2 * np.arctan(max(size_hw) / 2 / camera.focal_px)))
+    fov_deg = camera.fov_deg(size_hw)
     if not _FOV_BOUNDS_DEG[0] <= fov_deg <= _FOV_BOUNDS_DEG[1] or abs(camera.radial) > _MAX_RADIAL:
         return f"its matches give an implausible camera: {fov_deg:.0f}° wide, distortion {camera.radial:.2f}"
     spread = np.linalg.svd(inliers_px - inliers_px.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(inliers_px))

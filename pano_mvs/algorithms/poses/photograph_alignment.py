@@ -1,0 +1,118 @@
+"""Refine the camera of a photograph by patches of panoramas, and confirm it by them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, Sightings, refine_by_sightings
+from pano_mvs.algorithms.poses.photograph_patches import panorama_levels, photograph_levels, sight_points
+from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
+
+_MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
+_KEPT_PANORAMAS = 10
+# Levels of the panoramas in each round: coarse patches are aligned from further away.
+_ROUNDS = (1, 0, 0)
+# With fewer patches than these, the pose is wrong.
+_MIN_SIGHTINGS, _MIN_SEEN_SHARE = 12, 0.03
+_CONFIRMED_STD = 3.0
+
+
+class Aligned(NamedTuple):
+    """A camera after alignment.
+
+    Attributes:
+        camera: the camera.
+        confirmed: number of points that the photograph shows where the camera predicts them.
+        tested: number of points that it could show.
+    """
+
+    camera: PhotographCamera
+    confirmed: int
+    tested: int
+
+    @property
+    def share(self) -> float:
+        """The share of the tested points that are confirmed."""
+        return self.confirmed / max(1, self.tested)
+
+
+class PanoramaPatches:
+    """The panoramas and the points of their surfaces, of which those of the last few photographs stay in memory.
+
+    Args:
+        surfaces: points by the names of the panoramas.
+        load: returns a panorama (H, W, 3) by its name.
+    """
+
+    def __init__(self, surfaces: Mapping[str, SurfacePoints], load: Callable[[str], NDArray[np.uint8]]) -> None:
+        self.surfaces = surfaces
+        self._load = load
+        self._held: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
+
+    def levels(self, name: str) -> list[NDArray[np.float32]]:
+        """Return the `panorama_levels` of a panorama."""
+        if name not in self._held:
+            while len(self._held) >= _KEPT_PANORAMAS:
+                self._held.popitem(last=False)
+            self._held[name] = panorama_levels(_reduced(self._load(name), _MAX_PANORAMA_PX), max(_ROUNDS) + 1)
+        self._held.move_to_end(name)
+        return self._held[name]
+
+
+class PhotographPatches:
+    """A photograph that is aligned with panoramas.
+
+    Args:
+        photograph: (H, W, 3) uint8 RGB.
+        panoramas: what it is aligned with.
+    """
+
+    def __init__(self, photograph: NDArray[np.uint8], panoramas: PanoramaPatches) -> None:
+        self._size_hw = (photograph.shape[0], photograph.shape[1])
+        self._levels = photograph_levels(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY))
+        self._panoramas = panoramas
+
+    def aligned(self, camera: PhotographCamera, names: Iterable[str], *, prior: FocalPrior) -> Aligned:
+        """Return the camera that some panoramas' patches confirm best, from one that is accurate to about a degree.
+
+        Args:
+            camera: the camera to start from.
+            names: the panoramas.
+            prior: what is known about the focal length.
+        """
+        chosen, sightings = list(names), Sightings.joined([])
+        for level in _ROUNDS:
+            sightings = self._sightings(camera, chosen, level)
+            if len(sightings.pixels_px) < max(_MIN_SIGHTINGS, _MIN_SEEN_SHARE * sightings.tested):
+                return Aligned(camera, 0, sightings.tested)
+            camera = refine_by_sightings(camera, sightings, size_hw=self._size_hw, prior=prior)
+        errors = np.linalg.norm(sightings.errors(camera, self._size_hw), axis=1)
+        return Aligned(camera, int((errors < _CONFIRMED_STD).sum()), sightings.tested)
+
+    def _sightings(self, camera: PhotographCamera, names: Iterable[str], level: int) -> Sightings:
+        return Sightings.joined(
+            [
+                sight_points(
+                    self._panoramas.surfaces[name],
+                    self._panoramas.levels(name)[level],
+                    self._levels,
+                    camera=camera,
+                    size_hw=self._size_hw,
+                )
+                for name in names
+            ]
+        )
+
+
+def _reduced(picture: NDArray[np.uint8], max_px: int) -> NDArray[np.uint8]:
+    scale = min(1.0, max_px / max(picture.shape))
+    if scale == 1:
+        return picture
+    size_xy = [max(1, round(side * scale)) for side in picture.shape[1::-1]]
+    return np.asarray(cv2.resize(picture, size_xy, interpolation=cv2.INTER_AREA), np.uint8)

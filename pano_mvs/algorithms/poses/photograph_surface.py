@@ -1,0 +1,107 @@
+"""Points of surfaces around a panorama's key points, with which photographs are aligned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
+from pano_mvs.scene import Features, RangeMap
+
+FloatArray = NDArray[np.float64]
+
+# A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
+_OFFSETS_PX = (-4, -2, 0, 2, 4)
+_PLANAR_SHARE, _PLANAR = 0.8, 0.02
+_MIN_COSINE = 0.1
+_STD, _STD_BOUNDS = 0.005, (0.003, 0.05)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePoints:
+    """Points of surfaces that a panorama sees.
+
+    Attributes:
+        cam_from_world: the panorama's pose.
+        bearings: (N, 3) float64 unit, in its camera frame.
+        ranges: (N,) float64.
+        normals_in_cam: (N, 3) float64 unit, towards the camera.
+        range_stds: (N,) float64 standard deviations of the logarithms of the ranges.
+    """
+
+    cam_from_world: Rigid3
+    bearings: FloatArray
+    ranges: FloatArray
+    normals_in_cam: FloatArray
+    range_stds: FloatArray
+
+    @property
+    def points_in_world(self) -> FloatArray:
+        """The points, (N, 3)."""
+        return self.cam_from_world.inverse().apply(self.bearings * self.ranges[:, None])
+
+    def __getitem__(self, chosen: NDArray[np.generic]) -> SurfacePoints:
+        """Return some of the points."""
+        return SurfacePoints(
+            self.cam_from_world,
+            self.bearings[chosen],
+            self.ranges[chosen],
+            self.normals_in_cam[chosen],
+            self.range_stds[chosen],
+        )
+
+
+def surface_points(
+    features: Features, cam_from_world: Rigid3, range_map: RangeMap, *, min_confidence: int
+) -> SurfacePoints:
+    """Return the points of flat surfaces at a panorama's key points; ranges are those of the tangent planes.
+
+    Args:
+        features: key points of the panorama, of which only the bearings are used.
+        cam_from_world: the panorama's pose.
+        range_map: its ranges.
+        min_confidence: smallest confidence of a range that is used.
+    """
+    size_hw = (range_map.range.shape[0], range_map.range.shape[1])
+    x, y = np.floor(pixel_from_ray(features.bearings, size_hw)).astype(np.intp).T
+    x, y = x % size_hw[1], np.clip(y, 0, size_hw[0] - 1)
+    good = np.flatnonzero(np.isfinite(range_map.range[y, x]) & (range_map.confidence[y, x] >= min_confidence))
+    x, y, bearings = x[good], y[good], features.bearings[good]
+    wanted = np.zeros(size_hw, np.bool_)
+    wanted[y, x] = True
+    given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
+    normals = normals_from_range(range_map, given=given, wanted=wanted)[y, x].astype(np.float64)
+    centers = ray_from_pixel(np.stack([x + 0.5, y + 0.5], axis=-1), size_hw)
+    heights = (normals * centers).sum(axis=1) * range_map.range[y, x]
+    slopes = (normals * bearings).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        flat = _planar_share(range_map.range, (x, y), (normals, heights)) >= _PLANAR_SHARE
+        keep = flat & (slopes < -_MIN_COSINE)
+    stds = np.full(len(good), _STD)
+    if range_map.uncertainty is not None:
+        stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), *_STD_BOUNDS)
+    return SurfacePoints(cam_from_world, bearings[keep], (heights / slopes)[keep], normals[keep], stds[keep])
+
+
+def _planar_share(
+    ranges: NDArray[np.float32],
+    pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
+    planes: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Return the share of the ranges around pixels (x, y) that are on planes n · X = h, given as (n, h); (N,)."""
+    normals, heights = planes
+    height, width = ranges.shape
+    x, y = pixels
+    stretch = 1 / np.maximum(np.sin(np.pi * (y + 0.5) / height), 0.1)
+    share = np.zeros(len(x))
+    for down in _OFFSETS_PX:
+        for across in _OFFSETS_PX:
+            row = np.clip(y + down, 0, height - 1)
+            column = (x + np.rint(across * stretch).astype(np.intp)) % width
+            rays = ray_from_pixel(np.stack([column + 0.5, row + 0.5], axis=-1), (height, width))
+            on_plane = heights / (normals * rays).sum(axis=1)
+            share += np.abs(ranges[row, column] / on_plane - 1) < _PLANAR
+    return share / len(_OFFSETS_PX) ** 2
