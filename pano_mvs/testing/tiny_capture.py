@@ -268,12 +268,9 @@ class TinyCapture:
     def _photographs(self) -> Photographs:
         """Return a photograph that was taken from the place of the first image."""
         pose = self.poses[0]
-        picture = self.folder / "phone1.png"
-        if not exists(picture):
-            write_png(picture, np.random.default_rng(11).integers(0, 256, (30, 40, 3), np.uint8))
         return frozen(
             Photographs(
-                names=("phone/1.jpg",),
+                names=("phone/1.png",),
                 sizes_hw=np.array([[30, 40]], np.int32),
                 focals_px=np.array([35.0]),
                 radials=np.array([-0.05]),
@@ -281,7 +278,7 @@ class TinyCapture:
                 translations=pose.translation[None].copy(),
                 inliers=np.array([50], np.int32),
                 errors_px=np.array([0.5], np.float32),
-                pictures=(FilePart(picture),),
+                pictures=(FilePart(self.folder / "phone" / "1.png"),),
             )
         )
 
@@ -316,6 +313,8 @@ def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
     folder = Path(_folders[-1].name)
     (folder / "images").mkdir()
     (folder / "truth").mkdir()
+    (folder / "phone").mkdir()
+    write_png(folder / "phone" / "1.png", np.random.default_rng(11).integers(0, 256, (30, 40, 3), np.uint8))
     names, poses, pictures, ranges = [], [], [], []
     for idx, straight in enumerate(capture_poses(4, spread=0.4)):
         size_hw = _half(variant.size_hw) if variant.mixed and idx % 2 else variant.size_hw

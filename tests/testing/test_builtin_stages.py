@@ -14,7 +14,7 @@ from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
-    "poses.localise": {"path": "{capture}/images"},
+    "poses.localise": {"path": "{capture}/phone"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
     "source.dual_fisheye": {
