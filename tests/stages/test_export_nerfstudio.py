@@ -20,6 +20,7 @@ from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import (
     NerfstudioFramesParams,
     NerfstudioParams,
@@ -68,7 +69,9 @@ def exported(
     scratch.mkdir()
     poses = capture.whole(Poses)
     seeds = NerfstudioParams(seed_points=seed_points, frame=frame)
-    files = nerfstudio(frames, poses, cloud, None, seeds, Context(np.random.default_rng(0), scratch))
+    files = nerfstudio(
+        frames, poses, cloud, capture.whole(Photographs), seeds, Context(np.random.default_rng(0), scratch)
+    )
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
 
@@ -85,6 +88,22 @@ def masked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = dict(capture.images)
     images["001.png"] = replace(images["001.png"], mask_file=None)
     return exported(capture, folder, images=images)
+
+
+def test_photographs_are_listed_after_the_faces(plain: Path) -> None:
+    folder, photographs = plain / "faces", tiny_capture(PLAIN).whole(Photographs)
+    faces = json.loads((folder / "transforms.json").read_text())
+    document = json.loads((folder / "transforms_photographs.json").read_text())
+    *listed, last = document["frames"]
+    assert [frame["transform_matrix"] for frame in listed] == [frame["transform_matrix"] for frame in faces["frames"]]
+    assert document["camera_model"] == "OPENCV"
+    assert (last["w"], last["h"], last["fl_x"], last["k1"]) == (40, 30, 35.0, -0.05)
+    assert (folder / last["file_path"]).read_bytes() == photographs.pictures[0].path.read_bytes()
+    pose = photographs.cam_from_world(0)
+    turned = np.array(document["file_from_world"]) @ pose.rotation.T
+    np.testing.assert_allclose(np.array(last["transform_matrix"])[:3, :3], turned @ np.diag([1, -1, -1]), atol=1e-12)
+    assert "depth_file_path" not in last
+    assert all((folder / frame["file_path"]).is_file() for frame in document["frames"])
 
 
 @pytest.mark.parametrize("variant", ["equirectangular", "faces"])
