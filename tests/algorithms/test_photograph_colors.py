@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.fusion.fuse import join_clouds
 from pano_mvs.algorithms.photograph_colors import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.geometry import Rigid3
@@ -62,12 +63,7 @@ def test_the_exposure_of_the_photograph_is_matched() -> None:
 
 def test_hidden_points_keep_their_colors() -> None:
     before, behind = wall(1.0, (0.2, 0.15)), wall(2.0, (0.3, 0.2))
-    cloud = PointCloud(
-        *(
-            np.concatenate([getattr(before, name), getattr(behind, name)])
-            for name in ("points_in_world", "normals_in_world", "colors_rgb", "view_counts")
-        )
-    )
+    cloud = join_clouds([before, behind])
     colors = colored(cloud, stripes())
     assert (colors[: len(before)] != 128).any(axis=1).mean() > 0.8
     assert (colors[len(before) :] == 128).all()

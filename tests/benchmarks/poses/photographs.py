@@ -25,12 +25,17 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.pictures import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
+from pano_mvs.algorithms.fusion.fuse import fuse_views
+from pano_mvs.algorithms.fusion.view import FusionView
+from pano_mvs.algorithms.photograph_colors import PhotographColors, PhotographColorSettings
+from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, RangeMap
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.poses_localise import LocaliseParams, localise
 from pano_mvs.testing.photograph import render_photograph
+from pano_mvs.testing.room import colors_along
 from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
@@ -67,8 +72,9 @@ class Place:
         return float(np.nanmedian(np.stack(list(self.capture.ranges.values()))))
 
 
-def rendered_photographs(scene: Scene, *, count: int, seed: int, width: int = PHOTO_WH[0]) -> list[Taken]:
+def rendered_photographs(scene: Scene, *, count: int, seed: int, distorted: bool = True) -> list[Taken]:
     """Return photographs of a synthetic place, from between its cameras."""
+    width = PHOTO_WH[0]
     rng = np.random.default_rng([seed, 0xF0])
     centers = np.stack([pose.center for pose in scene.poses])
     taken = []
@@ -80,7 +86,7 @@ def rendered_photographs(scene: Scene, *, count: int, seed: int, width: int = PH
         size_hw = (width * 3 // 4, width) if number % 3 else (width, width * 3 // 4)
         focal_px = width / 2 / float(np.tan(np.radians(rng.uniform(50, 78)) / 2))
         picture = render_photograph(
-            scene.room, pose, size_hw, focal_px=focal_px, radial=rng.uniform(-0.08, 0.04), supersample=1
+            scene.room, pose, size_hw, focal_px=focal_px, radial=distorted * rng.uniform(-0.08, 0.04), supersample=1
         )
         levels = 255 * (picture / 255) ** np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.1, 3))
         noisy = np.clip(np.rint(levels + rng.normal(0, 2, picture.shape)), 0, 255).astype(np.uint8)
@@ -199,6 +205,32 @@ def _errors(found: Photographs, idx: int, truth: Taken, scale: float) -> tuple[f
     )
 
 
+def show_colors(name: str, *, seed: int, width: int) -> None:
+    """Print how far the colours of a cloud are from the truth, without and with photographs, where these look.
+
+    Cameras and ranges are the true ones. The truth is the colour of the surface for a pixel of the photograph.
+    """
+    scene = SCENES[name](seed=seed, views=4)
+    views = []
+    for idx, pose in enumerate(scene.poses):
+        picture, true = scene.view(idx, (width // 2, width), supersample=2)
+        known = RangeMap(true, np.where(np.isfinite(true), 255, 0).astype(np.uint8))
+        views.append(FusionView(known, pose, picture))
+    cloud = fuse_views(views)
+    taken = rendered_photographs(scene, count=2, seed=seed, distorted=False)
+    colors = PhotographColors(cloud, PhotographColorSettings())
+    for photograph in taken:
+        colors.add(photograph.picture, PhotographCamera(photograph.pose, photograph.focal_px, 0.0))
+    changed = np.flatnonzero((colors.colors_rgb() != cloud.colors_rgb).any(axis=1))
+    rays = cloud.points_in_world[changed].astype(np.float64) - taken[0].pose.center
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    true_colors = 255 * colors_along(scene.room, taken[0].pose.center, rays, pixel_rad=1 / taken[0].focal_px)
+    errors = [np.abs(rgb[changed] - true_colors).mean() for rgb in (cloud.colors_rgb, colors.colors_rgb())]
+    print(
+        f"{name}: {len(changed)} points coloured, mean error {errors[0]:.1f} -> {errors[1]:.1f} grey levels", flush=True
+    )
+
+
 def main() -> None:
     """Measure the synthetic places and the captures that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -210,7 +242,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=21)
     parser.add_argument("--count", type=int, default=8, help="photographs of each place")
     parser.add_argument("--exif", nargs="*", type=int, default=[0, 1], choices=[0, 1])
+    parser.add_argument("--colors", action="store_true", help="measure the colours of clouds instead")
     options = parser.parse_args()
+    if options.colors:
+        for name in options.scenes:
+            show_colors(name, seed=options.seed, width=options.width)
+        return
     options.scratch.mkdir(parents=True, exist_ok=True)
     places = []
     for name in options.scenes:
