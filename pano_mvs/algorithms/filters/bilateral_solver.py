@@ -30,6 +30,7 @@ from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain, MaxHoleDeg
 from pano_mvs.algorithms.filters.sphere.cells import SphereCells, sphere_cells
+from pano_mvs.algorithms.filters.support.supported import supported_pixels
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
@@ -89,6 +90,9 @@ def fast_bilateral_solver(
     keep_confidence: Annotated[
         int, Setting("pixels with at least this confidence keep their range; 256: smooth all", ge=1, le=256)
     ] = CONSISTENT_CONFIDENCE[0],
+    keep_supported: Annotated[
+        bool, Setting("also keep pixels with texture beside such a pixel that has about the same range and colour")
+    ] = True,
 ) -> RangeMap:
     """Smooth a range map within the surfaces of the panorama, and fill invalid pixels.
 
@@ -110,6 +114,8 @@ def fast_bilateral_solver(
         max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`), since a sky has no range; 0 fills
             all.
         keep_confidence: pixels with at least this confidence keep their range; 256 smooths all.
+        keep_supported: whether pixels that `supported_pixels` finds count as if they had this confidence, so that thin
+            objects and gaps between them are not smoothed away.
 
     Raises:
         UsageError: if guide and range map differ in size, or a parameter is out of bounds.
@@ -121,14 +127,18 @@ def fast_bilateral_solver(
     valid = range_map.valid
     if not valid.any():
         return range_map
-    target, weight = data_term(range_map, domain)
+    trusted = range_map.confidence
+    if keep_supported:
+        supported = supported_pixels(range_map, guide, min_confidence=keep_confidence)
+        trusted = np.where(supported, np.uint8(min(keep_confidence, 255)), trusted)
+    target, weight = data_term(RangeMap(range_map.range, trusted), domain)
     cells = sphere_cells((height, width), sigma_spatial)
     colors = _color_bins(guide, sigma_luma, sigma_chroma)
     smooth, support = solve_bilateral(target, weight, colors, cells=cells, smoothness=smoothness, iterations=iterations)
     # The solution is a weighted mean of the targets up to the tolerance of the solver: clip it to their range.
     smooth = np.clip(smooth, target[valid].min(), target[valid].max())
     ranges = (1 / smooth if domain == "inverse" else smooth).astype(np.float32)
-    kept = range_map.confidence >= keep_confidence
+    kept = trusted >= keep_confidence
     ranges[kept] = range_map.range[kept]
     if not fill:
         return with_ranges(range_map, np.where(valid, ranges, np.float32(np.nan)))

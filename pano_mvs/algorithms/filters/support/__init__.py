@@ -1,0 +1,1 @@
+"""Pixels that confirmed neighbours support."""
