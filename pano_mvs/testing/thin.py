@@ -73,7 +73,7 @@ def _wires(rng: np.random.Generator, pixel: float) -> list[Painted]:
         along = np.cos(slope) * aside + np.sin(slope) * np.array([0.0, 1.0, 0.0]) + rng.normal(0, 0.15, 3)
         half = rng.uniform(0.4, 0.7) * along / np.linalg.norm(along)
         radius = 0.5 * rng.uniform(2, 6) * pixel * distance
-        wires.append((_rod(middle - half, middle + half, radius, number), "none"))
+        wires.append((_rod(middle - half, middle + half, radius=radius, number=number), "none"))
     return wires
 
 
@@ -88,7 +88,7 @@ def _legs(rng: np.random.Generator, pixel: float) -> list[Painted]:
         for number_of_leg, (right, front) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
             corner = np.array([x + right * side, top, z + front * side])
             head = corner - (0, 0.6 if number_of_leg < 2 and number % 2 else 0, 0)
-            legs.append((_rod(corner * (1, 0, 1) + (0, 1.3, 0), head, radius, number), "strong"))
+            legs.append((_rod(corner * (1, 0, 1) + (0, 1.3, 0), head, radius=radius, number=number), "strong"))
         low, high = (x - side, top, z - side), (x + side, top + 2 * radius, z + side)
         legs.append((Cuboid(low, high, _COLORS[number % 4]), "strong"))
     return legs
@@ -105,7 +105,7 @@ def _bars(rng: np.random.Generator, pixel: float) -> list[Painted]:
         across, along = (aside, up) if side % 2 else (up, aside)
         for step in np.arange(-4, 5).tolist():
             middle = distance * ahead + rng.uniform(0.12, 0.14) * step * across
-            bars.append((_rod(middle - 0.6 * along, middle + 0.6 * along, radius, side), "strong"))
+            bars.append((_rod(middle - 0.6 * along, middle + 0.6 * along, radius=radius, number=side), "strong"))
     return bars
 
 
@@ -125,7 +125,7 @@ def _treads(rng: np.random.Generator, pixel: float) -> list[Painted]:
     return treads
 
 
-def _rod(foot: NDArray[np.float64], head: NDArray[np.float64], radius: float, number: int) -> Rod:
+def _rod(foot: NDArray[np.float64], head: NDArray[np.float64], *, radius: float, number: int) -> Rod:
     ends = [(float(end[0]), float(end[1]), float(end[2])) for end in (foot, head)]
     return Rod(ends[0], ends[1], float(radius), _COLORS[number % 4])
 

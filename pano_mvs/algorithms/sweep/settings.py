@@ -43,7 +43,7 @@ class SweepSettings:
         doc="census, census_gradient (also grey levels and their gradients), zncc (correlation), sad (the "
         "paper's sum of absolute differences), sad_gradient (also gradients of colours), or a plugin's cost",
     )
-    window: int = setting(5, ge=1, le=15, odd=True, doc="side of the window of the cost in pixels, odd")
+    window: int = setting(7, ge=1, le=15, odd=True, doc="side of the window of the cost in pixels, odd")
     spherical_window: bool = setting(True, doc="widen windows towards the poles so that they keep their solid angle")
     combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = setting(
         "best_half",

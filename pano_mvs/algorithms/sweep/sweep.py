@@ -135,6 +135,7 @@ def sweep_input(
         )
         sources = match_all(reference, sources, source_from_reference, ranges=rough, masks=masks)
     poses = tuple(source_from_reference)
+    follows_colors = settings.edges == "colors" and settings.aggregation == "sgm"
     if settings.derotate:
         sources, poses, masks = derotated(sources, poses, masks)
     return SweepInput(
@@ -145,7 +146,7 @@ def sweep_input(
         ranges=ranges,
         settings=settings,
         device=device,
-        colors=prepare_colors(reference, settings) if settings.edges == "colors" else None,
+        colors=prepare_colors(reference, settings) if follows_colors else None,
     )
 
 

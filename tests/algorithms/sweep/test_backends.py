@@ -113,7 +113,7 @@ def test_a_colour_cost_is_given_colours_and_grey_is_the_default(ours: None) -> N
         settings = SweepSettings(planes=3, cost=name, exposure=False)
         sweep_range(picture, [picture], [pose], near=1, far=2, settings=settings, backend="numpy")
     assert {first[2] for first, *_ in seen} == {1, 3}
-    assert all(ours == theirs and kind == np.float64 and radius == 2 for ours, theirs, kind, radius in seen)
+    assert all(ours == theirs and kind == np.float64 and radius == 3 for ours, theirs, kind, radius in seen)
 
 
 @pytest.mark.parametrize("value", [1.5, -0.1, np.nan])
