@@ -54,6 +54,7 @@ from pano_mvs.scene import (
     Record,
     Scores,
     TwoView,
+    TwoViews,
     Views,
 )
 from pano_mvs.scene.files import group_file
@@ -100,6 +101,7 @@ __all__ = [
     "SourcePath",
     "SweepInput",
     "TwoView",
+    "TwoViews",
     "UsageError",
     "Views",
     "Winners",

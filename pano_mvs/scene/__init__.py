@@ -10,7 +10,7 @@ from pano_mvs.scene.poses import Pose, Poses
 from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
 from pano_mvs.scene.scores import Scores
-from pano_mvs.scene.two_view import TwoView
+from pano_mvs.scene.two_view import TwoView, TwoViews
 
 __all__ = [
     "Axis",
@@ -29,5 +29,6 @@ __all__ = [
     "Record",
     "Scores",
     "TwoView",
+    "TwoViews",
     "Views",
 ]

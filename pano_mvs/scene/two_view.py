@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.record import Axis, Record, require_array
+from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
+from pano_mvs.scene.record import Axis, Part, Parts, Record, require_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +133,52 @@ class TwoView(Record):
             require_array(self, "alternative_directions", dtype=np.float64, shape=(len(sizes), 3))
             require_array(self, "alternative_matches_idx", dtype=np.int32, shape=(int(sizes.sum()), 2))
             require_array(self, "alternative_residuals_rad", dtype=np.float32, shape=(int(sizes.sum()),))
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViews(Record):
+    """The two-view geometries of all pairs of a capture, for stages that judge pairs together.
+
+    Attributes:
+        views: pair of image names to its geometry.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+    explodes_into: ClassVar[type[Record] | None] = TwoView
+
+    views: Mapping[tuple[str, str], TwoView] = field(default_factory=dict)
+
+    def explode(self) -> Mapping[str, TwoView]:
+        """Return the geometry of each pair by the name of its unit."""
+        return {pair_name(*pair): view for pair, view in self.views.items()}
+
+    def check(self) -> None:
+        """Raise ContractError unless every geometry is valid."""
+        for view in self.views.values():
+            view.check()
+
+    def to_parts(self) -> Parts:
+        """Return the arrays of all pairs, each with the number of its pair in its name, and the rest as JSON."""
+        parts: dict[str, Part] = {}
+        rest: list[dict[str, object]] = []
+        for number, view in enumerate(self.views.values()):
+            own = dict(view.to_parts())
+            meta = own.pop("meta")
+            assert isinstance(meta, dict)
+            rest.append(meta)
+            parts.update({f"{name}_{number}": part for name, part in own.items()})
+        parts["meta"] = {"pairs": [pair_name(*pair) for pair in self.views], "rest": rest}
+        return parts
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the record from the result of `to_parts`."""
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        own: list[dict[str, Part]] = [{"meta": rest} for rest in meta["rest"]]
+        for name, part in parts.items():
+            if name != "meta":
+                array, _, number = name.rpartition("_")
+                own[int(number)][array] = part
+        views = [TwoView.from_parts(one) for one in own]
+        return cls(dict(zip(map(pair_from_name, meta["pairs"]), views, strict=True)))

@@ -24,7 +24,7 @@ from pano_mvs.engine.workflows.wiring import Edge, Graph, wire
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.results.run_output import RunOutput
-from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView
+from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView, TwoViews
 from pano_mvs.scene.pairs_and_views import Pairs, Views
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.static_masks import StaticMasks
@@ -40,7 +40,7 @@ _SCALED: Mapping[type[Record], tuple[str, str]] = {
     RangeMap: ("filters.scale", "range_map"),
     PointCloud: ("fusion.scale", "cloud"),
 }
-_WITHOUT_LENGTHS = (Panorama, Pairs, Views, TwoView, StaticMasks)
+_WITHOUT_LENGTHS = (Panorama, Pairs, Views, TwoView, TwoViews, StaticMasks)
 _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+)\s*(mm|cm|m|in|ft|)\s*")
 _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 

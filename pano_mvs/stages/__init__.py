@@ -28,7 +28,7 @@ from pano_mvs.stages.filters import (
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
-from pano_mvs.stages.matches import brute_force
+from pano_mvs.stages.matches import bridges, brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch
 from pano_mvs.stages.points import surface, tracked
@@ -45,6 +45,7 @@ from pano_mvs.stages.views import nearest
 __all__ = [
     "apply",
     "bilateral_solver",
+    "bridges",
     "brute_force",
     "colmap",
     "colmap_dense",

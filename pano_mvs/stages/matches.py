@@ -1,11 +1,26 @@
-"""Matchers: find matching key points of two images, and verify them by the images' two-view geometry."""
+"""Matchers: find matching key points of two images, and verify them by the geometry of pairs and of groups."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sized
+from typing import Any
+
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.preemptive import hopeless_reason
+from pano_mvs.algorithms.poses.joining.bridges import Bridges, find_bridges
 from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.api import Context, Features, Near, Params, TwoView, arguments_from, params_from, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    Features,
+    Near,
+    Params,
+    TwoView,
+    TwoViews,
+    arguments_from,
+    params_from,
+    stage,
+)
 
 
 @params_from(match_features, hopeless_reason, verify_pair)
@@ -35,3 +50,42 @@ def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context
         ctx.metric("direction_std_deg", two_view.direction_std_deg)
         ctx.metric("parallax_deg", two_view.parallax_deg)
     return two_view
+
+
+_BYTES_PER_IMAGE, _BYTES_PER_PAIR, _BYTES_OF_A_MATCH = 16 << 20, 128 << 10, 512 << 20
+
+
+def _bridges_memory(params: Params, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for all key points and pairs, and for the comparison of two images."""
+    del params
+    images, pairs = inputs["features"], inputs["matches"]
+    assert isinstance(images, Sized)
+    assert isinstance(pairs, Sized)
+    return _BYTES_OF_A_MATCH + _BYTES_PER_IMAGE * len(images) + _BYTES_PER_PAIR * len(pairs)
+
+
+@params_from(find_bridges)
+class BridgesParams(Params):
+    """Settings of matches.bridges."""
+
+
+@stage("matches.bridges", memory=_bridges_memory)
+def bridges(features: All[Features], matches: All[TwoView], params: BridgesParams, ctx: Context) -> TwoViews:
+    """Add pairs between groups of images that hardly see each other, such as rooms joined by doors.
+
+    The groups that no reliable pair connects are aligned with all matches between their images together. The result
+    has all pairs, old and new. If the pairs connect all images, nothing is matched and the pairs stay as they are.
+    """
+    found = find_bridges(features, matches, **arguments_from(find_bridges, params), rng=ctx.rng)
+    _report(found, ctx)
+    return TwoViews({**matches, **found.two_views})
+
+
+def _report(found: Bridges, ctx: Context) -> None:
+    before, after = found.groups
+    ctx.metric("groups_before", before)
+    ctx.metric("groups_after", after)
+    ctx.metric("new_pairs", len(found.two_views))
+    for bridge in found.bridges:
+        first, second = (f"{names[0]} …" if len(names) > 1 else names[0] for names in bridge.images)
+        ctx.note(f"the group of {first} was joined with the group of {second}: {bridge.inliers} matches agree")

@@ -12,11 +12,14 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
+from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry.geodesy import local_from_lla
-from pano_mvs.scene import GlobalDescriptor, Pairs
+from pano_mvs.scene import Features, GlobalDescriptor, Pairs
 
 FloatArray = NDArray[np.float64]
+
+_SHORTLISTED = 20
 
 
 @checks_settings
@@ -184,6 +187,13 @@ def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescr
     by_looks = np.asarray(alike.max() - alike, np.float64)
     matches = sample_matches([descriptors[name].sample for name in names], by_looks, neighbours=neighbours)
     return np.asarray(by_looks + (by_looks.max() + 1) * (matches.max() - matches), np.float64)
+
+
+def similarities(features: Sequence[Features], *, sample: int = 400) -> FloatArray:
+    """Return the similarity of images, (N, N): matches of samples of their key points, then their VLAD vectors."""
+    names = [str(number) for number in range(len(features))]
+    descriptors = {name: vlad_descriptor(one, sample=sample) for name, one in zip(names, features, strict=True)}
+    return -_dissimilarities(names, descriptors, _SHORTLISTED)
 
 
 def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:

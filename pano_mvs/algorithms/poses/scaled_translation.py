@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Annotated
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, TypedDict
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.growth import GrownModel, grown_models
-from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
+from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle, strongest_first
+from pano_mvs.algorithms.poses.joining.join_groups import join_models
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
+from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
+
+
+class _GrowthArguments(TypedDict):
+    adjust: bool
+    confirmation: Confirmation | None
 
 
 @checks_settings
@@ -63,15 +72,12 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    groups: list[Poses] = []
-    reasons: dict[int, str] = {}
-    waiting = [group for group in connected_groups(pairs.geometries, len(names)) if len(group) > 1]
-    while waiting:
-        grown = grown_models(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)[0]
-        groups.append(_finished(grown, adjust=adjust))
-        reasons |= grown.refused
-        left = {edge for edge in pairs.geometries if edge[0] in grown.refused and edge[1] in grown.refused}
-        waiting += [group for group in connected_groups(left, len(names)) if len(group) > 1]
+    settings = _Growth(adjust, confirmation)
+    models, reasons = settings.models(pairs, lambda group: grown_models(pairs, group, **settings.arguments)[0])
+    if _connected_but_apart(pairs, models):
+        parts, _ = settings.models(pairs, lambda group: strongest_first(pairs, group, **settings.arguments))
+        models = min(models, parts, key=_rank)
+    groups = [_finished(grown, adjust=adjust) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
@@ -85,6 +91,63 @@ def solve_scaled_translation(
             metric=False,
         )
     return join_groups(groups, order=names, rejected=rejected)
+
+
+@dataclass(frozen=True, eq=False)
+class _Growth:
+    """How models of all groups are grown and joined."""
+
+    adjust: bool
+    confirmation: Confirmation | None
+
+    @property
+    def arguments(self) -> _GrowthArguments:
+        """The settings of the functions that grow a model."""
+        return {"adjust": self.adjust, "confirmation": self.confirmation}
+
+    def models(
+        self, pairs: Pairs, grow: Callable[[Collection[int]], GrownModel]
+    ) -> tuple[list[GrownModel], dict[int, str]]:
+        """Return the models of all groups, and the reasons for images that were refused at least once."""
+        models: list[GrownModel] = []
+        reasons: dict[int, str] = {}
+        waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
+        while waiting:
+            grown = grow(waiting.pop(0))
+            models.append(grown)
+            reasons |= grown.refused
+            left = {edge for edge in pairs.geometries if edge[0] in grown.refused and edge[1] in grown.refused}
+            waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
+        return self.joined(pairs, models), reasons
+
+    def joined(self, pairs: Pairs, models: Sequence[GrownModel]) -> list[GrownModel]:
+        """Return models after joining those that the pairs between them align, the largest first.
+
+        Images that could not be added to any model are tried as models of one camera.
+        """
+        placed = {image for grown in models for image in grown.model.cameras}
+        alone = [image for image in range(len(pairs.names)) if image not in placed and pairs.partners[image]]
+        parts = [grown.model for grown in models]
+        parts += [PlacedModel(pairs, {image: Rigid3.identity()}) for image in alone]
+        found: list[GrownModel] = []
+        for model, numbers in join_models(parts) if len(parts) > 1 else [(part, (0,)) for part in parts]:
+            if len(numbers) == 1:
+                found += [models[number] for number in numbers if number < len(models)]
+                continue
+            settle(model, adjust=self.adjust, confirmation=self.confirmation)
+            found.append(GrownModel(model, {}, check_cameras(model, self.confirmation)))
+        return sorted(found, key=lambda grown: (-len(grown.model.cameras), min(grown.model.cameras)))
+
+
+def _connected_but_apart(pairs: Pairs, models: Sequence[GrownModel]) -> bool:
+    """Return whether some pair joins two models, or a model and an image without a pose."""
+    number = {image: idx for idx, grown in enumerate(models) for image in grown.model.cameras}
+    return any(number.get(a, -1) != number.get(b, -2) for a, b in pairs.geometries)
+
+
+def _rank(models: Sequence[GrownModel]) -> tuple[int, int]:
+    """Return the sort key of models of a capture: more images with a pose first, then fewer groups."""
+    return -sum(len(grown.model.cameras) for grown in models), len(models)
 
 
 def _finished(grown: GrownModel, *, adjust: bool) -> Poses:

@@ -1,0 +1,156 @@
+"""The similarity that joins two models of the same capture, from matches between their images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.joining.cross_matches import (
+    CrossMatches,
+    alignment_cost,
+    errors_and_residuals,
+    parts_of,
+)
+from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
+from pano_mvs.algorithms.poses.joining.proposals import (
+    camera_proposals,
+    least_costly,
+    level_proposals,
+    pair_proposals,
+    pivoted,
+)
+from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+
+_FINALISTS, _PIVOTED = 10, 6
+_MAX_EVALUATIONS = 12
+_MIN_REFINED = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity of two models, and its evidence.
+
+    Attributes:
+        first_from_second: moves the second model into the world of the first one.
+        inliers: (M,) bool, the matches that agree.
+        witnesses: number of independent inliers whose point is known.
+        log10_false_alarms: expected number of equally good alignments among random matches.
+        rotation_std_deg: standard deviation of the rotation about its least certain axis.
+        offset_std_deg: that of the cameras of the second model, as an angle at the nearest camera of the first one.
+        scale_std: relative standard deviation of the scale; 0 if the second model has one camera.
+        threshold_rad: maximum error of an inlier.
+    """
+
+    first_from_second: Similarity3
+    inliers: NDArray[np.bool_]
+    witnesses: int
+    log10_false_alarms: float
+    rotation_std_deg: float
+    offset_std_deg: float
+    scale_std: float
+    threshold_rad: float
+
+
+def align_models(
+    matches: CrossMatches,
+    *,
+    rng: np.random.Generator,
+    threshold_rad: float,
+    has_scale: bool,
+    levels: tuple[FloatArray | None, FloatArray | None] = (None, None),
+    relative: Mapping[tuple[int, int], Rigid3] | None = None,
+) -> Alignment | None:
+    """Return the similarity of two models on which most of their matches agree; None if there is none.
+
+    Every camera of one model is resected against the known points of the other one, in both directions. Each pose
+    suggests a similarity, whose scale is the one with which most matches agree. The best are refined on all matches
+    together: those with a known point by the angles between rays and point, the others by their epipolar error.
+
+    Args:
+        matches: between the images of the two models.
+        rng: draws the samples.
+        threshold_rad: maximum error of an inlier.
+        has_scale: whether the second model has a scale of its own, i.e. more than one camera.
+        levels: level_from_world of each model, (3, 3), or None if it is not known (see `level_pairs`).
+        relative: second_from_first of pairs of images, |t| = 1, as further proposals.
+    """
+    proposals = camera_proposals(matches, rng=rng, threshold_rad=threshold_rad, has_scale=has_scale)
+    if levels[0] is not None and levels[1] is not None:
+        proposals += level_proposals(matches, (levels[0], levels[1]), rng=rng, threshold_rad=threshold_rad)
+    proposals += pair_proposals(matches, relative or {}, threshold_rad=threshold_rad)
+    if not proposals:
+        return None
+    proposals = least_costly(proposals, matches, threshold_rad=threshold_rad, count=_PIVOTED)
+    for start in tuple(proposals):
+        proposals += pivoted(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
+    finalists = [
+        _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
+        for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)
+    ]
+    costs = [alignment_cost(similarity, matches, threshold_rad=threshold_rad) for similarity, _ in finalists]
+    return _judged(*finalists[int(np.argmin(costs))], matches, threshold_rad=threshold_rad)
+
+
+def _refined(
+    similarity: FloatArray, matches: CrossMatches, *, threshold_rad: float, has_scale: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return the similarity refined on the matches near it, and the derivatives of its residuals."""
+    jacobian = np.zeros((0, 7))
+    for widen in (3.0, 1.5):
+        near = errors_and_residuals(similarity, matches)[0] < widen * threshold_rad
+        if near.sum() < _MIN_REFINED:
+            break
+        similarity, jacobian = _least_squares(
+            similarity, matches[np.flatnonzero(near)], scale_rad=0.5 * threshold_rad, size=7 if has_scale else 6
+        )
+    return similarity, jacobian
+
+
+def _least_squares(
+    start: FloatArray, matches: CrossMatches, *, scale_rad: float, size: int
+) -> tuple[FloatArray, FloatArray]:
+    """Minimise the Cauchy loss of all residuals over turn, shift and, if `size` is 7, scale."""
+    from scipy.optimize import least_squares  # slow to import
+
+    middle = matches.centers[:, 1].mean(axis=0)
+
+    def residuals(step: FloatArray) -> FloatArray:
+        return errors_and_residuals(_stepped(start, step, middle), matches)[1].ravel()
+
+    solved = least_squares(residuals, np.zeros(size), loss="cauchy", f_scale=scale_rad, max_nfev=_MAX_EVALUATIONS)
+    return _stepped(start, solved.x, middle), np.asarray(solved.jac)
+
+
+def _stepped(similarity: FloatArray, step: FloatArray, middle: FloatArray) -> FloatArray:
+    """Return a similarity turned, shifted and scaled a little about a point of the second model."""
+    rotation, shift, scale = parts_of(similarity)
+    place = scale * rotation @ middle + shift
+    turned = rotation_from_rotvec(step[:3]) @ rotation
+    scaled = scale * np.exp(np.clip(step[6], -1, 1)) if len(step) == 7 else scale
+    return np.concatenate([turned.ravel(), place + step[3:6] - scaled * turned @ middle, [scaled]])
+
+
+def _judged(similarity: FloatArray, jacobian: FloatArray, matches: CrossMatches, *, threshold_rad: float) -> Alignment:
+    errors = errors_and_residuals(similarity, matches)[0]
+    inliers = errors < threshold_rad
+    rotation, shift, scale = parts_of(similarity)
+    witnesses, alarms = log10_false_alignments(
+        similarity, matches[np.flatnonzero(matches.known)], inliers[matches.known], threshold_rad=threshold_rad
+    )
+    noise_rad = max(float(np.sqrt(np.mean(errors[inliers] ** 2))) if inliers.any() else 0.0, 0.2 * threshold_rad)
+    stds = deviations(similarity, jacobian, matches[np.flatnonzero(inliers)], noise_rad=noise_rad)
+    return Alignment(
+        first_from_second=Similarity3(scale, rotation, shift),
+        inliers=inliers,
+        witnesses=witnesses,
+        log10_false_alarms=alarms,
+        rotation_std_deg=stds[0],
+        offset_std_deg=stds[1],
+        scale_std=stds[2],
+        threshold_rad=threshold_rad,
+    )

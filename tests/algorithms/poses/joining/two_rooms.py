@@ -1,0 +1,89 @@
+"""Two rooms of points that see each other through a door, with two cameras in each, and no pictures."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.scene import Features, TwoView
+
+FloatArray = NDArray[np.float64]
+
+CENTERS = {
+    "a1": (-2.4, 0.0, 0.3),
+    "a2": (-1.5, 0.05, -0.8),
+    "b1": (2.3, 0.02, -0.4),
+    "b2": (1.6, -0.03, 0.9),
+}
+NOISE_RAD = 3e-4
+
+
+def room_poses(*, turned: bool = False) -> dict[str, Rigid3]:
+    """Return cam_from_world of two cameras in either room, level with any heading, or turned in any way."""
+    rng = np.random.default_rng(4)
+    poses = {}
+    for name, center in CENTERS.items():
+        heading = (0.0, rng.uniform(-np.pi, np.pi), 0.0)
+        turn = rng.uniform(-1.5, 1.5, 3) if turned else np.zeros(3)
+        poses[name] = Rigid3.from_center(rotation_from_rotvec(turn) @ rotation_from_rotvec(heading), np.array(center))
+    return poses
+
+
+def room_features(poses: dict[str, Rigid3], *, door: int, own: int = 220) -> dict[str, Features]:
+    """Return the key points of all cameras: those of the own room, and some of the other one seen through the door.
+
+    Args:
+        poses: cam_from_world by name.
+        door: number of points of either room that the cameras of the other room see too.
+        own: number of points of each room.
+    """
+    rng = np.random.default_rng(7)
+    points = np.concatenate([_room_points(rng, -2.0, own), _room_points(rng, 2.0, own)])
+    through = np.concatenate([_door_points(rng, -3.0, door), _door_points(rng, 3.0, door)])
+    descriptors = rng.integers(0, 120, (len(points) + len(through), 64)).astype(np.float32)
+    features = {}
+    for name, pose in poses.items():
+        mine = np.arange(own) + (0 if name[0] == "a" else own)
+        seen = np.concatenate([mine, 2 * own + np.arange(len(through))])
+        rays = pose.apply(np.concatenate([points, through])[seen])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays += rng.normal(0, NOISE_RAD, rays.shape)
+        features[name] = Features(
+            bearings=rays / np.linalg.norm(rays, axis=1, keepdims=True),
+            descriptors=descriptors[seen] + rng.integers(-4, 5, (len(seen), 64)).astype(np.float32),
+            sizes_rad=np.full(len(seen), 0.02, np.float32),
+            scores=np.linspace(1, 0.1, len(seen), dtype=np.float32),
+            colors_rgb=np.full((len(seen), 3), 128, np.uint8),
+            metric="l2",
+            size_hw=(512, 1024),
+        )
+    return features
+
+
+def verified_inside(features: dict[str, Features]) -> dict[tuple[str, str], TwoView]:
+    """Return the pairs of the capture, of which only those within a room have a geometry."""
+    return {
+        (a, b): verify_pair(
+            features[a], features[b], match_features(features[a], features[b]), rng=np.random.default_rng(1)
+        )
+        if a[0] == b[0]
+        else TwoView.failed("rooms apart", candidates=20)
+        for a, b in combinations(features, 2)
+    }
+
+
+def _room_points(rng: np.random.Generator, middle: float, count: int) -> FloatArray:
+    points = rng.uniform(-1, 1, (count, 3))
+    side = rng.integers(3, size=count)
+    points[np.arange(count), side] = np.sign(points[np.arange(count), side])
+    return np.asarray(points * (1.9, 1.3, 2.0) + (middle, 0, 0))
+
+
+def _door_points(rng: np.random.Generator, x: float, count: int) -> FloatArray:
+    points: FloatArray = rng.uniform(-1, 1, (count, 3)) * (0.8, 0.9, 0.5) + (x, 0.1, 0.0)
+    return points
