@@ -63,7 +63,12 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "old", "new", "stages"),
     [
-        ("algorithms.poses.adjustment.kernels_patch_alignment", "= 12, 0.003", "= 12, 0.004", {"poses.refine"}),
+        (
+            "algorithms.poses.adjustment.kernels_patch_alignment",
+            "= 12, 0.003",
+            "= 12, 0.004",
+            {"poses.refine", "poses.localise"},
+        ),
         ("algorithms.features.kernels_sphorb", "ARC = 10", "ARC = 9", {"features.sphorb"}),
         (
             "algorithms.patchmatch.kernels_planes",
