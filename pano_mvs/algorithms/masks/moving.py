@@ -32,8 +32,9 @@ _CHANGED, _CERTAIN = 10.0, 24.0
 _MIN_CERTAIN_SHARE = 0.15
 # The operator reaches to within this angle of straight down. What touches the operator's mask is within the other.
 _NADIR_DEG, _REACH_DEG = 30.0, 75.0
-# The mean probability of a person, by the network.
-_PERSON = 0.5
+# The mean probability of a person, by the network: of an area below the camera, where an operator is expected, and of
+# others. Furniture that the other views hide can have 0.77, and has 0.00 below the camera.
+_OPERATOR, _PERSON = 0.04, 0.85
 # As far around an area, the network's pixels belong to the person.
 _PERSON_REACH_DEG = 4.0
 # A vehicle's length, height and distance, in heights of the camera; it fills much of its outline.
@@ -74,10 +75,11 @@ def moving_pixels(
     """Return the pixels of a panorama whose colours contradict all other views, and that look like people or vehicles.
 
     The other views expect surfaces (`expected_view`). Where the colour differs from everything that they show there,
-    and around it, the panorama shows something that was there only then. Such an area is accepted if it is the
-    operator, so it reaches to the nadir or to an area that is masked already; or if the network of `people` finds a
-    person in it; or if it stands on the ground and has the size of a vehicle. Other areas, such as reflections and
-    things that the other views do not see, are ignored. Darker areas with unchanged hue on the ground are shadows.
+    and around it, the panorama shows something that was there only then. Such an area is accepted if it extends an
+    area of the operator that is masked already; or if the network of `people` finds a person in it, where less is
+    enough below the camera; or if it stands on the ground and has the size of a vehicle. Other areas, such as
+    reflections and things that the other views do not see, are ignored. Darker areas with unchanged hue on the ground
+    are shadows.
 
     Args:
         picture: (H, W, 3) uint8 RGB, at most `WIDTH` columns, masked pixels filled.
@@ -104,7 +106,7 @@ def moving_pixels(
     shadow = _shadows(expected) & valid
     found = nothing.copy()
     for area in _areas(changed & valid & ~shadow, expected, min_area_deg2):
-        if _is_operator(area, ~valid):
+        if _extends_mask(area, ~valid) or _is_operator(picture, area):
             found |= area
         elif passers_by and (person := _with_person(picture, area)).any():
             found |= person
@@ -130,13 +132,22 @@ def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask
     return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= _MIN_CERTAIN_SHARE))]
 
 
-def _is_operator(area: Mask, masked: Mask) -> bool:
-    """Return whether an area lies within the operator's reach and extends to the nadir, or to what is masked there."""
-    off_nadir_deg = np.degrees(np.arccos(np.clip(ray_grid((area.shape[0], area.shape[1]))[..., 1], -1, 1)))
+def _off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
+    return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
+
+
+def _is_operator(picture: Picture, area: Mask) -> bool:
+    """Return whether an area extends to below the camera, where the operator stands, and may be a person."""
+    if _off_nadir_deg((area.shape[0], area.shape[1]))[area].min() >= _NADIR_DEG:
+        return False
+    return person_at(picture, area)[0] >= _OPERATOR
+
+
+def _extends_mask(area: Mask, masked: Mask) -> bool:
+    """Return whether an area lies within the operator's reach and extends what is masked there."""
     weights = pixel_weights(area.shape)
-    if off_nadir_deg[area].min() < _NADIR_DEG:
-        return True
-    if weights[area & (off_nadir_deg < _REACH_DEG)].sum() < 0.9 * weights[area].sum():
+    within = area & (_off_nadir_deg((area.shape[0], area.shape[1])) < _REACH_DEG)
+    if weights[within].sum() < 0.9 * weights[area].sum():
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
     return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
