@@ -72,7 +72,7 @@ def test_blocks_of_a_rendered_room_become_one_model_of_it(pano_mvs: Command, tmp
     ranges = read_range_tiff(Path("out/merged/range/007.tiff")) * room_from_merged.scale
     rays = cameras[7].rotation.T @ ray_grid(ranges.shape).reshape(-1, 3).T
     errors = np.abs(ranges.ravel() / range_along(room, cameras[7].center, rays.T) - 1)
-    assert np.nanmedian(errors) < 0.02
+    assert np.nanmedian(errors) < 0.025
     cloud = read_ply(Path("out/merged/cloud.ply"))
     parts = [len(read_ply(Path(f"out/{number}/cloud.ply"))) for number in (1, 2)]
     assert max(parts) / 2 < len(cloud) < sum(parts)

@@ -40,6 +40,9 @@ def solve_scaled_translation(
     ] = "cauchy",
     kappa: Annotated[float, Setting("width of the paper's clusters of scale factors", gt=0)] = 0.01,
     adjust: Annotated[bool, Setting("adjust all cameras and points as the model grows")] = True,
+    join_rooms: Annotated[
+        bool, Setting("join groups that verified pairs connect through too few points for one camera at a time")
+    ] = False,
     load: Callable[[str], Picture] | None = None,
     rng: np.random.Generator,
 ) -> Poses:
@@ -59,6 +62,8 @@ def solve_scaled_translation(
         kappa: the paper's κ.
         adjust: whether to adjust all cameras and points together at intervals, which keeps errors from accumulating. If
             False, the poses are those of the chain, as in the paper.
+        join_rooms: whether to align whole groups that pairs connect, as with `find_bridges`. Where structure repeats,
+            a group may be joined in the wrong place without a doubt.
         load: returns the panorama and the mask of an image by its name; None leaves every decision to the pairs.
         rng: not used; part of the interface of pose solvers.
 
@@ -72,9 +77,9 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    settings = _Growth(adjust, confirmation)
+    settings = _Growth(adjust, confirmation, join_rooms)
     models, reasons = settings.models(pairs, lambda group: grown_models(pairs, group, **settings.arguments)[0])
-    if _connected_but_apart(pairs, models):
+    if join_rooms and _connected_but_apart(pairs, models):
         parts, _ = settings.models(pairs, lambda group: strongest_first(pairs, group, **settings.arguments))
         models = min(models, parts, key=_rank)
     groups = [_finished(grown, adjust=adjust) for grown in models]
@@ -99,6 +104,7 @@ class _Growth:
 
     adjust: bool
     confirmation: Confirmation | None
+    join_rooms: bool
 
     @property
     def arguments(self) -> _GrowthArguments:
@@ -118,7 +124,7 @@ class _Growth:
             reasons |= grown.refused
             left = {edge for edge in pairs.geometries if edge[0] in grown.refused and edge[1] in grown.refused}
             waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
-        return self.joined(pairs, models), reasons
+        return self.joined(pairs, models) if self.join_rooms else models, reasons
 
     def joined(self, pairs: Pairs, models: Sequence[GrownModel]) -> list[GrownModel]:
         """Return models after joining those that the pairs between them align, the largest first.
