@@ -90,6 +90,7 @@ def test_only_bad_pictures(pano_mvs: Command, short: Path, capture: Path) -> Non
     assert "none of the 4 items can be used" in result.flat
 
 
+@pytest.mark.slow
 def test_mixed_sizes_work(pano_mvs: Command, capture: Path) -> None:
     path = capture / "images" / "002.png"
     image = read_picture(path)
@@ -99,6 +100,7 @@ def test_mixed_sizes_work(pano_mvs: Command, capture: Path) -> None:
     assert run_json(Path("out"))["poses"]["registered"] == [f"00{number}.png" for number in range(4)]
 
 
+@pytest.mark.slow
 def test_two_identical_pictures(pano_mvs: Command, capture: Path) -> None:
     shutil.copy(capture / "images" / "000.png", capture / "images" / "000_copy.png")
     result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
@@ -153,6 +155,7 @@ def test_output_folder_that_is_the_capture(pano_mvs: Command, short: Path, captu
     assert "reads this folder" in result.flat
 
 
+@pytest.mark.slow
 def test_outputs_of_an_interrupted_run_are_no_pictures(pano_mvs: Command, capture: Path) -> None:
     out = capture / "images" / "out"
     arguments = ("run", "quickstart", "--images", capture / "images", "--out", out, *SMALL)

@@ -47,6 +47,7 @@ def workflow(capture: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_plugins_cost_is_run_and_cached_by_its_code(pano_mvs: Command, workflow: Path) -> None:
     result = pano_mvs("run", workflow)
     assert result.code == 0, result.text

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from pano_mvs.geometry import roll_panorama
 from pano_mvs.io.ranges.files import read_range_tiff
@@ -43,6 +44,7 @@ def rolled_capture(capture: Path, folder: Path, columns: int) -> Path:
     return workflow
 
 
+@pytest.mark.slow
 def test_rolled_pictures_give_rolled_range_maps(pano_mvs: Command, capture: Path, tmp_path: Path) -> None:
     quarter = 320 // 4
     straight = rolled_capture(capture, tmp_path / "straight", 0)

@@ -68,6 +68,7 @@ def insert_chunk(picture: Path, chunk: bytes) -> None:
     picture.write_bytes(data[:33] + whole + data[33:])
 
 
+@pytest.mark.slow
 def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Path) -> None:
     truth = true_poses(capture)
     baseline = float(np.linalg.norm(truth["002.png"].center - truth["000.png"].center))

@@ -134,6 +134,7 @@ def test_cloud_lies_on_the_walls(quickstart: tuple[Path, str]) -> None:
     assert (error < 0.05).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_second_run_computes_nothing_and_separate_stores_agree(pano_mvs: Command, capture: Path) -> None:
     arguments = ("run", "known_poses", *known(capture))
     first = pano_mvs(*arguments, "--out", "a", "--cache", "cache_a")
@@ -198,6 +199,7 @@ def test_evaluate_compares_an_output_folder_with_the_truth(
     assert "Give the output folder of a finished run" in nothing.flat
 
 
+@pytest.mark.slow
 def test_an_output_folder_beside_the_pictures_is_not_taken_for_pictures(pano_mvs: Command, capture: Path) -> None:
     """`--images .` with `out/` below it once swept up its own previews."""
     shutil.copytree(capture / "images", Path.cwd(), dirs_exist_ok=True)

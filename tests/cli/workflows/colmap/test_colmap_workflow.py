@@ -55,6 +55,7 @@ def errors(out: Path, capture: Path) -> PoseErrors:
     return relative_pose_errors(found, {Path(view.name).name: view.cam_from_world for view in views})
 
 
+@pytest.mark.slow
 def test_colmap_preset_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: Path) -> None:
     arguments = ("colmap", "--images", rendered / "images", "--out", "o", *SMALL)
     result = pano_mvs("run", *arguments, "--set", f"scores.truth={rendered / 'truth'}")
