@@ -55,6 +55,7 @@ from pano_mvs.geometry.sphere import (
     pixel_solid_angle,
     ray_from_pixel,
     ray_grid,
+    sines_of_grid,
     spiral_rays,
 )
 from pano_mvs.geometry.transforms import Rigid3, Similarity3, similarity_from_points
@@ -86,6 +87,7 @@ __all__ = [
     "rotvec_from_rotation",
     "sample_panorama",
     "similarity_from_points",
+    "sines_of_grid",
     "skew",
     "spiral_rays",
     "triangulate_bearings",

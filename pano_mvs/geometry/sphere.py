@@ -62,13 +62,23 @@ def ray_grid(size_hw: tuple[int, int]) -> FloatArray:
     """
     height, width = _checked_size(size_hw)
     # One row and one column are enough: nothing as large as the result is made beside it.
-    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    turns, elevations = sines_of_grid(size_hw)
     rays = np.empty((height, width, 3))
-    rays[..., 0] = np.cos(elevation) * np.sin(azimuth)
-    rays[..., 1] = -np.sin(elevation)
-    rays[..., 2] = np.cos(elevation) * np.cos(azimuth)
+    rays[..., 0] = elevations[1][:, None] * turns[0]
+    rays[..., 1] = -elevations[0][:, None]
+    rays[..., 2] = elevations[1][:, None] * turns[1]
     return rays
+
+
+def sines_of_grid(size_hw: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return sin θ and cos θ of the columns, (2, width), and sin φ and cos φ of the rows, (2, height).
+
+    The ray through a pixel centre is (cos φ sin θ, −sin φ, cos φ cos θ).
+    """
+    height, width = _checked_size(size_hw)
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    return np.stack([np.sin(azimuth), np.cos(azimuth)]), np.stack([np.sin(elevation), np.cos(elevation)])
 
 
 def spiral_rays(count: int) -> FloatArray:

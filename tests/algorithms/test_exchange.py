@@ -7,13 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges, projected, surface_planes
-from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows, nearest_of_cells, next_run
-from pano_mvs.algorithms.patchmatch.kernels_refine import STRETCH
+from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges, offers_of, projected, surface_planes
+from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_pixels, land_nearest
 from pano_mvs.algorithms.patchmatch.refine import reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError
@@ -58,32 +55,20 @@ def on_a_surface(truth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 @pytest.mark.kernel("patchmatch.kernels_exchange")
-def test_the_nearest_point_of_a_cell_counts_and_the_first_of_equals() -> None:
+def test_the_nearest_point_of_a_pixel_counts_and_the_first_of_equals() -> None:
     rng = np.random.default_rng(4)
     cells, distances = rng.integers(0, 40, 300), rng.integers(1, 6, 300).astype(np.float64)
     order = np.lexsort((distances, cells))
     expected = np.full(50, -1)
     occupied, firsts = np.unique(cells[order], return_index=True)
     expected[occupied] = order[firsts]
-    np.testing.assert_array_equal(nearest_of_cells(cells, distances, 50), expected)
-
-
-@given(st.lists(st.booleans(), max_size=60), st.integers(0, 3))
-def test_runs_cover_what_is_wanted_once(bits: list[bool], spread: int) -> None:
-    wanted = np.repeat(np.array(bits, np.bool_), 1 + 9 * spread)
-    covered, start = np.zeros(len(wanted), np.int64), 0
-    while True:
-        first, stop = next_run(wanted, start)
-        assert start <= first <= stop <= first + STRETCH
-        if first >= len(wanted):
-            break
-        assert wanted[first]
-        assert wanted[stop - 1]
-        covered[first:stop] += 1
-        start = stop
-    assert covered.max(initial=0) <= 1
-    assert np.all(covered[wanted] == 1)
-    assert covered.sum() <= 9 * wanted.sum()
+    nearest, pixels = np.full((5, 10), np.nan), np.full((5, 10), -1)
+    places = np.stack([cells % 10 + 0.5, cells // 10 + 0.5, distances])
+    ranges = np.ones(300, np.float32)
+    land_nearest(places[:, :200], ranges[:200], 0, nearest, pixels)
+    land_nearest(places[:, 200:], ranges[200:], 200, nearest, pixels)
+    np.testing.assert_array_equal(pixels.ravel(), expected)
+    np.testing.assert_array_equal(nearest.ravel()[occupied], distances[expected[occupied]])
 
 
 @pytest.mark.kernel("patchmatch.kernels_exchange", "patchmatch.kernels_match", "patchmatch.kernels_refine")
@@ -92,13 +77,19 @@ def test_compiled_correlations_equal_the_definition(scene: Scene) -> None:
     offsets, stretches = column_offsets(SIZE, 4, spherical=True)[:, ::2].copy(), column_stretch(SIZE[0], spherical=True)
     wanted = np.zeros(SIZE, np.bool_)
     wanted[::9, 5::31] = True
-    planes = surface_planes(truth, None, ray_grid(SIZE), wanted=np.ones(SIZE, np.bool_))
-    found = np.full((1, *SIZE), -2, np.float32)
+    rows, columns = np.nonzero(wanted)
+    planes = np.zeros((3, *SIZE), np.float32)
+    planes[:, wanted] = surface_planes(truth[wanted], None, ray_grid(SIZE)[wanted])
+    found = np.zeros((1, *SIZE), np.float32)
     arrays = (
         reference_arrays(picture, offsets, stretches),
         source_arrays([sources[0].picture], [sources[0].from_reference], None, reach=0.0),
     )
-    correlate_rows(0, SIZE[0], planes, wanted, *arrays, (np.float32(1 / 25), np.float32(0.16)), found)
+    values_of = np.empty((1, len(rows)), np.float32)
+    starts = np.searchsorted(rows, np.arange(SIZE[0] + 1))
+    numbers = np.float32(1 / 25), np.float32(0.16)
+    correlate_pixels((0, SIZE[0]), starts, columns, planes[:, wanted], *arrays, numbers, values_of)
+    found[:, wanted] = values_of
     pose, grey = sources[0].from_reference, (sources[0].picture @ LUMA)[..., None]
     for row, column in np.argwhere(wanted):
         places, values, weights = oracle.window(
@@ -115,8 +106,9 @@ def test_compiled_correlations_equal_the_definition(scene: Scene) -> None:
 
 def test_true_ranges_of_a_source_land_on_true_ranges(scene: Scene) -> None:
     _, truth, sources = scene
-    landed, normals = projected(sources[0], SIZE)
-    assert normals is None
+    landed, positions = projected(sources[0], SIZE)
+    assert offers_of(sources[0], np.full(SIZE, 9, np.float32)).normals is None
+    np.testing.assert_array_equal(positions >= 0, np.isfinite(landed))
     ratio = (landed / truth)[np.isfinite(landed) & on_a_surface(truth)]
     assert len(ratio) > 1500
     assert np.mean(np.abs(ratio - 1) < 0.05) > 0.9
@@ -135,9 +127,9 @@ def test_normals_turn_with_the_camera() -> None:
     turn = Rigid3(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
     normals = -ray_grid((16, 32)).astype(np.float16)
     source = SourceView(np.zeros((16, 32, 3), np.uint8), seen(np.full((16, 32), 2, np.float32), normals), turn)
-    landed, turned = projected(source, (16, 32))
-    assert np.isfinite(landed).all()
-    np.testing.assert_allclose(known(turned), -ray_grid((16, 32)), atol=2e-3)
+    offers = offers_of(source, np.full((16, 32), 9, np.float32))
+    np.testing.assert_array_equal(offers.pixels, np.arange(16 * 32))
+    np.testing.assert_allclose(known(offers.normals).reshape(16, 32, 3), -ray_grid((16, 32)), atol=2e-3)
 
 
 def test_planes_go_through_their_points_with_their_normals() -> None:
@@ -145,7 +137,8 @@ def test_planes_go_through_their_points_with_their_normals() -> None:
     rays, ranges = ray_grid(size), np.linspace(1, 4, 512, dtype=np.float32).reshape(size)
     normals = np.broadcast_to(np.array([0, -1, 0], np.float16), (*size, 3)).copy()
     normals[0] = np.nan
-    planes = surface_planes(ranges, normals, rays, wanted=np.ones(size, np.bool_)).astype(np.float64)
+    planes = surface_planes(ranges.ravel(), normals.reshape(-1, 3), rays.reshape(-1, 3)).astype(np.float64)
+    planes = planes.reshape(3, *size)
     np.testing.assert_allclose(np.einsum("ahw,hwa->hw", planes, rays * ranges[..., None]), 1, rtol=1e-5)
     direction = planes / np.linalg.norm(planes, axis=0)
     np.testing.assert_allclose(np.abs(direction[1, 1:6]), 1, rtol=1e-5)

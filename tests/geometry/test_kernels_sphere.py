@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -109,3 +111,11 @@ def test_fast_angles_equal_the_plain_ones_to_the_precision_of_float32() -> None:
             assert np.cos(float(found) - expected) == pytest.approx(1, abs=1e-12)
             assert np.sin(float(found) - expected) == pytest.approx(0, abs=1e-6)
         assert kernels_sphere.fast_dip(y, level) == pytest.approx(np.arctan2(float(y), float(level)), abs=1e-6)
+
+
+def test_the_arc_tangent_without_branches_is_as_exact_as_the_library() -> None:
+    values = [0.0, 1e-200, 1e-9, 0.3, 0.66, 0.67, 1.0, 5.0, 1e8]
+    for y in [*values, *(-value for value in values)]:
+        for x in [*values, *(-value for value in values)]:
+            expected = 0.0 if x == y == 0 else math.atan2(y + 0.0, x + 0.0)
+            assert kernels_sphere.even_atan2(y, x) == pytest.approx(expected, rel=1e-15, abs=1e-15)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -15,12 +15,11 @@ from pano_mvs.algorithms.filters.view_doubts import Agreement
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
-_Judged = tuple[NDArray[np.uint8], FloatArray, FloatArray]
 
 # Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
@@ -194,7 +193,9 @@ def compare_with_sources(
         max_relative_error: largest relative difference of ranges that agree.
         max_angle: largest angle between pixel and reprojection, in radians.
     """
-    from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
+    import numba  # slow to import
+
+    from pano_mvs.algorithms.filters.kernels_reprojection import compare_rows  # compiles on import
 
     shape = ranges.shape
     comparison = Comparison(
@@ -203,72 +204,55 @@ def compare_with_sources(
         np.zeros(shape, np.uint16),
         *(np.zeros(shape) for _ in range(3)),
     )
+    counts = comparison.agreeing, comparison.contradicting, comparison.hiding
+    sums = comparison.support, comparison.motion, comparison.squared_error
+    # Copied, since the kernel is compiled once more for arrays that are read-only.
+    ranges, grid = np.array(ranges, np.float32), sines_of_grid((shape[0], shape[1]))
+    limits = max_relative_error, max_angle, _MAX_SURFACE_STEP
+    views = [
+        (_arrays_of(moved), seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0]))
+        for source, moved in zip(sources, source_from_reference, strict=True)
+    ]
 
-    def add(rows: slice, judged: _Judged) -> None:
-        verdicts, supports, motions = judged
-        comparison.agreeing[rows] += verdicts == kernels.AGREES
-        comparison.contradicting[rows] += verdicts == kernels.CONTRADICTS
-        comparison.hiding[rows] += verdicts == kernels.HIDDEN
-        # Rounded, so that the sum of a few values does not depend on the order of the sources.
-        comparison.support[rows] += np.rint(supports * 2**40) / 2**40
-        comparison.motion[rows] += np.rint(supports * motions * 2**40) / 2**40
-        # A support is (1 − (error / limit)²)².
-        squared_error = supports * max_angle**2 * (1 - np.sqrt(supports))
-        comparison.squared_error[rows] += np.rint(squared_error * 2**60) / 2**60
+    def compare(first: int, rows: int) -> None:
+        for view, known in views:
+            compare_rows((first, first + rows), ranges, grid, view, known, limits, counts, sums)
 
-    _judge_all(ranges, sources, source_from_reference, limits=(max_relative_error, max_angle), add=add)
+    for_bands(compare, shape[0], threads=numba.get_num_threads())
     return comparison
 
 
 def agreeing_sources(
-    ranges: NDArray[np.float32],
+    points: FloatArray,
     sources: Sequence[RangeMap],
     source_from_reference: Sequence[Rigid3],
     *,
     max_relative_error: float,
     max_angle: float,
+    most: int = 255,
 ) -> NDArray[np.uint8]:
-    """Return the number of sources that agree with each pixel, (H, W), as in `compare_with_sources`, in less time."""
-    from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
+    """Return the number of sources that agree with each point, (N,), as in `compare_with_sources`.
 
-    agreeing = np.zeros(ranges.shape, np.uint8)
+    Args:
+        points: (N, 3) in the reference frame.
+        sources: range maps; filled pixels are left out.
+        source_from_reference: pose of each.
+        max_relative_error: largest relative difference of ranges that agree.
+        max_angle: largest angle between pixel and reprojection, in radians.
+        most: as many sources are enough; more are not counted.
+    """
+    from pano_mvs.algorithms.filters.kernels_reprojection import count_agreeing  # compiles on import
 
-    def add(rows: slice, judged: _Judged) -> None:
-        agreeing[rows] += judged[0] == kernels.AGREES
-
-    _judge_all(ranges, sources, source_from_reference, limits=(max_relative_error, max_angle), add=add)
+    agreeing = np.zeros(len(points), np.uint8)
+    limits = max_relative_error, max_angle, _MAX_SURFACE_STEP
+    for source, moved in zip(sources, source_from_reference, strict=True):
+        known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
+        count_agreeing(points, _arrays_of(moved), known, limits, most, agreeing)
     return agreeing
 
 
-def _judge_all(
-    ranges: NDArray[np.float32],
-    sources: Sequence[RangeMap],
-    source_from_reference: Sequence[Rigid3],
-    *,
-    limits: tuple[float, float],
-    add: Callable[[slice, _Judged], None],
-) -> None:
-    """Call `add(rows, (verdicts, supports, motions))` for bands of rows, each source in turn; see `judge_rows`."""
-    import numba  # slow to import
-
-    from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows  # compiles on import
-
-    height, width = ranges.shape
-    ranges, rays = np.ascontiguousarray(ranges), ray_grid((height, width))
-    all_limits = np.array([*limits, _MAX_SURFACE_STEP])
-    verdicts, supports, motions = np.empty(ranges.shape, np.uint8), np.empty(ranges.shape), np.empty(ranges.shape)
-    for source, moved in zip(sources, source_from_reference, strict=True):
-        view = np.ascontiguousarray(moved.rotation), np.ascontiguousarray(moved.translation)
-        known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
-        arguments = ranges, rays, view, known, all_limits, verdicts, supports, motions
-
-        def judge(first: int, rows: int, *, arguments: tuple[Any, ...] = arguments) -> None:
-            judge_rows(first, rows, *arguments)
-            band = slice(first, first + rows)
-            # In bands, so that the arrays are still in the cache.
-            add(band, (verdicts[band], supports[band], motions[band]))
-
-        for_bands(judge, height, threads=numba.get_num_threads())
+def _arrays_of(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
+    return np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
 
 
 def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:

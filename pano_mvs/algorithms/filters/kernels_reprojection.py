@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, pixel_from_ray
+from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, even_atan2, pixel_from_ray
 
 FloatArray = NDArray[np.float64]
 Triple = FloatArray | tuple[float, float, float]
@@ -16,6 +16,9 @@ Triple = FloatArray | tuple[float, float, float]
 # Verdicts of a source on a point: no information; it sees the same surface; it sees something farther away through
 # the point; something nearer hides the point.
 UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
+
+_U = np.uint64
+_FINE, _FINEST = 2.0**40, 2.0**60
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -105,47 +108,187 @@ def squared_motion(point: Triple, distance: float, baseline: FloatArray) -> floa
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judge_rows(
-    first: int,
-    rows: int,
+def locate_row(
     ranges: NDArray[np.float32],
-    rays: FloatArray,
+    turns: FloatArray,
+    elevation: tuple[float, float],
     view: tuple[FloatArray, FloatArray],
-    source_ranges: NDArray[np.float32],
-    limits: FloatArray,
-    verdicts: NDArray[np.uint8],
-    supports: FloatArray,
-    motions: FloatArray,
+    size_hw: tuple[int, int],
+    places: FloatArray,
 ) -> None:
-    """Write the verdicts of one source on the pixels of some rows.
+    """Project the points of one row into a source, in loops that can be vectorised.
 
     Args:
-        first: the first row.
-        rows: number of rows.
+        ranges: (W,) float32 of the row; the place of a NaN is NaN.
+        turns: (2, W) sin θ and cos θ of the columns.
+        elevation: sin φ and cos φ of the row.
+        view: rotation (3, 3) and translation (3,) source_from_reference.
+        size_hw: of the source.
+        places: (3, W) written: x and y in pixels, and the distance from the source.
+    """
+    rotation, translation = view
+    sine, cosine = elevation
+    r00, r01, r02, t0 = rotation[0, 0], rotation[0, 1], rotation[0, 2], translation[0]
+    r10, r11, r12, t1 = rotation[1, 0], rotation[1, 1], rotation[1, 2], translation[1]
+    r20, r21, r22, t2 = rotation[2, 0], rotation[2, 1], rotation[2, 2], translation[2]
+    height, width = size_hw
+    for i in range(_U(len(ranges))):
+        r = ranges[i]
+        p0, p1, p2 = r * (cosine * turns[0, i]), r * -sine, r * (cosine * turns[1, i])
+        a = r00 * p0 + r01 * p1 + r02 * p2 + t0
+        b = r10 * p0 + r11 * p1 + r12 * p2 + t1
+        c = r20 * p0 + r21 * p1 + r22 * p2 + t2
+        places[0, i] = (even_atan2(a, c) / (2 * math.pi) + 0.5) * width
+        places[1, i] = (0.5 - even_atan2(-b, math.sqrt(a * a + c * c)) / math.pi) * height
+    for i in range(_U(len(ranges))):
+        r = ranges[i]
+        p0, p1, p2 = r * (cosine * turns[0, i]), r * -sine, r * (cosine * turns[1, i])
+        a = r00 * p0 + r01 * p1 + r02 * p2 + t0
+        b = r10 * p0 + r11 * p1 + r12 * p2 + t1
+        c = r20 * p0 + r21 * p1 + r22 * p2 + t2
+        places[2, i] = math.sqrt(a * a + b * b + c * c)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def reproject_row(
+    ranges: NDArray[np.float32],
+    turns: FloatArray,
+    elevation: tuple[float, float],
+    baseline: FloatArray,
+    distances: FloatArray,
+    seen: FloatArray,
+    angles: FloatArray,
+) -> None:
+    """Write `reprojection_angle`, (W,), of the points of one row, in a loop that can be vectorised.
+
+    Args:
+        ranges: (W,) float32 of the row.
+        turns: (2, W) sin θ and cos θ of the columns.
+        elevation: sin φ and cos φ of the row.
+        baseline: (3,) the source's centre in the reference frame.
+        distances: (W,) of the points from the source.
+        seen: (W,) the source's ranges in their places.
+        angles: (W,) written.
+    """
+    sine, cosine = elevation
+    b0, b1, b2 = baseline[0], baseline[1], baseline[2]
+    for i in range(_U(len(ranges))):
+        r, ratio = ranges[i], seen[i] / distances[i]
+        p0, p1, p2 = r * (cosine * turns[0, i]), r * -sine, r * (cosine * turns[1, i])
+        o0, o1, o2 = b0 + ratio * (p0 - b0), b1 + ratio * (p1 - b1), b2 + ratio * (p2 - b2)
+        x, y, z = p1 * o2 - p2 * o1, p2 * o0 - p0 * o2, p0 * o1 - p1 * o0
+        angles[i] = even_atan2(math.sqrt(x * x + y * y + z * z), p0 * o0 + p1 * o1 + p2 * o2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def judge_row(
+    ranges: NDArray[np.float32],
+    turns: FloatArray,
+    elevation: tuple[float, float],
+    view: tuple[FloatArray, FloatArray, FloatArray],
+    source_ranges: NDArray[np.float32],
+    limits: Triple,
+    verdicts: NDArray[np.uint8],
+    found: FloatArray,
+) -> None:
+    """Write the verdicts of one source on the points of a row: what `judge_point` returns for each of them.
+
+    Args:
+        ranges: (W,) float32 of the row.
+        turns: (2, W) sin θ and cos θ of the columns.
+        elevation: sin φ and cos φ of the row.
+        view: rotation (3, 3), translation (3,) source_from_reference, and the source's centre (3,) in the reference.
+        source_ranges: (Hs, Ws) float32.
+        limits: see `judge_point`.
+        verdicts: (W,) uint8, written.
+        found: (5, W) written: x, y, distance from the source, the source's range, angle of the reprojection.
+    """
+    rotation, translation, baseline = view
+    locate_row(ranges, turns, elevation, (rotation, translation), source_ranges.shape, found)
+    for i in range(len(ranges)):
+        place = found[2, i] > 0  # False for NaN
+        found[3, i] = sample_range(source_ranges, found[0, i], found[1, i], limits[2]) if place else math.nan
+    reproject_row(ranges, turns, elevation, baseline, found[2], found[3], found[4])
+    for i in range(_U(len(ranges))):
+        distance, seen = found[2, i], found[3, i]
+        verdict = UNKNOWN  # for NaN, all comparisons are False
+        verdict = CONTRADICTS if seen > distance * (1 + 2 * limits[0]) else verdict
+        verdict = HIDDEN if seen < distance * (1 - 2 * limits[0]) else verdict
+        agrees = abs(seen - distance) / distance <= limits[0] and found[4, i] <= limits[1]
+        verdicts[i] = AGREES if agrees else verdict
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def compare_rows(
+    rows: tuple[int, int],
+    ranges: NDArray[np.float32],
+    grid: tuple[FloatArray, FloatArray],
+    view: tuple[FloatArray, FloatArray],
+    source_ranges: NDArray[np.float32],
+    limits: Triple,
+    counts: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]],
+    sums: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Add the verdicts of one source on the pixels of some rows to those of other sources.
+
+    Sums are rounded to a multiple of 2⁻⁴⁰ or 2⁻⁶⁰, so that they do not depend on the order of the sources.
+
+    Args:
+        rows: the first row, and the end.
         ranges: (H, W) float32 of the reference.
-        rays: (H, W, 3) its rays.
+        grid: (2, W) sin θ and cos θ of the columns, (2, H) sin φ and cos φ of the rows.
         view: rotation (3, 3) and translation (3,) source_from_reference.
         source_ranges: (Hs, Ws) float32.
         limits: see `judge_point`.
-        verdicts: (H, W) uint8, written.
-        supports: (H, W) float64, written: (1 − (angle / limit)²)² where the source agrees, else 0.
-        motions: (H, W) float64, written: `squared_motion` where the source agrees, else 0.
+        counts: (H, W) each: sources that agree, that contradict, and that see something nearer.
+        sums: (H, W) each: of the supports (1 − (angle / limit)²)² of those that agree, of these times
+            `squared_motion`, and of these times the squared angles.
     """
     rotation, translation = view
+    width = ranges.shape[1]
     baseline = -(rotation.T @ translation)
-    for row in range(first, first + rows):
-        for column in range(ranges.shape[1]):
-            r = ranges[row, column]
-            verdicts[row, column], supports[row, column], motions[row, column] = UNKNOWN, 0.0, 0.0
-            if not math.isfinite(r):
-                continue
-            ray = rays[row, column]
-            point = (r * ray[0], r * ray[1], r * ray[2])
-            verdict, _, _, _, seen = judge_point(point, rotation, translation, baseline, source_ranges, limits)
-            verdicts[row, column] = verdict
+    turns, elevations = grid
+    verdicts, found = np.empty(width, np.uint8), np.empty((5, width))
+    agreeing, contradicting, hiding = counts
+    supports, motions, squared_errors = sums
+    for row in range(rows[0], rows[1]):
+        elevation = elevations[0, row], elevations[1, row]
+        judge_row(
+            ranges[row], turns, elevation, (rotation, translation, baseline), source_ranges, limits, verdicts, found
+        )
+        for i in range(width):
+            verdict = verdicts[i]
             if verdict == AGREES:
-                a, b, c = transformed(point, rotation, translation)
-                distance = math.sqrt(a * a + b * b + c * c)
-                share = reprojection_angle(point, baseline, seen / distance) / limits[1]
-                supports[row, column] = (1.0 - share * share) ** 2
-                motions[row, column] = squared_motion(point, distance, baseline)
+                r = ranges[row, i]
+                point = (r * (elevation[1] * turns[0, i]), r * -elevation[0], r * (elevation[1] * turns[1, i]))
+                share = found[4, i] / limits[1]
+                support = (1.0 - share * share) ** 2
+                motion = squared_motion(point, found[2, i], baseline)
+                squared_error = support * limits[1] ** 2 * (1 - math.sqrt(support))
+                agreeing[row, i] += 1
+                supports[row, i] += np.rint(support * _FINE) / _FINE
+                motions[row, i] += np.rint(support * motion * _FINE) / _FINE
+                squared_errors[row, i] += np.rint(squared_error * _FINEST) / _FINEST
+            elif verdict == CONTRADICTS:
+                contradicting[row, i] += 1
+            elif verdict == HIDDEN:
+                hiding[row, i] += 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def count_agreeing(
+    points: FloatArray,
+    view: tuple[FloatArray, FloatArray],
+    source_ranges: NDArray[np.float32],
+    limits: Triple,
+    most: int,
+    counts: NDArray[np.uint8],
+) -> None:
+    """Add 1 to the counts (N,) of the points (N, 3) of the reference with which a source agrees, up to `most`."""
+    rotation, translation = view
+    baseline = -(rotation.T @ translation)
+    for i in range(len(points)):
+        if counts[i] < most:
+            point = (points[i, 0], points[i, 1], points[i, 2])
+            verdict = judge_point(point, rotation, translation, baseline, source_ranges, limits)[0]
+            counts[i] += verdict == AGREES

@@ -12,18 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources
+from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.patchmatch.refine import SOURCE_REACH, reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
+from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
@@ -107,78 +107,98 @@ def exchange_ranges(
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     own = compare_with_sources(np.where(seen, range_map.range, np.float32(np.nan)), *views, **limits)
     unsure = seen & ((own.agreeing < 1) | (own.support < min_support))
-    best = _Best.of(range_map, own.agreeing, agreement)
-    match = _Matcher(reference, sources)
     least = min(min_agreeing, max(len(sources), 2))
-    offers = []
-    for source in sources:
-        ranges, normals = projected(source, (reference.shape[0], reference.shape[1]))
-        with np.errstate(invalid="ignore"):
-            other = unsure & (ranges < range_map.range * (1 - max_relative_error))
-        agreeing = agreeing_sources(np.where(other, ranges, np.float32(np.nan)), *views, **limits)
-        offers.append((ranges, normals, agreeing, other & (agreeing >= least)))
-    wanted = np.any([offer[-1] for offer in offers], axis=0)
-    best.score[wanted] += match.correlation(range_map.range, range_map.normals_in_cam, wanted)[wanted]
-    for ranges, normals, agreeing, other in offers:
-        scores = match.correlation(ranges, normals, other) + agreement * np.minimum(agreeing, _MOST_AGREEING)
-        best.take(other & (scores > best.score), scores, ranges, normals=normals)
-    share = float(best.taken.sum() / max(seen.sum(), 1))
-    return RangeMap(best.ranges, range_map.confidence, best.normals, sky=range_map.sky), share
+    farthest = np.where(unsure, range_map.range * (1 - max_relative_error), np.float32(0)).astype(np.float32)
+    offers = Offers.joined([offers_of(source, farthest) for source in sources])
+    points = _rays_of(offers.pixels, farthest.shape) * offers.ranges.astype(np.float64)[:, None]
+    agreeing = agreeing_sources(points, *views, **limits, most=max(least, _MOST_AGREEING))
+    offers, agreeing = offers.chosen(agreeing >= least), agreeing[agreeing >= least]
+    wanted = np.unique(offers.pixels)
+    match = _Matcher(reference, sources)
+    normals = range_map.normals_in_cam
+    own_normals = None if normals is None else normals.reshape(-1, 3)[wanted]
+    score = np.zeros(seen.size)
+    score[wanted] = match.correlation(Offers(wanted, range_map.range.ravel()[wanted], own_normals))
+    score[wanted] += agreement * np.minimum(own.agreeing.ravel()[wanted], _MOST_AGREEING)
+    scores = match.correlation(offers) + agreement * np.minimum(agreeing, _MOST_AGREEING)
+    better = np.flatnonzero(scores > score[offers.pixels])
+    # The last of a pixel counts: the best one, and of equals that of the first source.
+    better = better[::-1][np.argsort(scores[better[::-1]], kind="stable")]
+    share = float(len(np.unique(offers.pixels[better])) / max(seen.sum(), 1))
+    return _replaced(range_map, offers.chosen(better)), share
 
 
-def projected(source: SourceView, size_hw: tuple[int, int]) -> tuple[FloatImage, NDArray[np.float16] | None]:
-    """Return the ranges and normals of a source as the reference sees them, (H, W) and (H, W, 3); NaN where none lands.
+@dataclass(frozen=True, eq=False)
+class Offers:
+    """Ranges that are offered to pixels of the reference, (N,): flat positions, ranges, and normals (N, 3) or None."""
 
-    Every pixel of the source lands in one pixel of the reference; of those that land in the same one, the nearest
-    counts.
-    """
-    from pano_mvs.algorithms.patchmatch.kernels_exchange import nearest_of_cells  # compiles on import
-
-    height, width = size_hw
-    ranges = source.range_map.range
-    seen = source.range_map.confidence >= WEAK_CONFIDENCE[0]
-    back = source.from_reference.inverse()
-    points = back.apply(ray_grid((ranges.shape[0], ranges.shape[1]))[seen] * ranges[seen].astype(np.float64)[:, None])
-    distance = np.linalg.norm(points, axis=-1)
-    pixels = pixel_from_ray(points, size_hw)
-    cell = np.minimum(pixels[:, 1].astype(np.intp), height - 1) * width + pixels[:, 0].astype(np.intp) % width
-    nearest = nearest_of_cells(cell, distance, height * width)
-    cells = np.flatnonzero(nearest >= 0)
-    chosen = nearest[cells]
-    landed = np.full(height * width, np.nan, np.float32)
-    landed[cells] = distance[chosen]
-    if source.range_map.normals_in_cam is None:
-        return landed.reshape(size_hw), None
-    normals = np.full((height * width, 3), np.nan, np.float16)
-    normals[cells] = source.range_map.normals_in_cam[seen][chosen].astype(np.float64) @ back.rotation.T
-    return landed.reshape(size_hw), normals.reshape(height, width, 3)
-
-
-@dataclass(eq=False)
-class _Best:
-    """The best range of each pixel so far, (H, W) each, and its normal, (H, W, 3)."""
-
-    score: NDArray[np.float64]
-    ranges: FloatImage
+    pixels: NDArray[np.int64]
+    ranges: NDArray[np.float32]
     normals: NDArray[np.float16] | None
-    taken: Mask
 
     @staticmethod
-    def of(range_map: RangeMap, agreeing: NDArray[np.int64], agreement: float) -> _Best:
-        """Return a pixel's own range, without the correlation in its score."""
-        normals = None if range_map.normals_in_cam is None else range_map.normals_in_cam.copy()
-        score = float(agreement) * np.minimum(agreeing, _MOST_AGREEING)
-        return _Best(score, range_map.range.copy(), normals, np.zeros(score.shape, np.bool_))
+    def joined(offers: Sequence[Offers]) -> Offers:
+        """Return the offers of all sources, one after the other; normals are NaN where they are not known."""
+        normals = [
+            np.full((len(offer.pixels), 3), np.nan, np.float16) if offer.normals is None else offer.normals
+            for offer in offers
+        ]
+        return Offers(
+            np.concatenate([offer.pixels for offer in offers]),
+            np.concatenate([offer.ranges for offer in offers]),
+            np.concatenate(normals),
+        )
 
-    def take(
-        self, where: Mask, scores: NDArray[np.float64], ranges: FloatImage, *, normals: NDArray[np.float16] | None
-    ) -> None:
-        """Take over ranges."""
-        self.taken |= where
-        self.score[where] = scores[where]
-        self.ranges[where] = ranges[where]
-        if self.normals is not None:
-            self.normals[where] = np.nan if normals is None else normals[where]
+    def chosen(self, which: NDArray[Any]) -> Offers:
+        """Return some of the offers."""
+        return Offers(self.pixels[which], self.ranges[which], None if self.normals is None else self.normals[which])
+
+
+def offers_of(source: SourceView, farthest: FloatImage) -> Offers:
+    """Return the ranges of a source that are nearer than given ones, (H, W), of the reference."""
+    ranges, positions = projected(source, (farthest.shape[0], farthest.shape[1]))
+    with np.errstate(invalid="ignore"):
+        pixels = np.flatnonzero((ranges < farthest).ravel())
+    normals = source.range_map.normals_in_cam
+    if normals is not None:
+        turn = source.from_reference.rotation
+        normals = (normals.reshape(-1, 3)[positions.ravel()[pixels]].astype(np.float64) @ turn).astype(np.float16)
+    return Offers(pixels, ranges.ravel()[pixels], normals)
+
+
+def _replaced(range_map: RangeMap, offers: Offers) -> RangeMap:
+    """Return a range map with offered ranges; of several for one pixel, the last counts."""
+    ranges, normals = range_map.range.copy(), range_map.normals_in_cam
+    ranges.reshape(-1)[offers.pixels] = offers.ranges
+    if normals is not None:
+        normals = normals.copy()
+        normals.reshape(-1, 3)[offers.pixels] = np.nan if offers.normals is None else offers.normals
+    return RangeMap(ranges, range_map.confidence, normals, sky=range_map.sky)
+
+
+def projected(source: SourceView, size_hw: tuple[int, int]) -> tuple[FloatImage, NDArray[np.int64]]:
+    """Return the ranges of a source as the reference sees them, and the positions of its pixels, (H, W) each.
+
+    Every pixel of the source lands in one pixel of the reference; of those that land in the same one, the nearest
+    counts. Where none lands, the range is NaN and the position −1.
+    """
+    from pano_mvs.algorithms.patchmatch.kernels_exchange import land_points
+
+    ranges = seen_ranges(source.range_map, min_confidence=WEAK_CONFIDENCE[0])
+    back = source.from_reference.inverse()
+    view = np.ascontiguousarray(back.rotation), np.ascontiguousarray(back.translation)
+    nearest, positions = np.full(size_hw, np.nan), np.full(size_hw, -1, np.int64)
+    land_points(ranges, sines_of_grid((ranges.shape[0], ranges.shape[1])), view, nearest, positions)
+    return nearest.astype(np.float32), positions
+
+
+def _rays_of(pixels: NDArray[np.int64], size_hw: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the unit rays (N, 3) of pixels at flat positions."""
+    height, width = size_hw
+    turns, elevations = sines_of_grid((height, width))
+    rows, columns = np.divmod(pixels, width)
+    sine, cosine = elevations[:, rows]
+    return np.stack([cosine * turns[0, columns], -sine, cosine * turns[1, columns]], axis=-1)
 
 
 class _Matcher:
@@ -186,7 +206,7 @@ class _Matcher:
 
     def __init__(self, reference: Picture, sources: Sequence[SourceView]) -> None:
         height, width = reference.shape[:2]
-        self.rays = ray_grid((height, width))
+        self.size_hw = height, width
         offsets = column_offsets((height, width), 2 * (_WINDOW // 2), spherical=True)[:, ::2].copy()
         self.reference = reference_arrays(reference, offsets, column_stretch(height, spherical=True))
         self.sources = source_arrays(
@@ -197,43 +217,51 @@ class _Matcher:
         )
         self.count = len(sources)
 
-    def correlation(self, ranges: FloatImage, normals: NDArray[np.float16] | None, wanted: Mask) -> FloatImage:
-        """Return the mean of the two best correlations, at least 0, (H, W); 0 where it is not wanted."""
+    def correlation(self, offers: Offers) -> NDArray[np.float32]:
+        """Return the mean of the two best correlations of each offer, at least 0, (N,)."""
         import numba  # slow to import
 
-        from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_rows  # compiles on import
+        from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_pixels  # compiles on import
 
-        height, width = ranges.shape
-        planes = surface_planes(ranges, normals, self.rays, wanted=wanted)
-        found = np.full((self.count, height, width), -2, np.float32)
+        height, width = self.size_hw
+        order = np.argsort(offers.pixels, kind="stable")
+        offers = offers.chosen(order)
+        rows, columns = np.divmod(offers.pixels, width)
+        planes = surface_planes(offers.ranges, offers.normals, _rays_of(offers.pixels, (height, width)))
+        starts = np.searchsorted(rows, np.arange(height + 1))
+        found = np.empty((self.count, len(order)), np.float32)
         numbers = np.float32(1 / _SIGMA_COLOR), np.float32(_NOISE**2)
 
         def match(first: int, rows: int) -> None:
-            correlate_rows(first, rows, planes, wanted, self.reference, self.sources, numbers, found)
+            correlate_pixels(
+                *((first, first + rows), starts, columns, planes, self.reference, self.sources, numbers, found)
+            )
 
         for_bands(match, height, threads=numba.get_num_threads())
         best = min(_BEST, self.count)
-        some = np.partition(found[:, wanted], self.count - best, axis=0)[-best:]
-        correlations = np.zeros((height, width), np.float32)
-        correlations[wanted] = np.maximum(some, 0).mean(axis=0)
+        some = np.partition(found, self.count - best, axis=0)[-best:]
+        correlations = np.empty(len(order), np.float32)
+        correlations[order] = np.maximum(some, 0).mean(axis=0)
         return correlations
 
 
 def surface_planes(
-    ranges: FloatImage, normals: NDArray[np.float16] | None, rays: NDArray[np.float64], *, wanted: Mask
-) -> FloatImage:
-    """Return the planes p with p · X = 1, (3, H, W), through the points of a range map; 0 where not wanted.
+    ranges: NDArray[np.float32], normals: NDArray[np.float16] | None, rays: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the planes p with p · X = 1, (3, N), through points on surfaces.
 
     A plane faces the camera where the normal is unknown or the surface is seen at a grazing angle.
+
+    Args:
+        ranges: (N,) of the points.
+        normals: (N, 3) of the surfaces, NaN where unknown; or None.
+        rays: (N, 3) unit vectors to the points.
     """
-    planes = np.zeros((3, *ranges.shape), np.float32)
-    ray = rays[wanted]
-    normal = np.full_like(ray, np.nan) if normals is None else normals[wanted].astype(np.float64)
-    cosine = np.sum(normal * ray, axis=-1)
+    normal = np.full_like(rays, np.nan) if normals is None else normals.astype(np.float64)
+    cosine = np.sum(normal * rays, axis=-1)
     steep = np.abs(cosine) >= _GRAZING  # False for NaN
-    normal, cosine = np.where(steep[:, None], normal, ray), np.where(steep, cosine, 1.0)
-    planes[:, wanted] = (normal / (cosine * ranges[wanted])[:, None]).T
-    return planes
+    normal, cosine = np.where(steep[:, None], normal, rays), np.where(steep, cosine, 1.0)
+    return np.ascontiguousarray((normal / (cosine * ranges)[:, None]).T, np.float32)
 
 
 def _check(range_map: RangeMap, reference: Picture, sources: Sequence[SourceView]) -> None:

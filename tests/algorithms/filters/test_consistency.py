@@ -15,9 +15,9 @@ from pano_mvs.algorithms.filters.consistency import (
     compare_with_sources,
     seen_ranges,
 )
-from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows
+from pano_mvs.algorithms.filters.kernels_reprojection import compare_rows, count_agreeing
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama
+from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room
 from tests.algorithms.range_scenes import as_map, random_map, rolled, room_range
@@ -48,25 +48,36 @@ def test_compiled_verdicts_equal_the_plain_ones(size: tuple[int, int]) -> None:
     reference, source = random_map(rng, size), random_map(rng, (16, 32))
     smooth = as_map(2 + 0.02 * rng.random((16, 32)))
     for ranges in (source.range, smooth.range):
-        verdicts, supports, motions = np.empty(size, np.uint8), np.empty(size), np.empty(size)
-        limits = np.array([0.2, 3 * 2 * np.pi / size[1], 0.3])
+        limits = (0.2, 3 * 2 * np.pi / size[1], 0.3)
         view = pose.rotation, pose.translation
-        judge_rows(0, 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
-        judge_rows(5, size[0] - 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
-        expected, expected_supports, expected_motions = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
+        counts = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.uint16)
+        sums = np.zeros(size), np.zeros(size), np.zeros(size)
+        for rows in ((0, 5), (5, size[0])):
+            compare_rows(rows, reference.range, sines_of_grid(size), view, ranges, limits, counts, sums)
+        expected, supports, motions = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
         assert len(np.unique(expected)) == 4
-        np.testing.assert_array_equal(verdicts, expected)
-        np.testing.assert_allclose(supports, expected_supports, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(motions, expected_motions, rtol=1e-3, atol=1e-6)
+        for verdict, count in enumerate(counts, start=1):
+            np.testing.assert_array_equal(count, expected == verdict)
+        squared_errors = supports * limits[1] ** 2 * (1 - np.sqrt(supports))
+        for found, plain in zip(sums, (supports, supports * motions, squared_errors), strict=True):
+            np.testing.assert_allclose(found, plain, rtol=1e-3, atol=1e-6)
+        agreeing = np.zeros(size, np.uint8)
+        rays = ray_grid(size).reshape(-1, 3)
+        points = rays * reference.range.reshape(-1, 1)
+        count_agreeing(points, view, ranges, limits, 1, agreeing.ravel())
+        np.testing.assert_array_equal(agreeing, expected == 1)
 
 
 def test_sources_that_agree_are_counted_alone_or_with_all_figures(true_maps: list[RangeMap]) -> None:
     moved = [pose @ POSES[0].inverse() for pose in POSES[1:]]
-    limits = {"max_relative_error": 0.02, "max_angle": 0.03}
-    found = agreeing_sources(true_maps[0].range, true_maps[1:], moved, **limits)
-    expected = compare_with_sources(true_maps[0].range, true_maps[1:], moved, **limits).agreeing
+    limits: dict[str, Any] = {"max_relative_error": 0.02, "max_angle": 0.03}
+    points = (ray_grid(SIZE) * true_maps[0].range[..., None]).reshape(-1, 3)
+    found = agreeing_sources(points, true_maps[1:], moved, **limits)
+    expected = compare_with_sources(true_maps[0].range, true_maps[1:], moved, **limits).agreeing.ravel()
     assert found.max() == len(moved)
     np.testing.assert_array_equal(found, expected)
+    enough = agreeing_sources(points, true_maps[1:], moved, **limits, most=2)
+    np.testing.assert_array_equal(enough, np.minimum(expected, 2))
 
 
 def test_true_ranges_confirm_each_other(true_maps: list[RangeMap]) -> None:
