@@ -204,17 +204,18 @@ def judge_row(
         found: (5, W) written: x, y, distance from the source, the source's range, angle of the reprojection.
     """
     rotation, translation, baseline = view
+    max_error, max_angle, max_step = limits[0], limits[1], limits[2]
     locate_row(ranges, turns, elevation, (rotation, translation), source_ranges.shape, found)
     for i in range(len(ranges)):
         place = found[2, i] > 0  # False for NaN
-        found[3, i] = sample_range(source_ranges, found[0, i], found[1, i], limits[2]) if place else math.nan
+        found[3, i] = sample_range(source_ranges, found[0, i], found[1, i], max_step) if place else math.nan
     reproject_row(ranges, turns, elevation, baseline, found[2], found[3], found[4])
     for i in range(_U(len(ranges))):
         distance, seen = found[2, i], found[3, i]
         verdict = UNKNOWN  # for NaN, all comparisons are False
-        verdict = CONTRADICTS if seen > distance * (1 + 2 * limits[0]) else verdict
-        verdict = HIDDEN if seen < distance * (1 - 2 * limits[0]) else verdict
-        agrees = abs(seen - distance) / distance <= limits[0] and found[4, i] <= limits[1]
+        verdict = CONTRADICTS if seen > distance * (1 + 2 * max_error) else verdict
+        verdict = HIDDEN if seen < distance * (1 - 2 * max_error) else verdict
+        agrees = (abs(seen - distance) / distance <= max_error) & (found[4, i] <= max_angle)
         verdicts[i] = AGREES if agrees else verdict
 
 

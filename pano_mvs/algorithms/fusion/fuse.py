@@ -23,10 +23,12 @@ from pano_mvs.algorithms.fusion.view import (
 )
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
 from pano_mvs.core.bands import for_bands
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.cloud import joined_uncertainty
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+Grid = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _MAX_SURFACE_STEP = 0.05
 _MAX_REPROJECTION_PX = 1.0
@@ -181,10 +183,10 @@ def _points_of(
     rays = held_rays((height, width))
     written = _chosen_pixels((height, width), settings)
     normals = _normals_or_views(reference, rays, written, threads=threads)
-    tallies = _own_tallies(reference, rays, normals)
+    tallies, grid = _own_tallies(reference, rays, normals), sines_of_grid((height, width))
     for window, idx, tie in sources:
         _compare_with(
-            window[idx], tie, (reference, rays, normals, written), settings=settings, tallies=tallies, threads=threads
+            window[idx], tie, (reference, grid, normals, written), settings=settings, tallies=tallies, threads=threads
         )
     kept = _kept(reference, tallies, settings) & written
     position = tallies.sums[kept]
@@ -223,7 +225,7 @@ def _own_tallies(reference: ConfidentView, rays: NDArray[np.float64], normals: N
 def _compare_with(
     source: ConfidentView,
     tie: float,
-    pixels: tuple[ConfidentView, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
+    pixels: tuple[ConfidentView, Grid, NDArray[np.float32], NDArray[np.bool_]],
     *,
     settings: FusionSettings,
     tallies: _Tallies,
@@ -231,7 +233,7 @@ def _compare_with(
 ) -> None:
     from pano_mvs.algorithms.fusion.kernels_fuse import add_source  # compiles on import
 
-    reference, *grids = pixels
+    reference, *arrays_of_pixels = pixels
     height, width = reference.ranges.shape
     max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / width
     limits = np.array(
@@ -252,7 +254,7 @@ def _compare_with(
     arrays = (*relation, source.ranges, source.confidence, source.image, _uncertainty_of(source, reference))
 
     def of_rows(first: int, rows: int) -> None:
-        add_source((reference.ranges, *grids), arrays, limits, (first, first + rows), tallies.arrays())
+        add_source((reference.ranges, *arrays_of_pixels), arrays, limits, (first, first + rows), tallies.arrays())
 
     for_bands(of_rows, height, threads=threads)
 

@@ -12,12 +12,12 @@ from pano_mvs.algorithms.filters.kernels_reprojection import (
     AGREES,
     CONTRADICTS,
     Triple,
-    judge_point,
+    judge_row,
 )
 from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_at
 
 FloatArray = NDArray[np.float64]
-Reference = tuple[NDArray[np.float32], FloatArray, NDArray[np.float32], NDArray[np.bool_]]
+Reference = tuple[NDArray[np.float32], tuple[FloatArray, FloatArray], NDArray[np.float32], NDArray[np.bool_]]
 Source = tuple[FloatArray, FloatArray, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]
 Tallies = tuple[
     NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], FloatArray, FloatArray, FloatArray
@@ -70,9 +70,9 @@ def add_source(
 ) -> None:
     """Add one source's support for the pixels of the rows [first, end) of a reference view.
 
-    `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of
-    source_from_reference, ranges, confidence, image, relative uncertainties); if the latter are not known, they are (0,
-    0), and all ranges are taken as equally uncertain relative to the range. `limits` holds the three of `judge_point`,
+    `reference` is (ranges, sines of the grid, normals, bool where a point may be written); `source` is (rotation,
+    translation of source_from_reference, ranges, confidence, image, relative uncertainties); if the latter are not
+    known, they are (0, 0), and all ranges are taken as equally uncertain relative to the range. `limits` holds the three of `judge_point`,
     the maximum ratio of this view's footprint to the source's, the maximum relative difference of merged points, and
     the minimum confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is set where the footprint
     is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and the
@@ -80,20 +80,19 @@ def add_source(
     likewise; precisions (H, W), the largest 1 / variance of the merged points, (0, 0) if it is unknown. Where no point
     may be written, only counts and violations change.
     """
-    ranges, rays, normals, written = reference
+    ranges, (turns, elevations), normals, written = reference
     rotation, translation, source_ranges, source_confidence, image, uncertainty = source
     yields, counts, violations, confidence, sums, colors, precisions = tallies
     center = -(rotation.T @ translation)
     weighted = uncertainty.size > 0
     sigma = 1.0
+    verdicts, found = np.empty(ranges.shape[1], np.uint8), np.empty((5, ranges.shape[1]))
+    view = rotation, translation, center
     for row in range(rows[0], rows[1]):
+        sine, cosine = elevations[0, row], elevations[1, row]
+        judge_row(ranges[row], turns, (sine, cosine), view, source_ranges, limits, verdicts, found)
         for column in range(ranges.shape[1]):
-            r = ranges[row, column]
-            if not math.isfinite(r):
-                continue
-            ray = rays[row, column]
-            point = (r * ray[0], r * ray[1], r * ray[2])
-            verdict, error, x, y, seen = judge_point(point, rotation, translation, center, source_ranges, limits)
+            verdict, x, y = verdicts[column], found[0, column], found[1, column]
             if verdict == CONTRADICTS and confidence_at(source_confidence, x, y) >= limits[5]:
                 violations[row, column] += 1
             if verdict != AGREES:
@@ -101,16 +100,19 @@ def add_source(
             counts[row, column] += 1
             if not written[row, column]:
                 continue
-            normal = normals[row, column]
+            r, normal = ranges[row, column], normals[row, column]
+            point = (r * (cosine * turns[0, column]), r * -sine, r * (cosine * turns[1, column]))
+            distance, seen = found[2, column], found[3, column]
+            error = abs(seen - distance) / distance
             confidence[row, column] = max(confidence[row, column], confidence_at(source_confidence, x, y))
-            view = (point[0] - center[0], point[1] - center[1], point[2] - center[2])
-            footprint = pixel_footprint(view, normal)
+            seen_from = (point[0] - center[0], point[1] - center[1], point[2] - center[2])
+            footprint = pixel_footprint(seen_from, normal)
             if pixel_footprint(point, normal) > limits[3] * footprint:
                 yields[row, column] = True
             add_color(image, x, y, 1 / footprint, colors[row, column])
             if error < limits[4]:
                 share = error / limits[4]
-                squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
+                squared = seen_from[0] * seen_from[0] + seen_from[1] * seen_from[1] + seen_from[2] * seen_from[2]
                 if weighted:
                     sigma = uncertainty_at(uncertainty, x, y)
                 variance = squared * sigma * sigma
@@ -118,5 +120,5 @@ def add_source(
                 if weighted:
                     precisions[row, column] = max(precisions[row, column], 1 / variance)
                 for axis in range(3):
-                    sums[row, column, axis] += weight * (center[axis] + ratio * view[axis])
+                    sums[row, column, axis] += weight * (center[axis] + ratio * seen_from[axis])
                 sums[row, column, 3] += weight

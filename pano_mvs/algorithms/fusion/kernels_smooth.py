@@ -13,7 +13,14 @@ from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-Cells = tuple[IntArray, IntArray, IntArray, IntArray]
+Cells = tuple[IntArray, IntArray, IntArray, IntArray, IntArray]
+
+BLOCK = 128
+"""Number of neighbours that are weighed together."""
+
+_U = np.uint64
+_RADIX_BITS = 11
+_RADIX = 1 << _RADIX_BITS
 
 _MIN_COSINE = 0.8
 _MAX_DEVIATIONS = 2.5
@@ -48,32 +55,150 @@ def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, f
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_neighbour(cloud: Cloud, i: int, j: int, axes: FloatArray, radius: float, a: FloatArray, b: FloatArray) -> float:
-    """Add point j to the normal equations of the plane h + s u + t v around point i; return its weight, 0 if unused."""
+def find_cells(points: NDArray[np.float32], least: NDArray[np.float32], edge: float, shape: IntArray) -> IntArray:
+    """Return the key of the cell, (N,), of each point: cells have this edge, from 1 in each axis, and rows of cells.
+
+    Args:
+        points: (N, 3).
+        least: (3,) the least coordinates.
+        edge: of a cell.
+        shape: (3,) number of cells in each axis, with one more on either side.
+    """
+    keys = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        x = np.int64(np.floor((points[i, 0] - least[0]) / edge)) + 1
+        y = np.int64(np.floor((points[i, 1] - least[1]) / edge)) + 1
+        z = np.int64(np.floor((points[i, 2] - least[2]) / edge)) + 1
+        keys[i] = (x * shape[1] + y) * shape[2] + z
+    return keys
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sort_keys(keys: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return keys (N,) from 0 to `most` in order, and their positions; the first of equals first (a radix sort)."""
+    order, other_order = np.arange(len(keys)), np.empty(len(keys), np.int64)
+    keys, other_keys = keys.copy(), np.empty(len(keys), np.int64)
+    places = np.empty(_RADIX, np.int64)
+    shift = 0
+    while most >> shift > 0:
+        places[:] = 0
+        for i in range(len(keys)):
+            places[(keys[i] >> shift) & (_RADIX - 1)] += 1
+        place = 0
+        for digit in range(_RADIX):
+            place, places[digit] = place + places[digit], place
+        for i in range(len(keys)):
+            digit = (keys[i] >> shift) & (_RADIX - 1)
+            other_keys[places[digit]], other_order[places[digit]] = keys[i], order[i]
+            places[digit] += 1
+        keys, other_keys, order, other_order = other_keys, keys, other_order, order
+        shift += _RADIX_BITS
+    return keys, order
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def find_starts(own: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the different keys (K,) of sorted keys (N,), and where each begins, (K + 1,), the last one ends."""
+    count = 0
+    for i in range(len(own)):
+        count += i == 0 or own[i] != own[i - 1]
+    keys, starts = np.empty(count, np.int64), np.empty(count + 1, np.int64)
+    count = 0
+    for i in range(len(own)):
+        if i == 0 or own[i] != own[i - 1]:
+            keys[count], starts[count] = own[i], i
+            count += 1
+    starts[count] = len(own)
+    return keys, starts
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def gather_neighbours(cloud: Cloud, cells: Cells, cell: int, most: int, near: NDArray[np.float32]) -> int:
+    """Write the points around a cell, in blocks of `BLOCK`, and return how many there are.
+
+    Args:
+        cloud: see `find_heights`.
+        cells: see `find_heights`.
+        cell: key of the cell.
+        most: number of points of a column that count, evenly among them.
+        near: (blocks · 7 · BLOCK,) written: in each block positions, normals and standard deviations, one after the
+            other.
+    """
     points, normals, sigmas = cloud
-    x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
-    height = float(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2])
-    share = (x * x + y * y + z * z - height * height) / (radius * radius)
-    variance = sigmas[i] * sigmas[i] + sigmas[j] * sigmas[j]
-    deviation = height * height / (_MAX_DEVIATIONS * _MAX_DEVIATIONS * variance)
-    if share >= 1 or deviation >= 1:
-        return 0.0
-    cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
-    if cosine < _MIN_COSINE:
-        return 0.0
-    u, v = x * axes[0] + y * axes[1] + z * axes[2], x * axes[3] + y * axes[4] + z * axes[5]
-    weight: float = (1 - share) ** 2 * (1 - deviation) ** 2 / (sigmas[j] * sigmas[j])
-    u, v = u / radius, v / radius
-    a[0] += weight
-    a[1] += weight * u
-    a[2] += weight * v
-    a[3] += weight * u * u
-    a[4] += weight * u * v
-    a[5] += weight * v * v
-    b[0] += weight * height
-    b[1] += weight * height * u
-    b[2] += weight * height * v
-    return weight
+    keys, starts, _, steps, order = cells
+    count = 0
+    for c in range(len(steps)):
+        begin, end = column_range(keys, starts, cell + steps[c])
+        inside = min(end - begin, most)
+        for k in range(inside):
+            j = order[begin + k * (end - begin) // inside]
+            place = count // BLOCK * (7 * BLOCK) + count % BLOCK
+            for axis in range(3):
+                near[place + axis * BLOCK] = points[j, axis]
+                near[place + (3 + axis) * BLOCK] = normals[j, axis]
+            near[place + 6 * BLOCK] = sigmas[j]
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def weigh_block(
+    near: NDArray[np.float32],
+    first: int,
+    count: int,
+    own: tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32],
+    axes: tuple[float, float, float, float, float, float],
+    radius: float,
+    weighed: FloatArray,
+) -> None:
+    """Weigh a block of neighbours of a point, in a loop that can be vectorised.
+
+    Args:
+        near: see `gather_neighbours`.
+        first: where the block begins.
+        count: number of points in it.
+        own: the point, its normal, and its standard deviation.
+        axes: two unit vectors perpendicular to the normal.
+        radius: within which neighbours count.
+        weighed: (4 · BLOCK,) written: weights, 0 if unused; heights along the normal; and positions along the axes, in
+            radii.
+    """
+    px, py, pz, nx, ny, nz, sigma = own
+    ux, uy, uz, vx, vy, vz = axes
+    base, block = _U(first), _U(BLOCK)
+    for i in range(_U(count)):
+        k = base + i
+        x, y, z = near[k] - px, near[k + block] - py, near[k + _U(2) * block] - pz
+        height = x * nx + y * ny + z * nz
+        share = (x * x + y * y + z * z - height * height) / (radius * radius)
+        other = near[k + _U(6) * block]
+        variance = sigma * sigma + other * other
+        deviation = height * height / (_MAX_DEVIATIONS * _MAX_DEVIATIONS * variance)
+        cosine = nx * near[k + _U(3) * block] + ny * near[k + _U(4) * block] + nz * near[k + _U(5) * block]
+        weight = (1 - share) * (1 - share) * ((1 - deviation) * (1 - deviation)) / (other * other)
+        used = (share < 1) & (deviation < 1) & (cosine >= _MIN_COSINE)
+        weighed[i] = weight if used else 0.0
+        weighed[i + block] = height
+        weighed[i + _U(2) * block] = (x * ux + y * uy + z * uz) / radius
+        weighed[i + _U(3) * block] = (x * vx + y * vy + z * vz) / radius
+
+
+@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})  # so that the sums are vectorised
+def add_block(weighed: FloatArray, count: int, a: FloatArray, b: FloatArray) -> int:
+    """Add weighed neighbours to the normal equations of the plane h + s u + t v; return how many have a weight."""
+    used = 0
+    a0, a1, a2, a3, a4, a5, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(_U(count)):
+        weight, height = weighed[i], weighed[i + _U(BLOCK)]
+        u, v = weighed[i + _U(2 * BLOCK)], weighed[i + _U(3 * BLOCK)]
+        along, across = weight * u, weight * v
+        a0, a1, a2 = a0 + weight, a1 + along, a2 + across
+        a3, a4, a5 = a3 + along * u, a4 + along * v, a5 + across * v
+        b0, b1, b2 = b0 + weight * height, b1 + along * height, b2 + across * height
+        used += weight > 0
+    a[0], a[1], a[2], a[3], a[4], a[5] = a[0] + a0, a[1] + a1, a[2] + a2, a[3] + a3, a[4] + a4, a[5] + a5
+    b[0], b[1], b[2] = b[0] + b0, b[1] + b1, b[2] + b2
+    return used
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -86,39 +211,38 @@ def find_heights(
     heights: FloatArray,
     part: tuple[int, int],
 ) -> None:
-    """Write the heights of the surface above the points chosen[first:end]; 0 where it is undefined.
+    """Write the heights of the surface above the points order[chosen[first:end]]; 0 where it is undefined.
 
     Args:
-        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations, sorted by cells.
+        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations.
         radii: (N,) radius within which neighbours count.
-        chosen: indices of points, the radii of which are at most the edge of a cell.
+        chosen: positions in the order of the cells of points, the radii of which are at most the edge of a cell.
         cells: keys of the occupied cells, where the points of each begin (and the last ends), (N,) the key of the cell
-            of each point, and the differences to the keys of the 9 columns of three cells around a cell.
+            of each point in order, the differences to the keys of the 9 columns of three cells around a cell, and the
+            order of the points.
         most: number of points of a column that count, evenly among them.
         heights: (N,) written, along the normal.
         part: first and end.
     """
-    keys, starts, own, steps = cells
-    a, b, axes = np.empty(6), np.empty(3), np.empty(6)
-    columns = np.empty((len(steps), 2), np.int64)
-    cell = np.int64(-1)
+    points, normals, sigmas = cloud
+    own, steps, order = cells[2], cells[3], cells[4]
+    a, b, weighed = np.empty(6), np.empty(3), np.empty(4 * BLOCK)
+    near = np.empty(((len(steps) * most + BLOCK - 1) // BLOCK) * 7 * BLOCK, np.float32)
+    cell, neighbours = np.int64(-1), 0
     for number in range(part[0], part[1]):
-        i = chosen[number]
-        if own[i] != cell:  # successive points mostly lie in the same cell
-            cell = own[i]
-            for c in range(len(steps)):
-                columns[c, 0], columns[c, 1] = column_range(keys, starts, cell + steps[c])
-        axes[0], axes[1], axes[2], axes[3], axes[4], axes[5] = tangents(cloud[1][i])
+        i = order[chosen[number]]
+        if own[chosen[number]] != cell:  # successive points mostly lie in the same cell
+            cell = own[chosen[number]]
+            neighbours = gather_neighbours(cloud, cells, cell, most, near)
+        axes = tangents(normals[i])
+        point = points[i, 0], points[i, 1], points[i, 2], normals[i, 0], normals[i, 1], normals[i, 2], sigmas[i]
         a[:] = 0.0
         b[:] = 0.0
         count = 0
-        for c in range(len(steps)):
-            begin, end = columns[c, 0], columns[c, 1]
-            inside = min(end - begin, most)
-            for k in range(inside):
-                j = begin + k * (end - begin) // inside
-                if add_neighbour(cloud, i, j, axes, radii[i], a, b) > 0:
-                    count += 1
+        for first in range(0, neighbours, BLOCK):
+            inside = min(BLOCK, neighbours - first)
+            weigh_block(near, first * 7, inside, point, axes, radii[i], weighed)
+            count += add_block(weighed, inside, a, b)
         height, _, _, ok = solve_symmetric(a, b)
         off_center = (a[1] * a[1] + a[2] * a[2]) / (_MAX_OFF_CENTER * _MAX_OFF_CENTER * a[0] * a[0])
         heights[i] = height if ok and count >= _MIN_NEIGHBOURS and off_center < 1 else 0.0

@@ -23,7 +23,7 @@ _REACH = 2.0
 # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
 _MOST_UNCERTAIN = 0.03
 _POINTS_PER_COLUMN = 12
-_POINTS_AT_ONCE = 1 << 13
+_POINTS_AT_ONCE = 1 << 14
 # Points with a smaller standard deviation, relative to the same distance, stay where they are.
 _LEAST_UNCERTAIN = 0.005
 _MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
@@ -81,18 +81,15 @@ def surface_heights(
     radii = _REACH * sigmas.astype(np.float64)
     heights = np.zeros(len(points))
     wanted = np.arange(len(points)) if chosen is None else chosen
+    cloud = points, normals, sigmas
+    marked = np.zeros(len(points), np.bool_)
     for some, edge in _levels(points, radii, wanted):
-        order, cells = _cells(points, edge)
-        marked = np.zeros(len(points), np.bool_)
+        cells = _cells(points, float(edge))
         marked[some] = True
-        found = np.zeros(len(points))
-        # Sorted by cells, so that neighbours are near each other in memory.
-        arrays = points[order], normals[order], sigmas[order]
-        targets = np.flatnonzero(marked[order])
-        arguments = arrays, radii[order], targets, cells, per_column, found
-        find = partial(_find, kernel=find_heights, arguments=arguments)
+        targets = np.flatnonzero(marked[cells[-1]])
+        marked[some] = False
+        find = partial(_find, kernel=find_heights, arguments=(cloud, radii, targets, cells, per_column, heights))
         for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
-        heights[order[targets]] = found[targets]
     return heights
 
 
@@ -111,16 +108,15 @@ def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) ->
     return [(wanted[level == number], least * 2.0**number) for number in np.unique(level)]
 
 
-def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, tuple[IntArray, ...]]:
-    """Return the order of points by cells of this edge, and the cells as `find_heights` needs them."""
-    # One axis at a time: columns of a large (N, 3) array are slow to reduce and to multiply.
-    axes = [np.ascontiguousarray(points[:, axis]) for axis in range(3)]
-    places = [np.floor((axis - axis.min()) / edge).astype(np.int64) + 1 for axis in axes]
-    _, rows, columns = (int(axis.max()) + 2 for axis in places)
-    strides = np.array([rows * columns, columns, 1], np.int64)
-    own = (places[0] * rows + places[1]) * columns + places[2]
-    order = np.argsort(own, kind="stable")
-    own = own[order]
-    starts = np.flatnonzero(np.diff(own, prepend=own[0] - 1))
-    steps = np.array(list(product((-1, 0, 1), repeat=2)), np.int64) @ strides[:2]
-    return order, (own[starts], np.append(starts, len(own)), own, steps)
+def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, ...]:
+    """Return the cells of this edge, as `find_heights` needs them; the last array is the order of the points."""
+    from pano_mvs.algorithms.fusion.kernels_smooth import find_cells, find_starts, sort_keys  # compile on import
+
+    # One axis at a time: columns of a large (N, 3) array are slow to reduce.
+    extents = [(axis.min(), axis.max()) for axis in np.ascontiguousarray(points.T)]
+    least, most = np.array(extents, np.float32).T
+    shape = np.floor((most - least).astype(np.float64) / edge).astype(np.int64) + 3
+    own, order = sort_keys(find_cells(points, least, edge, shape), int(np.prod(shape)))
+    keys, starts = find_starts(own)
+    steps = np.array(list(product((-1, 0, 1), repeat=2)), np.int64) @ np.array([shape[1] * shape[2], shape[2]])
+    return keys, starts, own, steps, order

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion.kernels_fuse import add_source
 from pano_mvs.algorithms.fusion.kernels_support import find_supported
-from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec, sines_of_grid
 from tests.oracles import fusion as oracle
 
 SIZE, SOURCE_SIZE = (12, 24), (10, 20)
@@ -52,7 +52,9 @@ def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> Non
     }
     source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image, uncertainty)
     for rows in ((0, 5), (5, 12)):
-        add_source((ranges, rays, normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS))
+        add_source(
+            (ranges, sines_of_grid(SIZE), normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS)
+        )
     expected = oracle.add_source(
         (ranges, rays, normals, written), pose, (source_ranges, confidence, image, uncertainty), LIMITS
     )
