@@ -72,13 +72,13 @@ def add_source(
 
     `reference` is (ranges, sines of the grid, normals, bool where a point may be written); `source` is (rotation,
     translation of source_from_reference, ranges, confidence, image, relative uncertainties); if the latter are not
-    known, they are (0, 0), and all ranges are taken as equally uncertain relative to the range. `limits` holds the three of `judge_point`,
-    the maximum ratio of this view's footprint to the source's, the maximum relative difference of merged points, and
-    the minimum confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is set where the footprint
-    is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and the
-    largest confidence; sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4)
-    likewise; precisions (H, W), the largest 1 / variance of the merged points, (0, 0) if it is unknown. Where no point
-    may be written, only counts and violations change.
+    known, they are (0, 0), and all ranges are taken as equally uncertain relative to the range. `limits` holds the
+    three of `judge_point`, the maximum ratio of this view's footprint to the source's, the maximum relative difference
+    of merged points, and the minimum confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is
+    set where the footprint is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of
+    contradicting ones, and the largest confidence; sums (H, W, 4) of weighted points in the reference frame and their
+    weights; colors (H, W, 4) likewise; precisions (H, W), the largest 1 / variance of the merged points, (0, 0) if it
+    is unknown. Where no point may be written, only counts and violations change.
     """
     ranges, (turns, elevations), normals, written = reference
     rotation, translation, source_ranges, source_confidence, image, uncertainty = source
