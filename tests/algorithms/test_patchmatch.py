@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine
+from pano_mvs.algorithms.patchmatch import kernels_pack, kernels_planes, kernels_refine
 from pano_mvs.algorithms.patchmatch.refine import (
     _range_map_from_planes,
     reference_arrays,
@@ -81,6 +81,16 @@ def little_picture(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[n
     rays = ray_grid(size).reshape(-1, 3)
     channels = [solid_noise(rays, cells=((0.35, 60.0),), seed=int(rng.integers(1000))) for _ in range(3)]
     return np.clip(128 + np.stack(channels, -1), 0, 255).astype(np.uint8).reshape(*size, 3)
+
+
+@pytest.mark.kernel("patchmatch.kernels_pack")
+def test_packed_patches_hold_four_grey_levels_over_the_seam_and_the_poles() -> None:
+    picture = np.random.default_rng(7).integers(0, 256, (6, 12, 3)).astype(np.uint8)
+    grey = pad_panorama(np.rint(256 * (picture @ LUMA)).astype(np.uint64), 1)
+    packed = kernels_pack.pack_grey(picture)
+    assert packed.shape == (7, 13)
+    for shift, part in ((0, grey[:-1, :-1]), (16, grey[1:, :-1]), (32, grey[:-1, 1:]), (48, grey[1:, 1:])):
+        np.testing.assert_array_equal(packed >> np.uint64(shift) & np.uint64(65535), part)
 
 
 @pytest.mark.kernel("patchmatch.kernels_planes")

@@ -9,8 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import locate_row
-from pano_mvs.algorithms.patchmatch.kernels_match import Sources, row_matrix
-from pano_mvs.algorithms.patchmatch.kernels_refine import STRETCH, Reference
+from pano_mvs.algorithms.patchmatch.kernels_match import STRETCH, Sources, row_matrix
+from pano_mvs.algorithms.patchmatch.kernels_refine import Reference
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, pixel_at
 
 FloatArray = NDArray[np.float64]

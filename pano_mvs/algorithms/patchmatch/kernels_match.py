@@ -30,6 +30,9 @@ SUM_B, SUM_BB, SUM_AB = 0, 1, 2
 SUM_G, SUM_GG, SUM_GB, SUM_GA = 3, 6, 12, 15
 SUMS = 18
 
+STRETCH = 256
+"""Number of pixels of a row that are computed together, so that their sums fit the cache."""
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def weigh_window(
@@ -101,8 +104,7 @@ def project_samples(
     matrix: NDArray[np.float32],
     shape: NDArray[np.int64],
     index: NDArray[np.int32],
-    weights: NDArray[np.float32],
-    slopes: NDArray[np.float32],
+    placed: NDArray[np.float32],
 ) -> None:
     """Project rays of one row, at inverse ranges q, into a packed source, with the derivative by q.
 
@@ -113,8 +115,8 @@ def project_samples(
         matrix: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q).
         shape: (2,) int64 rows and columns of the source.
         index: (n,) int32, written: position in the packed source.
-        weights: (2, n) float32, written: of the right and of the lower neighbours.
-        slopes: (2, n) float32, written: dx/dq and dy/dq in pixels.
+        placed: (4 · STRETCH,) float32, written: weights of the right and of the lower neighbours, dx/dq and dy/dq in
+            pixels.
     """
     m00, m01, o0, t0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, o1, t1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
@@ -137,10 +139,10 @@ def project_samples(
         column = last_column if column > last_column else column
         row = last_row if row > last_row else row
         index[i] = np.int32(row * stride + column)
-        weights[0, i] = px - _F(column)
-        weights[1, i] = py - _F(row)
-        slopes[0, i] = x_scale * (z * t0 - x * t2) / level_squared
-        slopes[1, i] = y_scale * (level * t1 - y * (x * t0 + z * t2) / level) / (level_squared + y * y)
+        placed[i] = px - _F(column)
+        placed[i + _U(STRETCH)] = py - _F(row)
+        placed[i + _U(2 * STRETCH)] = x_scale * (z * t0 - x * t2) / level_squared
+        placed[i + _U(3 * STRETCH)] = y_scale * (level * t1 - y * (x * t0 + z * t2) / level) / (level_squared + y * y)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -154,93 +156,62 @@ def gather_samples(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blend_samples(
+def add_samples(
     patches: NDArray[np.uint64],
-    weights: NDArray[np.float32],
-    slopes: NDArray[np.float32],
-    means: NDArray[np.float32],
-    samples: NDArray[np.float32],
-    gradients: NDArray[np.float32],
+    placed: NDArray[np.float32],
+    window: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    position: tuple[np.float32, np.float32],
+    sums: NDArray[np.float32],
 ) -> None:
-    """Blend 2×2 patches into samples less `means`, and their slopes along the epipolar curve against q; all (n,)."""
+    """Blend 2×2 patches into samples b, with slopes g along the epipolar curve against q, and add them to the sums.
+
+    The sums are one array, whose rows are a constant apart: the loop is only vectorised if few arrays have to be
+    proved not to overlap.
+
+    Args:
+        patches: (n,) uint64 of one window sample of each pixel.
+        placed: see `project_samples`.
+        window: (n,) float32 weights and centred samples of the reference, and means, which are subtracted from b.
+        position: columns u and rows v of the sample from the centre.
+        sums: (SUMS · STRETCH,) float32 of one source, added to.
+    """
+    weights, reference, means = window
+    u, v = position
+    uu, uv, vv = u * u, u * v, v * v
+    row = _U(STRETCH)
     for i in range(_U(patches.shape[0])):
         patch = patches[i]
         upper_left = _F(np.int32(patch & _LOW)) * _STEP
         lower_left = _F(np.int32((patch >> _U(16)) & _LOW)) * _STEP
         upper_right = _F(np.int32((patch >> _U(32)) & _LOW)) * _STEP
         lower_right = _F(np.int32(patch >> _U(48))) * _STEP
-        wx, wy = weights[0, i], weights[1, i]
+        wx, wy = placed[i], placed[i + row]
         left = upper_left + wy * (lower_left - upper_left)
         right = upper_right + wy * (lower_right - upper_right)
         down_left, down_right = lower_left - upper_left, lower_right - upper_right
-        samples[i] = left + wx * (right - left) - means[i]
-        gradients[i] = slopes[0, i] * (right - left) + slopes[1, i] * (down_left + wx * (down_right - down_left))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def add_samples(
-    samples: NDArray[np.float32],
-    window_weights: NDArray[np.float32],
-    reference: NDArray[np.float32],
-    sums: NDArray[np.float32],
-) -> None:
-    """Add one window sample of each pixel to the sums of one source; (n,) each, sums (SUMS, n)."""
-    for i in range(_U(samples.shape[0])):
-        b = samples[i]
-        wb = window_weights[i] * b
-        sums[SUM_B, i] += wb
-        sums[SUM_BB, i] += wb * b
-        sums[SUM_AB, i] += wb * reference[i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def weigh_gradients(
-    samples: NDArray[np.float32],
-    gradients: NDArray[np.float32],
-    window_weights: NDArray[np.float32],
-    reference: NDArray[np.float32],
-    products: NDArray[np.float32],
-) -> None:
-    """Write w g, w g g, w g b and w g a, (4, n), of the slopes g of one window sample of each pixel, all (n,)."""
-    for i in range(_U(samples.shape[0])):
-        g = gradients[i]
-        wg = window_weights[i] * g
-        products[0, i] = wg
-        products[1, i] = wg * g
-        products[2, i] = wg * samples[i]
-        products[3, i] = wg * reference[i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def add_moments(
-    products: NDArray[np.float32],
-    row: int,
-    factors: tuple[np.float32, np.float32, np.float32],
-    sums: NDArray[np.float32],
-    first: int,
-) -> None:
-    """Add a row of `products`, times each of three factors, to three rows of `sums` from `first` on."""
-    p, s = _U(row), _U(first)
-    f0, f1, f2 = factors
-    for i in range(_U(products.shape[1])):
-        value = products[p, i]
-        sums[s, i] += f0 * value
-        sums[s + _U(1), i] += f1 * value
-        sums[s + _U(2), i] += f2 * value
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def add_gradients(products: NDArray[np.float32], u: np.float32, v: np.float32, sums: NDArray[np.float32]) -> None:
-    """Add what `weigh_gradients` wrote of one window sample, at columns u and rows v from the centre, to the sums.
-
-    One loop over all of it would not be vectorised: too many rows would have to be proved not to overlap.
-    """
-    basis = _ONE, u, v
-    add_moments(products, 0, basis, sums, SUM_G)
-    add_moments(products, 1, basis, sums, SUM_GG)
-    add_moments(products, 1, (u * u, u * v, v * v), sums, SUM_GG + 3)
-    add_moments(products, 2, basis, sums, SUM_GB)
-    add_moments(products, 3, basis, sums, SUM_GA)
+        b = left + wx * (right - left) - means[i]
+        down = down_left + wx * (down_right - down_left)
+        g = placed[i + _U(2) * row] * (right - left) + placed[i + _U(3) * row] * down
+        a, wb, wg = reference[i], weights[i] * b, weights[i] * g
+        wgg, wgb, wga = wg * g, wg * b, wg * a
+        sums[i] += wb
+        sums[i + row] += wb * b
+        sums[i + _U(2) * row] += wb * a
+        sums[i + _U(3) * row] += wg
+        sums[i + _U(4) * row] += u * wg
+        sums[i + _U(5) * row] += v * wg
+        sums[i + _U(6) * row] += wgg
+        sums[i + _U(7) * row] += u * wgg
+        sums[i + _U(8) * row] += v * wgg
+        sums[i + _U(9) * row] += uu * wgg
+        sums[i + _U(10) * row] += uv * wgg
+        sums[i + _U(11) * row] += vv * wgg
+        sums[i + _U(12) * row] += wgb
+        sums[i + _U(13) * row] += u * wgb
+        sums[i + _U(14) * row] += v * wgb
+        sums[i + _U(15) * row] += wga
+        sums[i + _U(16) * row] += u * wga
+        sums[i + _U(17) * row] += v * wga
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -273,7 +244,7 @@ def sum_windows(
         window: weights and centred samples, (side², n) float32, and means (n,), of the reference.
         sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
             source_from_reference, (·,) uint8 which patches count, empty if all do, and (S,) where each begins.
-        sums: (S, SUMS, n) float32, written.
+        sums: (S, SUMS, STRETCH) float32, written.
         votes: (S, n) bool, written: True where the source counts for the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
@@ -281,9 +252,8 @@ def sum_windows(
     packed, starts, shapes, poses, valid, valid_starts = sources
     n, side = planes.shape[1], len(rows)
     inverse = np.empty((side * side, n), np.float32)
-    values, gradients, products = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((4, n), np.float32)
     index, patches = np.empty(n, np.int32), np.empty(n, np.uint64)
-    blend, slopes = np.empty((2, n), np.float32), np.empty((2, n), np.float32)
+    placed = np.empty(4 * STRETCH, np.float32)
     matrix = np.empty((3, 4), np.float32)
     sums[:] = _F(0)
     for k in range(side * side):
@@ -293,12 +263,11 @@ def sum_windows(
         for k in range(side * side):
             v, column = rows[k // side], columns[k % side]
             row_matrix(poses[s], elevation_from_y(row + v + 0.5, height), matrix)
-            project_samples(azimuth, pad + first + column, inverse[k], matrix, shapes[s], index, blend, slopes)
+            project_samples(azimuth, pad + first + column, inverse[k], matrix, shapes[s], index, placed)
             gather_samples(packed, starts[s], index, patches)
-            blend_samples(patches, blend, slopes, means, values, gradients)
-            add_samples(values, weights[k], centred[k], sums[s])
-            weigh_gradients(values, gradients, weights[k], centred[k], products)
-            add_gradients(products, _F(column / stretch), _F(v), sums[s])
+            add_samples(
+                patches, placed, (weights[k], centred[k], means), (_F(column / stretch), _F(v)), sums[s].reshape(-1)
+            )
             if v == 0 and column == 0:
                 for i in range(n):
                     votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.kernels_match import (
+    STRETCH,
     SUM_AB,
     SUM_B,
     SUM_BB,
@@ -28,8 +29,6 @@ Numbers = tuple[np.float32, np.float32, float, float, float, np.float32]
 
 _F = np.float32
 _U = np.uint64
-# Number of pixels of a row that are computed together, so that their sums fit the cache.
-STRETCH = 256
 # Windows with a lower correlation show different surfaces.
 _MIN_CORRELATION = 0.2
 
@@ -126,7 +125,7 @@ def most_likely_steps(
     """Write the most likely step of α, (n,), given the pictures and the current planes.
 
     Args:
-        sums: (S, SUMS, n) float32 of the windows, see `sum_windows`.
+        sums: (S, SUMS, STRETCH) float32 of the windows, see `sum_windows`.
         correlations: (S, n) float32.
         variance: (n,) float32 of the reference's windows.
         noise: variance of a grey level.
@@ -191,7 +190,7 @@ def refine_rows(
         for first in range(0, width, STRETCH):
             n = min(STRETCH, width - first)
             weights, centred = np.empty((side * side, n), np.float32), np.empty((side * side, n), np.float32)
-            moments, sums = np.empty((2, n), np.float32), np.empty((count, SUMS, n), np.float32)
+            moments, sums = np.empty((2, n), np.float32), np.empty((count, SUMS, STRETCH), np.float32)
             votes, correlations = np.empty((count, n), np.bool_), np.empty((count, n), np.float32)
             steps, part = np.empty(n, np.float32), planes[:, row, first : first + n].copy()
             place = row, first, height, stretches[row], pad, window_rows, window_columns[row]

@@ -183,29 +183,24 @@ def source_arrays(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
 ) -> tuple[object, ...]:
     """Return the kernels' arguments for the sources, see `sum_windows`; `reach`: window size in image heights."""
-    pictures = [_packed(np.rint(256 * (source @ _LUMA)).astype(np.uint64)).ravel() for source in sources]
+    from pano_mvs.algorithms.patchmatch.kernels_pack import pack_grey  # compiles on import
+
+    pictures = [pack_grey(source).ravel() for source in sources]
     starts = np.cumsum([0, *(len(picture) for picture in pictures)])[:-1]
     valid = np.zeros(0, np.uint8)
     if masks is not None and not all(mask is None or mask.all() for mask in masks):
         given = [np.ones(s.shape[:2], np.bool_) if m is None else m for s, m in zip(sources, masks, strict=True)]
         voting = [pixels_with_valid_window(mask, ceil(reach * mask.shape[0])) for mask in given]
-        patches = [_packed(mask.astype(np.uint64)).ravel() for mask in voting]
-        valid = (np.concatenate(patches) == 0x0001000100010001).astype(np.uint8)
+        valid = np.concatenate([_whole_patches(mask).ravel() for mask in voting])
     matrices = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in poses])
     shapes = np.array([source.shape[:2] for source in sources])
     return np.concatenate(pictures), starts, shapes, matrices, valid, starts
 
 
-def _packed(plane: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return all 2×2 patches of a plane of 16-bit numbers, (H, W) to (H + 1, W + 1), across the seam and the poles.
-
-    Patch (j, i) is upper left | lower left << 16 | upper right << 32 | lower right << 48 of rows j − 1, j and columns
-    i − 1, i.
-    """
-    padded = pad_panorama(plane, 1)
-    upper, lower = padded[:-1], padded[1:]
-    patches = upper[:, :-1] | lower[:, :-1] << 16 | upper[:, 1:] << 32 | lower[:, 1:] << 48
-    return np.asarray(patches, dtype=np.uint64)
+def _whole_patches(mask: Mask) -> NDArray[np.uint8]:
+    """Return which 2×2 patches of a mask are valid, (H, W) to (H + 1, W + 1), ordered as those of `pack_grey`."""
+    padded = pad_panorama(mask, 1)
+    return np.asarray(padded[:-1, :-1] & padded[1:, :-1] & padded[:-1, 1:] & padded[1:, 1:], np.uint8)
 
 
 def _check(

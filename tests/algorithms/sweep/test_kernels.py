@@ -131,7 +131,7 @@ def test_differences_are_averaged_over_seams(radius: int) -> None:
 
 
 @pytest.mark.kernel("sweep.numba.kernels_combine")
-@pytest.mark.parametrize("sources", [1, 2, 3, 5])
+@pytest.mark.parametrize("sources", [1, 2, 3, 5, 8, 9])
 @pytest.mark.parametrize(("share", "most"), [(0.5, 9), (1.0, 9), (1.0, 2)])
 @pytest.mark.parametrize("all_vote", [True, False])
 @pytest.mark.parametrize("weighted", [True, False])

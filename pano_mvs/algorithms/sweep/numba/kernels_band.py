@@ -55,7 +55,7 @@ def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, pl
     found = Lookup(knots, warped, votes, against, pixel_costs)
     for d in range(len(ranges)):
         for s in range(count):
-            if s == 0 or not summed:
+            if is_sad and (s == 0 or not summed):
                 pixel_costs[:] = 0
             warp_band(first - halo, height, sin_cos_azimuth, sources, s, ranges[d], pad, found)
             if is_sad:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, Combination
 
@@ -11,6 +12,8 @@ _F = np.float32
 _U = np.uint64
 # Sources hold the share that is asked for although their weights, added up, fall short of it by rounding.
 ENOUGH = 1 - 1e-5
+# Up to so many sources, of which at most half are used, are combined by `_combine_few`, so many pixels at a time.
+_FEW, _BLOCK = 8, 256
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -35,6 +38,9 @@ def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, 
         return
     row = _U(y)
     used = min(most, int(np.ceil(share * ENOUGH * sources)))
+    if sources <= _FEW and 2 * used <= _FEW:
+        _combine_few(costs, row, share, most, neutral, result)
+        return
     if used < sources:
         _sort_sources(costs, row)
     if all_vote:
@@ -53,6 +59,70 @@ def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, 
                 total += cost
                 taken += 1
         result[i] = total / _F(used) if used else neutral
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _in_order(a: np.float32, b: np.float32) -> tuple[np.float32, np.float32]:
+    return (a, b) if a < b else (b, a)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _mean_of_cheapest(
+    held: NDArray[np.float32], share: float, most: int, neutral: np.float32, result: NDArray[np.float32]
+) -> None:
+    """Combine the costs of up to eight sources, of which at most four count, in a loop without branches.
+
+    Args:
+        held: (8 · 256,) float32, source after source, infinite for sources that are not valid or do not exist.
+        share: of the valid sources that count.
+        most: number of sources that count.
+        neutral: the cost without a valid source.
+        result: (n,) float32, written.
+    """
+    block, one, none = _U(_BLOCK), np.int32(1), np.int32(0)
+    for i in range(_U(result.shape[0])):
+        a, b, c, d = held[i], held[i + block], held[i + _U(2) * block], held[i + _U(3) * block]
+        e, f = held[i + _U(4) * block], held[i + _U(5) * block]
+        g, h = held[i + _U(6) * block], held[i + _U(7) * block]
+        votes = (one if a < np.inf else none) + (one if b < np.inf else none) + (one if c < np.inf else none)
+        votes += (one if d < np.inf else none) + (one if e < np.inf else none) + (one if f < np.inf else none)
+        votes += (one if g < np.inf else none) + (one if h < np.inf else none)
+        used = np.ceil(share * ENOUGH * votes)
+        used = used if used < most else np.float64(most)
+        # Two fours in order; the lesser ones of both, from either end, are the four least; these in order.
+        a, b = _in_order(a, b)
+        c, d = _in_order(c, d)
+        a, c = _in_order(a, c)
+        b, d = _in_order(b, d)
+        b, c = _in_order(b, c)
+        e, f = _in_order(e, f)
+        g, h = _in_order(g, h)
+        e, g = _in_order(e, g)
+        f, h = _in_order(f, h)
+        f, g = _in_order(f, g)
+        a, b = h if h < a else a, g if g < b else b
+        c, d = f if f < c else c, e if e < d else d
+        a, c = _in_order(a, c)
+        b, d = _in_order(b, d)
+        a, b = _in_order(a, b)
+        c, d = _in_order(c, d)
+        total = (a if used > 0.5 else _F(0)) + (b if used > 1.5 else _F(0))
+        total = total + (c if used > 2.5 else _F(0))
+        total = total + (d if used > 3.5 else _F(0))
+        result[i] = total / _F(used) if used > 0.5 else neutral
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _combine_few(costs: F32, row: int, share: float, most: int, neutral: np.float32, result: F32) -> None:
+    """Do what `combine_row` does for up to eight sources without weights, of which at most four count."""
+    held = np.full(_FEW * _BLOCK, np.inf, np.float32)
+    for first in range(0, result.shape[0], _BLOCK):
+        count = min(_BLOCK, result.shape[0] - first)
+        for k in range(costs.shape[0]):
+            start, of_block = _U(k * _BLOCK), _U(first)
+            for i in range(_U(count)):
+                held[start + i] = costs[_U(k), row, of_block + i]
+        _mean_of_cheapest(held, share, most, neutral, result[first : first + count])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

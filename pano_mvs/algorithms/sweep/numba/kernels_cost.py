@@ -9,6 +9,8 @@ from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U
 
 _F = np.float32
 _U = np.uint64
+# Windows of up to so many columns on either side are added up column by column.
+_FEW = 6
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -54,6 +56,32 @@ def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: in
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def average_row(column_sums: I32, reach: int, pad: int, share: np.float32, scratch: I32, means: F32) -> None:
+    """Write sums of 2 reach + 1 neighbouring columns, times `share`; see `box_rows`."""
+    left, middle, right = _U(pad - reach), _U(pad), _U(pad + reach)
+    if reach == 1:
+        for i in range(_U(means.shape[0])):
+            total = np.int32(np.int32(column_sums[left + i] + column_sums[middle + i]) + column_sums[right + i])
+            means[i] = _F(total) * share
+        return
+    if reach <= _FEW:  # sums can be vectorised, and running sums cannot
+        scratch[:] = 0
+        for k in range(2 * reach + 1):
+            start = _U(pad - reach + k)
+            for i in range(_U(means.shape[0])):
+                scratch[i] = np.int32(scratch[i] + column_sums[start + i])
+        for i in range(_U(means.shape[0])):
+            means[i] = _F(scratch[i]) * share
+        return
+    running = np.int32(0)
+    for i in range(_U(column_sums.shape[0])):
+        running = np.int32(running + column_sums[i])
+        scratch[i] = running
+    for i in range(_U(means.shape[0])):
+        means[i] = _F(np.int32(scratch[right + i] - scratch[left - _U(1) + i])) * share
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I32, prefix: I32, means: F32) -> None:
     """Average costs over windows of 2 radius + 1 rows by 2 reach + 1 columns, in O(1) each.
 
@@ -66,7 +94,7 @@ def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I
         prefix: (W + 2 pad,) int32, scratch.
         means: (rows, W) float32, written.
     """
-    rows, width = means.shape
+    rows = means.shape[0]
     padded = _U(pixel_costs.shape[1])
     column_sums[:] = 0
     for j in range(2 * radius):
@@ -76,14 +104,7 @@ def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I
         entering, leaving = _U(y + 2 * radius), _U(y)
         for i in range(padded):
             column_sums[i] = np.int32(column_sums[i] + np.int32(pixel_costs[entering, i]))
-        running = np.int32(0)
-        for i in range(padded):
-            running = np.int32(running + column_sums[i])
-            prefix[i] = running
-        left, right = _U(pad - reach[y] - 1), _U(pad + reach[y])
         share = _F(1.0 / ((2 * radius + 1) * (2 * reach[y] + 1)))
-        row = _U(y)
-        for i in range(_U(width)):
-            means[row, i] = _F(np.int32(prefix[right + i] - prefix[left + i])) * share
+        average_row(column_sums, reach[y], pad, share, prefix, means[y])
         for i in range(padded):
             column_sums[i] = np.int32(column_sums[i] - np.int32(pixel_costs[leaving, i]))

@@ -88,7 +88,8 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
         offsets = window_offsets[mirrored]
         compared = j + compare_radius
         pixel_cost_row(cost, census_weight, reference, y + pad, warped, compared, offsets, pad, disagree, total)
-        pixel_costs[j, pad : pad + width] = total
+        for i in range(_U(width)):
+            pixel_costs[_U(j), _U(pad) + i] = total[i]
         wrap_row(pixel_costs[j], width, pad)
     if box_radius:
         box_rows(pixel_costs, reach, box_radius, pad, scratch[0], scratch[1], means)
