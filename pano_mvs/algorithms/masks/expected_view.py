@@ -92,11 +92,12 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     ground = ~(ranges < (1 - 2 * _SAME) * on_ground) & np.isfinite(on_ground)
     ranges = _enlarged(np.where(ground, on_ground, ranges), size_hw)
     ground = _enlarged(ground.astype(np.float32), size_hw) > 0.5
-    difference, ratio = _differences(picture, ranges, others)
+    colors = [_colors_around(other.picture) for other in others]
+    difference, ratio = _differences(picture, ranges, others, colors)
     # Such as a chair beside the camera that others hardly see.
     nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
     if nearer.any():
-        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others)[0]
+        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others, colors)[0]
         difference = np.fmin(difference, own)
     height = float("nan") if plane is None else float(plane[3])
     return Expected(ranges, ground, difference, ratio, height)
@@ -184,13 +185,18 @@ def _enlarged(values: Plane, size_hw: tuple[int, int]) -> Plane:
     return np.asarray(values[rows[:, None], columns])
 
 
-def _differences(picture: Picture, ranges: Plane, others: Sequence[OtherView]) -> tuple[Plane, Plane]:
-    """Return the differences of colour, (H, W), and the ratios of the colours, (H, W, 3), see `Expected`."""
+def _differences(
+    picture: Picture, ranges: Plane, others: Sequence[OtherView], around: Sequence[tuple[Plane, Plane, Plane]]
+) -> tuple[Plane, Plane]:
+    """Return the differences of colour, (H, W), and the ratios of the colours, (H, W, 3), see `Expected`.
+
+    `around` holds `_colors_around` of each view.
+    """
     own = _smooth(picture)
     points = ray_grid((ranges.shape[0], ranges.shape[1])) * np.nan_to_num(ranges, nan=1.0)[..., None]
     differences, colors = [], []
-    for other in others:
-        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges))
+    for other, of_other in zip(others, around, strict=True):
+        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges), of_other)
         visible = np.isfinite(middle[..., 0])
         gain = np.ones(3, np.float32)
         if visible.sum() > 100:
@@ -215,7 +221,9 @@ def _nan_median(values: Plane) -> Plane:
     return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
 
 
-def _seen_colors(other: OtherView, points: FloatArray, known: Mask) -> tuple[Plane, Plane, Plane]:
+def _seen_colors(
+    other: OtherView, points: FloatArray, known: Mask, around: tuple[Plane, Plane, Plane]
+) -> tuple[Plane, Plane, Plane]:
     """Return the darkest, the mean and the lightest colours (H, W, 3) of points in another view; NaN if hidden."""
     in_view = points @ other.pose.rotation.T + other.pose.translation
     distances = np.linalg.norm(in_view, axis=-1)
@@ -226,14 +234,18 @@ def _seen_colors(other: OtherView, points: FloatArray, known: Mask) -> tuple[Pla
     seen = _enlarged(other.range_map.range, size_hw)[at]
     with np.errstate(invalid="ignore"):
         visible = known & other.valid[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
-    smooth = _smooth(other.picture)
-    around = max(1, round(_AROUND_DEG * size_hw[0] / 180))
+    lowest, middle, highest = (np.where(visible[..., None], colors[at], np.float32(np.nan)) for colors in around)
+    return lowest, middle, highest
+
+
+def _colors_around(picture: Picture) -> tuple[Plane, Plane, Plane]:
+    """Return the darkest, the mean and the lightest colours around each pixel, (H, W, 3)."""
+    smooth = _smooth(picture)
+    around = max(1, round(_AROUND_DEG * len(picture) / 180))
     padded = pad_panorama(smooth, around)
     window = np.ones((2 * around + 1,) * 2, np.uint8)
     inner = (slice(around, -around),) * 2
-    found = (cv2.erode(padded, window)[inner][at], smooth[at], cv2.dilate(padded, window)[inner][at])
-    lowest, middle, highest = (np.where(visible[..., None], colors, np.float32(np.nan)) for colors in found)
-    return lowest, middle, highest
+    return cv2.erode(padded, window)[inner], smooth, cv2.dilate(padded, window)[inner]
 
 
 def _smooth(picture: Picture) -> Plane:

@@ -106,9 +106,9 @@ def moving_pixels(
     shadow = _shadows(expected) & valid
     found = nothing.copy()
     for area in _areas(changed & valid & ~shadow, expected, min_area_deg2):
-        if _extends_mask(area, ~valid) or _is_operator(picture, area):
+        if _extends_mask(area, ~valid):
             found |= area
-        elif passers_by and (person := _with_person(picture, area)).any():
+        elif (person := _of_person(picture, area, passers_by=passers_by)).any():
             found |= person
         elif vehicles and _is_vehicle(area, expected):
             found |= area
@@ -136,11 +136,20 @@ def _off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
     return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
 
 
-def _is_operator(picture: Picture, area: Mask) -> bool:
-    """Return whether an area extends to below the camera, where the operator stands, and may be a person."""
-    if _off_nadir_deg((area.shape[0], area.shape[1]))[area].min() >= _NADIR_DEG:
-        return False
-    return person_at(picture, area)[0] >= _OPERATOR
+def _of_person(picture: Picture, area: Mask, *, passers_by: bool) -> Mask:
+    """Return an area that shows the operator, or with the pixels of the person in it; nothing without a person.
+
+    The operator stands below the camera, to where such an area extends.
+    """
+    below = _off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG
+    if below or passers_by:
+        probability, pixels = person_at(picture, area)
+        if below and probability >= _OPERATOR:
+            return area
+        if passers_by and probability >= _PERSON:
+            reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
+            return area | (pixels & dilated(area, reach))
+    return np.zeros_like(area)
 
 
 def _extends_mask(area: Mask, masked: Mask) -> bool:
@@ -151,15 +160,6 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
     return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
-
-
-def _with_person(picture: Picture, area: Mask) -> Mask:
-    """Return an area with the pixels of the person in it; nothing without a person."""
-    probability, pixels = person_at(picture, area)
-    if probability < _PERSON:
-        return np.zeros_like(area)
-    reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
-    return area | (pixels & dilated(area, reach))
 
 
 def _is_vehicle(area: Mask, expected: Expected) -> bool:

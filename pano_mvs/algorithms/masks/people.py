@@ -131,7 +131,7 @@ def person_at(picture: Picture, area: Mask) -> tuple[float, Mask]:
     seen, coarse = SeenPanorama(picture), _reduced_mask(area)
     if coarse.any():
         looks, _ = _views_of(coarse, FINE_HW)
-        if max(seen.presence(each) for each in looks) >= _MIN_PRESENCE:
+        if any(seen.presence(each) >= _MIN_PRESENCE for each in looks):
             seen_again = [seen.probability(each, mirrored=True) for each in looks]
             mean = _at_size(np.asarray(np.mean(seen_again, axis=0), np.float32), (area.shape[0], area.shape[1]))
             return float(np.average(mean[area], weights=pixel_weights(area.shape)[area])), mean > _BELONGS
