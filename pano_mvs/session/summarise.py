@@ -38,7 +38,7 @@ from pano_mvs.results.records import (
     WorkflowSummary,
 )
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
+from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView, TwoViews
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.up_direction import mean_up_direction
 from pano_mvs.scene.upright import world_up, z_up_from_world
@@ -140,11 +140,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
     poses, result = latest(run, Poses), run.result
     if poses is None:
         return PosesSummary()
-    links: tuple[PairLink, ...] = ()
-    for stage in result.stages:
-        if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
-            images = run.states[stage.name].members
-            links = tuple(_link(images[pair], metrics) for pair, metrics in stage.unit_metrics.items())
+    links = _links(run)
     return poses_summary(
         poses,
         blocked=blocked,
@@ -153,6 +149,33 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
         links=links,
         heights=_camera_heights(split_groups(poses), latest(run, PointCloud)),
     )
+
+
+def _links(run: Run) -> tuple[PairLink, ...]:
+    """Return the pairs that were matched, with what later stages, such as matches.bridges, found."""
+    matched: dict[tuple[str, ...], Mapping[str, float]] = {}
+    for stage in run.result.stages:
+        if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
+            images = run.states[stage.name].members
+            matched |= {images[pair]: metrics for pair, metrics in stage.unit_metrics.items()}
+    views = latest(run, TwoViews)
+    return pair_links(matched, {} if views is None else views.views)
+
+
+def pair_links(
+    matched: Mapping[tuple[str, ...], Mapping[str, float]], later: Mapping[tuple[str, str], TwoView]
+) -> tuple[PairLink, ...]:
+    """Return the pairs of a capture.
+
+    Args:
+        matched: pairs that a matcher compared to the figures that it stated.
+        later: the geometries of all pairs after stages that judge them together. They replace what a matcher rejected.
+    """
+    links = {images: _link(images, metrics) for images, metrics in matched.items()}
+    for pair, view in later.items():
+        if view and not (pair in links and links[pair].inliers):
+            links[pair] = PairLink(*pair, len(view), view.candidates, round(view.residual_deg, 5))
+    return tuple(links.values())
 
 
 def poses_summary(
