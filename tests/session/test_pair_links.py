@@ -16,12 +16,12 @@ def _view(matches: int, candidates: int) -> TwoView:
 
 
 def test_pairs_of_a_later_stage_replace_rejected_ones_and_are_added() -> None:
-    matched = {
+    matched: dict[tuple[str, ...], dict[str, float]] = {
         ("a", "b"): {"candidates": 80.0, "inliers": 60.0, "residual_deg": 0.05},
         ("b", "c"): {"candidates": 30.0, "inliers": 0.0},
         ("a", "c"): {"candidates": 20.0},
     }
-    later = {
+    later: dict[tuple[str, str], TwoView] = {
         ("a", "b"): _view(50, 70),
         ("b", "c"): _view(12, 33),
         ("a", "c"): TwoView.failed("too few"),

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
-from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
+from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks, with_joint_doubts
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
@@ -82,7 +82,7 @@ def solve_scaled_translation(
     if join_rooms and _connected_but_apart(pairs, models):
         parts, _ = settings.models(pairs, lambda group: strongest_first(pairs, group, **settings.arguments))
         models = min(models, parts, key=_rank)
-    groups = [_finished(grown, adjust=adjust) for grown in models]
+    groups = [_finished(grown, adjust=adjust, confirmation=confirmation) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
@@ -156,7 +156,7 @@ def _rank(models: Sequence[GrownModel]) -> tuple[int, int]:
     return -sum(len(grown.model.cameras) for grown in models), len(models)
 
 
-def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
+def _finished(grown: GrownModel, *, adjust: bool, confirmation: Confirmation | None) -> Poses:
     """Return a finished model as poses of one group, with points."""
     model = grown.model
     if adjust:
@@ -164,4 +164,4 @@ def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
     poses = normalised_poses(poses_of(model))
     if grown.checks is not None:
         poses = with_camera_checks(poses, model.pairs, grown.checks)
-    return poses
+    return poses if confirmation is None else with_joint_doubts(poses, model, confirmation)

@@ -15,12 +15,12 @@ from pano_mvs.algorithms.poses.growth import grown_models
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors
 from pano_mvs.algorithms.poses.joining.level_pairs import level_from_world
-from pano_mvs.algorithms.poses.joining.models import cross_matches, joined_model
+from pano_mvs.algorithms.poses.joining.models import are_apart, cross_matches, joined_model
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.two_view.cheirality import agreement
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
+from pano_mvs.geometry import Rigid3, angle_between
 from pano_mvs.scene import Features, TwoView
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +32,6 @@ _PROMISING = 0.0  # log10 of the false alarms at a first look, above which two g
 _PAIRS_OF_GROUPS = 12  # image pairs that are matched for two groups, the most similar ones
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 0.6, 2.0, 0.06
 _OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # matches that the best alignment explains and a rival does not
-_SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
 _MIN_OF_PAIR = 8
 
 
@@ -208,13 +207,7 @@ class _Search:
         for ratio in _RATIOS:
             matches = cross_matches(first, second, self._matches(first, second, ratio))
             for threshold_deg in (self.threshold_deg, 0.5 * self.threshold_deg):
-                aligned = align_models(
-                    matches,
-                    rng=self.rng,
-                    threshold_rad=float(np.deg2rad(threshold_deg)),
-                    has_scale=len(second.cameras) > 1,
-                    levels=(_level(first), _level(second)),
-                )
+                aligned = self._aligned(first, second, matches, threshold_rad=float(np.deg2rad(threshold_deg)))
                 if aligned is not None:
                     found.append((aligned, matches))
             if not found or min(one.log10_false_alarms for one, _ in found) > _PROMISING:
@@ -222,10 +215,27 @@ class _Search:
         best, matches = min(found, key=lambda item: item[0].log10_false_alarms)
         if best.log10_false_alarms > -self.significance or not _is_determined(best):
             return None
-        rivals = [one for one, _ in found if _differ(best, one, first=first, second=second)]
-        if any(_is_rival(best, rival, matches) for rival in rivals):
-            return None
+        others = [one for one, _ in found]
+        rest = matches[np.flatnonzero(~best.inliers)]
+        # Without the matches that agree: an alignment with another, similar room has matches of its own.
+        again = self._aligned(first, second, rest, threshold_rad=best.threshold_rad)
+        others += [] if again is None else [again]
+        for other in others:
+            alignments = best.first_from_second, other.first_from_second
+            if are_apart(alignments, first, second) and _is_rival(best, other, matches):
+                return None
         return best, matches
+
+    def _aligned(
+        self, first: PlacedModel, second: PlacedModel, matches: CrossMatches, *, threshold_rad: float
+    ) -> Alignment | None:
+        return align_models(
+            matches,
+            rng=self.rng,
+            threshold_rad=threshold_rad,
+            has_scale=len(second.cameras) > 1,
+            levels=(_level(first), _level(second)),
+        )
 
     def _matches(self, first: PlacedModel, second: PlacedModel, ratio: float) -> dict[Pair, NDArray[np.int32]]:
         """Return the matches of the most similar pairs of images of two models."""
@@ -306,18 +316,11 @@ def _is_determined(alignment: Alignment) -> bool:
 
 
 def _is_rival(best: Alignment, other: Alignment, matches: CrossMatches) -> bool:
-    """Return whether another alignment explains nearly as many matches that the best one does not explain."""
+    """Return whether another alignment explains nearly as many matches that the best one does not explain.
+
+    Matches without a known point are ignored, since many of them agree with any alignment.
+    """
     explained = match_errors(other.first_from_second, matches) < best.threshold_rad
-    own, others = int((best.inliers & ~explained).sum()), int((explained & ~best.inliers).sum())
+    own = int((best.inliers & ~explained & matches.known).sum())
+    others = int((explained & ~best.inliers & matches.known).sum())
     return own < _OWN_OF_RIVAL * others + _MIN_OWN
-
-
-def _differ(best: Alignment, other: Alignment, *, first: PlacedModel, second: PlacedModel) -> bool:
-    """Return whether two alignments put the second model at different places."""
-    one, two = best.first_from_second, other.first_from_second
-    if float(geodesic_angle(one.rotation, two.rotation)) > _SAME_TURN_RAD:
-        return True
-    centers = np.array([camera.center for camera in second.cameras.values()])
-    origin = np.mean([camera.center for camera in first.cameras.values()], axis=0)
-    offsets = one.apply(centers) - origin, two.apply(centers) - origin
-    return bool(angle_between(*offsets).max() > _SAME_DIRECTION_RAD)

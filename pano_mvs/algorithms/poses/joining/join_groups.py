@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
-from pano_mvs.algorithms.poses.joining.models import cross_matches, joined_model
+from pano_mvs.algorithms.poses.joining.models import are_apart, cross_matches, joined_model
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
 _THRESHOLD_RAD = float(np.deg2rad(0.4))
 _MIN_WITNESSES, _MIN_SHARE, _MAX_LOG10_FALSE_ALARMS = 10, 0.5, -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
+_MIN_OF_RIVAL = 0.5  # of the witnesses of an alignment; a rival with more makes it ambiguous
 _SAME_TURN_RAD = float(np.deg2rad(2.0))
 
 
@@ -48,16 +48,7 @@ def join_models(models: Sequence[PlacedModel]) -> list[tuple[PlacedModel, tuple[
 
 def _alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
     """Return the alignment of two models by the pairs between them; None if these do not determine it."""
-    matches, relative = _between(first, second)
-    if matches is None or not matches.known.any():
-        return None
-    alignment = align_models(
-        matches,
-        rng=np.random.default_rng(0),
-        threshold_rad=_THRESHOLD_RAD,
-        has_scale=len(second.cameras) > 1,
-        relative=relative,
-    )
+    relative, alignment = _aligned(first, second)
     if (
         alignment is None
         or alignment.witnesses < _MIN_WITNESSES
@@ -67,18 +58,38 @@ def _alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
         or alignment.offset_std_deg > _MAX_OFFSET_STD_DEG
         or alignment.scale_std > _MAX_SCALE_STD
         or not _most_agree(alignment, relative)
+        or _has_rival(alignment, first, second)
     ):
         return None
     return alignment
 
 
-def _between(first: PlacedModel, second: PlacedModel) -> tuple[CrossMatches | None, dict[tuple[int, int], Rigid3]]:
-    """Return the matches of the best geometries of the pairs between two models, and these in the worlds' axes."""
+def _has_rival(alignment: Alignment, first: PlacedModel, second: PlacedModel) -> bool:
+    """Return whether the runner-up geometries of the pairs put the second model elsewhere, nearly as well supported.
+
+    Where structure repeats, the pairs of two groups agree on several alignments, and the best one may be false.
+    """
+    _, other = _aligned(first, second, runners_up=True)
+    if other is None or other.witnesses < _MIN_OF_RIVAL * alignment.witnesses:
+        return False
+    return are_apart((alignment.first_from_second, other.first_from_second), first, second)
+
+
+def _aligned(
+    first: PlacedModel, second: PlacedModel, *, runners_up: bool = False
+) -> tuple[dict[tuple[int, int], Rigid3], Alignment | None]:
+    """Return the relative poses of the pairs between two models in the worlds' axes, and the alignment by them.
+
+    Args:
+        first: a model.
+        second: another model.
+        runners_up: use the second geometry of each pair, of those that have one, instead of the best.
+    """
     found, relative = {}, {}
     for edge, geometries in first.pairs.geometries.items():
         for one, other in (edge, edge[::-1]):
-            if one in first.cameras and other in second.cameras:
-                view, swapped = geometries[0].view, one > other
+            if one in first.cameras and other in second.cameras and len(geometries) > runners_up:
+                view, swapped = geometries[int(runners_up)].view, one > other
                 pose = Rigid3(view.rotation, view.direction)
                 pose = pose.inverse() if swapped else pose
                 turn = second.cameras[other].rotation.T
@@ -86,7 +97,16 @@ def _between(first: PlacedModel, second: PlacedModel) -> tuple[CrossMatches | No
                     turn @ pose.rotation @ first.cameras[one].rotation, turn @ pose.translation
                 )
                 found[one, other] = view.matches_idx[:, ::-1] if swapped else view.matches_idx
-    return (cross_matches(first, second, found) if found else None), relative
+    matches = cross_matches(first, second, found) if found else None
+    if matches is None or not matches.known.any():
+        return relative, None
+    return relative, align_models(
+        matches,
+        rng=np.random.default_rng(0),
+        threshold_rad=_THRESHOLD_RAD,
+        has_scale=len(second.cameras) > 1,
+        relative=relative,
+    )
 
 
 def _most_agree(alignment: Alignment, relative: dict[tuple[int, int], Rigid3]) -> bool:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, stacked
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
-from pano_mvs.geometry import Rigid3, Similarity3
+from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
+
+_SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
 
 
 def cross_matches(
@@ -56,3 +58,14 @@ def joined_model(first: PlacedModel, second: PlacedModel, first_from_second: Sim
         model.set_ranges(image, scale * second.known_ranges(image))
     model.chosen |= second.chosen
     return model
+
+
+def are_apart(alignments: tuple[Similarity3, Similarity3], first: PlacedModel, second: PlacedModel) -> bool:
+    """Return whether two alignments put the second model at different places in the world of the first one."""
+    one, other = alignments
+    if float(geodesic_angle(one.rotation, other.rotation)) > _SAME_TURN_RAD:
+        return True
+    centers = np.array([camera.center for camera in second.cameras.values()])
+    origin = np.mean([camera.center for camera in first.cameras.values()], axis=0)
+    offsets = one.apply(centers) - origin, other.apply(centers) - origin
+    return bool(angle_between(*offsets).max() > _SAME_DIRECTION_RAD)

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,6 @@ _SOURCES = 4
 # In units of the median baseline. A near limit from the longest one would lose the foreground if one source is far
 # away.
 _NEAREST_BASELINES = 0.15
-_MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 1.0, 0.5, 0.05
 # With less textured area than this share of the sphere, nothing can be concluded about a pose.
 MIN_TEXTURED = 0.05
 # Maps kept for an image with the same sources; relative poses that differ by less than this give the same map.
@@ -38,6 +38,21 @@ _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65
 _CLASSES = len(_PARALLAX_EDGES_DEG)
 # Weight, as solid angle, of the overall share in each class.
 _PRIOR = 0.05
+
+
+class _Consistency(TypedDict):
+    max_relative_error: float
+    max_reprojection_px: float
+    min_support: float
+    min_motion_px: float
+
+
+_CONSISTENCY: _Consistency = {
+    "max_relative_error": 0.05,
+    "max_reprojection_px": 1.0,
+    "min_support": 0.5,
+    "min_motion_px": 0.05,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,16 +158,7 @@ class Confirmation:
             seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
             maps.append(self._swept(source, others[source], seen_by, cameras=everybody))
             poses.append(others[source])
-        checked = check_consistency(
-            own,
-            pose,
-            maps,
-            source_poses=poses,
-            max_relative_error=_MAX_RELATIVE_ERROR,
-            max_reprojection_px=_MAX_REPROJECTION_PX,
-            min_support=_MIN_SUPPORT,
-            min_motion_px=_MIN_MOTION_PX,
-        )
+        checked = check_consistency(own, pose, maps, source_poses=poses, **_CONSISTENCY)
         confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured
         classes = _parallax_classes(own.range, pose, poses)
         return Evidence(
@@ -169,6 +175,17 @@ class Confirmation:
             reduced = reduced_panorama(picture, WIDTH_PX)
             self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
         return self._small[image]
+
+    def range_with(self, image: int, partner: int, cameras: Mapping[int, Rigid3]) -> NDArray[np.float64]:
+        """Return the ranges (128, 256) that two images confirm alone, NaN elsewhere, of the first of them."""
+        with _one_thread():
+            own, other = (
+                self._swept(one, cameras[one], [source], cameras=cameras)
+                for one, source in ((image, partner), (partner, image))
+            )
+        checked = check_consistency(own, cameras[image], [other], source_poses=[cameras[partner]], **_CONSISTENCY)
+        confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & self.small(image).mask
+        return np.where(confirmed, own.range, np.nan).astype(np.float64)
 
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.

@@ -12,6 +12,7 @@ from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.joints import joint_doubts
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -75,7 +76,7 @@ def _verified(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return with_camera_checks(poses, pairs, checks)
+    return with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -112,3 +113,12 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
         expected_shares=of_each(checks.expected) if checks.asked else None,
         doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )
+
+
+def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation) -> Poses:
+    """Return poses of one group with the doubts about the joints of its parts, beside those that it has."""
+    doubts = dict(poses.doubts)
+    for image, reason in joint_doubts(model, confirmation).items():
+        name = model.pairs.names[image]
+        doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
+    return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})
