@@ -114,11 +114,19 @@ def _details(picture: Picture) -> list[FloatImage]:
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[height // 4 : height - height // 4].astype(np.float32)
     details = []
     for _ in range(_MAX_HALVINGS + 2):
-        size = max(1, grey.shape[1] // 2), max(1, grey.shape[0] // 2)
-        half = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        details.append(grey - cv2.resize(half, grey.shape[::-1], interpolation=cv2.INTER_CUBIC))
-        grey = half
+        details.append(finest_detail(grey))
+        grey = _halved(grey)
     return details
+
+
+def finest_detail(grey: FloatImage) -> FloatImage:
+    """Return the detail of an image (H, W) that is lost if it is halved."""
+    return grey - cv2.resize(_halved(grey), grey.shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+
+def _halved(grey: FloatImage) -> FloatImage:
+    size = max(1, grey.shape[1] // 2), max(1, grey.shape[0] // 2)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _relative_detail(fine: FloatImage, coarse: FloatImage) -> float:

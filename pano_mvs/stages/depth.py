@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from pano_mvs.algorithms.plain_scale import coarser_levels, ranges_of_levels
 from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, sharp_halvings
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
@@ -50,6 +51,11 @@ class SweepParams(Params):
     scale: Literal["finer", "sharp", "nominal"] = Field(
         default="finer",
         description="resolution of the sweep: up to twice that at which the panorama is sharp, that one, or its own",
+    )
+    multiscale: bool = Field(
+        default=True,
+        description="sweep panoramas of 2048 columns and more also at half the resolution, down to 1024 columns, for "
+        "what shows only noise at the full one; not with scale: nominal",
     )
 
     @model_validator(mode="after")
@@ -95,18 +101,24 @@ def sweep(
     if params.scale == "finer":
         halvings = max(halvings - 1, 0)
     pictures, masks = reduced(pictures, masks, halvings=halvings)
-    found = sweep_range(
-        pictures[0],
-        pictures[1:],
-        [other @ poses[0].inverse() for other in poses[1:]],
-        near=near,
-        far=far,
-        settings=settings_from(SweepSettings, params),
-        backend=params.backend,
-        device=params.device,
-        reference_mask=masks[0],
-        source_masks=masks[1:],
-    )
+
+    def swept(halvings: int) -> RangeMap:
+        small, valid = reduced(pictures, masks, halvings=halvings)
+        return sweep_range(
+            small[0],
+            small[1:],
+            [other @ poses[0].inverse() for other in poses[1:]],
+            near=near,
+            far=far,
+            settings=settings_from(SweepSettings, params),
+            backend=params.backend,
+            device=params.device,
+            reference_mask=valid[0],
+            source_masks=valid[1:],
+        )
+
+    levels = coarser_levels(pictures[0].shape[:2]) if params.multiscale and params.scale != "nominal" else 0
+    found = ranges_of_levels(levels, lambda level: reduced(pictures[:1], [], halvings=level)[0][0], swept)
     range_map = enlarged_range_map(found, ref.size_hw)
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("sources", len(sources))

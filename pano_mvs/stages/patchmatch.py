@@ -9,6 +9,7 @@ from pydantic import Field
 from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
+from pano_mvs.algorithms.plain_scale import coarser_levels
 from pano_mvs.algorithms.sharp_scale import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.scene.pose_groups import require_one_group
@@ -21,6 +22,11 @@ class PatchMatchParams(Params):
 
     scale: Literal["sharp", "nominal"] = Field(
         default="sharp", description="where to begin: the resolution at which the panorama is sharp, or its own"
+    )
+    multiscale: bool = Field(
+        default=True,
+        description="refine panoramas of 2048 columns and more also at half the resolution, down to 1024 columns, for "
+        "what shows only noise at the full one; not with scale: nominal",
     )
 
 
@@ -37,13 +43,15 @@ def patchmatch(
     """Fit slanted planes to the ranges and move them to where the images match best; also gives normals."""
     require_one_group(pose, source_poses)
     reference = ref.load()
+    is_nominal = params.scale == "nominal"
     refined = refine_at_scale(
         range_map,
         reference,
         [source.load() for source in sources],
         source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
         source_masks=[source.load_mask() for source in sources],
-        halvings=sharp_halvings(reference) if params.scale == "sharp" else 0,
+        halvings=0 if is_nominal else sharp_halvings(reference),
+        levels=coarser_levels(ref.size_hw) if params.multiscale and not is_nominal else 0,
         **arguments_from(refine_range, params),
     )
     ctx.metric("completeness", float(refined.valid.mean()))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.refine import refine_range
+from pano_mvs.algorithms.plain_scale import with_coarser
 from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, reduced_range_map
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
@@ -28,6 +30,7 @@ def refine_at_scale(
     *,
     source_from_reference: Sequence[Rigid3],
     halvings: int,
+    levels: int = 0,
     source_masks: Sequence[Mask],
     rounds: int,
     **settings: Any,
@@ -36,24 +39,34 @@ def refine_at_scale(
 
     Args:
         range_map: as of `refine_range`, likewise the following arguments and the result.
-        reference: (H, W, 3) uint8 RGB; 2^halvings divides H and W.
+        reference: (H, W, 3) uint8 RGB; 2^halvings and 2^levels divide H and W.
         sources: one or more (Hs, Ws, 3) uint8 RGB.
         source_from_reference: pose of each source relative to the reference.
         halvings: how often the reference is halved for the first rounds; 0: all rounds at its own size.
+        levels: number of coarser sizes at which ranges are refined as well, for pixels without detail at a finer one.
         source_masks: for each source (Hs, Ws), False where it is ignored.
-        rounds: number of rounds at the reduced size; at most two follow at the panorama's own size.
+        rounds: number of rounds; after a reduced size, at most two follow at a larger one that is not sharp.
         settings: other settings of `refine_range`.
     """
     settings = {**settings, "source_from_reference": source_from_reference}
-    if not halvings:
-        return refine_range(range_map, reference, sources, source_masks=source_masks, rounds=rounds, **settings)
-    everything = np.ones(reference.shape[:2], np.bool_)
-    small, masks = reduced([reference, *sources], [everything, *source_masks], halvings=halvings)
-    reduced_map = reduced_range_map(range_map, halvings=halvings)
-    coarse = refine_range(reduced_map, small[0], small[1:], source_masks=masks[1:], rounds=rounds, **settings)
-    height, width = range_map.range.shape
-    enlarged = enlarged_range_map(coarse, (height, width)).range
-    seen = (range_map.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(enlarged)
-    start = RangeMap(np.where(seen, enlarged, range_map.range).astype(np.float32), range_map.confidence)
-    rounds = min(rounds, _FINAL_ROUNDS)
-    return refine_range(start, reference, sources, source_masks=source_masks, rounds=rounds, **settings)
+    pictures = [reference, *sources]
+    masks = [np.ones(reference.shape[:2], np.bool_), *source_masks]
+    found: RangeMap | None = None
+    for level in reversed(range(max(halvings, levels) + 1)):
+        small, valid = reduced(pictures, masks, halvings=level)
+        start, count = reduced_range_map(range_map, halvings=level) if level else range_map, rounds
+        if found is not None and level < halvings:
+            start, count = _continued(found, start), min(rounds, _FINAL_ROUNDS)
+        fine = refine_range(start, small[0], small[1:], source_masks=valid[1:], rounds=count, **settings)
+        if found is not None and level < levels:
+            fine = replace(with_coarser(fine, found, small[0]), confidence=fine.confidence)
+        found = fine
+    assert found is not None
+    return found
+
+
+def _continued(coarse: RangeMap, swept: RangeMap) -> RangeMap:
+    """Return swept ranges, (H, W), replaced by those that were refined at a smaller size."""
+    enlarged = enlarged_range_map(coarse, (swept.range.shape[0], swept.range.shape[1])).range
+    seen = (swept.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(enlarged)
+    return RangeMap(np.where(seen, enlarged, swept.range).astype(np.float32), swept.confidence)
