@@ -142,7 +142,7 @@ def checked_with_agreement(
         ranges = np.where(removed, np.float32(np.nan), ranges)
     uncertainty = confirmed_uncertainty(
         consistent & seen,
-        seen,
+        ranges,
         support=comparison.support,
         squared_error=comparison.squared_error * px_per_rad**2,
         motion=px_per_rad * np.sqrt(comparison.motion),

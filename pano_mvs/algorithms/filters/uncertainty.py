@@ -1,9 +1,9 @@
 """Standard deviations of ranges, from parallax and from the agreement between views.
 
 A match is precise to some angle, and the parallax in the sources converts that angle into a relative error of the
-range. The angle is not known, but it shows: where matches are poor, ranges of different views disagree, and fewer
-pixels are confirmed. The factors were fitted to renders with known ranges (three places) and checked on five others;
-`tests/benchmarks/uncertainty.py` measures them.
+range. The angle is not known, but it shows: where matches are poor, ranges of different views disagree, and surfaces
+are rough. The factors were fitted to synthetic places with known ranges, leaving out each place in turn, and checked
+on rendered ones; `tests/benchmarks/uncertainty.py` measures them.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ UNCONFIRMED_UNCERTAINTY = 0.15
 """Relative standard deviation of ranges that no other view confirms: weak, moved and filled ones."""
 
 # The one factor that was fitted: errors per rms reprojection error. Views share errors, so it is larger than 1.
-_SCALE = 2.2
-_PRECISION_RADIUS, _SHARE_RADIUS = 4, 8
-# Smaller reprojection errors are chance, and windows with fewer confirmed pixels are equally unreliable.
-_MIN_ERROR_PX, _MIN_SHARE = 0.02, 0.1
+_SCALE = 5.4
+_PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS = 4, 2, 8
+# Smaller reprojection errors, and less roughness, are chance; both in pixels.
+_MIN_ERROR_PX, _MIN_ROUGH_PX = 0.02, 0.01
+# Errors grow slowly with the roughness of the surface.
+_ROUGH_POWER = 0.25
 # Near steps like this, in ln range, a pixel may have the range of the other surface.
-_STEP, _STEP_WEIGHT = 0.1, 5.0
+_STEP, _STEP_WEIGHT, _STEP_POWER = 0.1, 5.0, 1 / 3
 _LEAST, _MOST = 0.0005, 0.5
 
 
 def confirmed_uncertainty(
     consistent: Mask,
-    seen: Mask,
+    ranges: NDArray[np.float32],
     *,
     support: FloatArray,
     squared_error: FloatArray,
@@ -42,33 +44,45 @@ def confirmed_uncertainty(
 ) -> NDArray[np.float16]:
     """Return the relative standard deviation of ranges, (H, W); `UNCONFIRMED_UNCERTAINTY` where they are not confirmed.
 
-    σ = 2.2 e (1 + 5 d) / (p² M). M is the parallax: the motion of the pixel in its sources per relative change of its
-    range. e is the rms reprojection error of the confirmed pixels within 4 pixels, weighted by their support. p is the
-    confirmed share of the pixels within 8 pixels that were seen, and d the share of pixels at steps of the range.
+    σ = 5.4 e (ρ M)^¼ (1 + 5 d)^⅓ / M. M is the parallax: the motion of the pixel in its sources per relative change of
+    its range. e is the rms reprojection error of the confirmed pixels within 4 pixels, weighted by their support. ρ is
+    the roughness of the surface: the rms relative deviation of the confirmed ranges within 2 pixels from their means,
+    so that ρ M is in pixels. d is the share of pixels at steps of the range within 8 pixels.
 
     Args:
         consistent: (H, W) pixels that other views confirm.
-        seen: (H, W) pixels that were seen, which include these.
+        ranges: (H, W), finite where consistent.
         support: (H, W) sum of the supports of the sources.
         squared_error: (H, W) sum of supports times squared reprojection errors, in pixels².
         motion: (H, W) M in pixels.
         step: (H, W) ln(largest / smallest range) around the pixel.
     """
-    near, wide = (max(1, min(radius, len(seen) // 2 - 1)) for radius in (_PRECISION_RADIUS, _SHARE_RADIUS))
+    near, rough, wide = (
+        max(1, min(radius, len(ranges) // 2 - 1)) for radius in (_PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS)
+    )
     sigma = box_sum(np.where(consistent, squared_error, 0), near)
     sigma /= np.maximum(box_sum(np.where(consistent, support, 0), near), 1e-9)
     sigma = np.maximum(np.sqrt(np.maximum(sigma, 0)), _MIN_ERROR_PX)
-    sigma /= _share(consistent, seen, wide) ** 2
-    sigma *= 1 + _STEP_WEIGHT * _share(step > _STEP, np.ones_like(seen), wide, least=0)
-    sigma *= _SCALE / np.maximum(motion, 1e-9)
+    motion = np.maximum(motion, 1e-9)
+    sigma *= np.maximum(_roughness(consistent, ranges, rough) * motion, _MIN_ROUGH_PX) ** _ROUGH_POWER
+    sigma *= (1 + _STEP_WEIGHT * _share(step > _STEP, wide)) ** _STEP_POWER
+    sigma *= _SCALE / motion
     return np.where(consistent, np.clip(sigma, _LEAST, _MOST), UNCONFIRMED_UNCERTAINTY).astype(np.float16)
 
 
-def _share(part: Mask, whole: Mask, radius: int, *, least: float = _MIN_SHARE) -> FloatArray:
-    """Return the share of the pixels of a set within a window that are in a part of it."""
+def _roughness(consistent: Mask, ranges: NDArray[np.float32], radius: int) -> FloatArray:
+    """Return the rms relative deviation of 1/range from the mean around it, of the consistent pixels of a window."""
+    inverse = np.where(consistent, 1 / np.where(consistent, ranges, 1).astype(np.float64), 0)
+    count = np.maximum(box_sum(consistent.astype(np.float64), radius), 1)
+    mean = np.maximum(box_sum(inverse, radius) / count, 1e-12)
+    deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), radius) / count
+    return np.asarray(np.sqrt(np.maximum(deviation, 0)))
+
+
+def _share(part: Mask, radius: int) -> FloatArray:
+    """Return the share of the pixels of a window that are in a part of it."""
     share = box_sum(part.astype(np.float64), radius)
-    share /= np.maximum(box_sum(whole.astype(np.float64), radius), 1)
-    return np.asarray(np.maximum(share, least))
+    return np.asarray(share / box_sum(np.ones(part.shape), radius))
 
 
 def replaced_uncertainty(
