@@ -19,6 +19,7 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.support.free_space import respect_free_space
 from pano_mvs.algorithms.sharp_scale import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.geometry import pixel_solid_angle
@@ -122,6 +123,37 @@ def consistency(
     for name, value in asdict(agreement).items():
         ctx.metric(name, value)
     return _measured(checked, ctx)
+
+
+@params_from(respect_free_space)
+class FreeSpaceParams(Params):
+    """Settings of filters.free_space."""
+
+
+@stage("filters.free_space", memory=bytes_per_pixel(150, each_source=40))
+def free_space(
+    range_map: Each[RangeMap],
+    pose: Each[Pose],
+    sources: Near[RangeMap],
+    source_poses: Near[Pose],
+    params: FreeSpaceParams,
+    ctx: Context,
+) -> RangeMap:
+    """Correct unconfirmed ranges by confirmed ones of other views: those behind a point, and those seen through.
+
+    Use it after filters.consistency, and a filter that fills holes after it.
+    """
+    require_one_group(pose, source_poses)
+    corrected, hidden, seen_through = respect_free_space(
+        range_map,
+        pose.cam_from_world,
+        sources,
+        source_poses=[other.cam_from_world for other in source_poses],
+        **arguments_from(respect_free_space, params),
+    )
+    ctx.metric("hidden", hidden)
+    ctx.metric("seen_through", seen_through)
+    return _measured(corrected, ctx)
 
 
 class ScaleRangesParams(Params):

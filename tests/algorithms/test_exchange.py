@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges, offers_of, projected, surface_planes
+from pano_mvs.algorithms.patchmatch.exchange import (
+    SourceView,
+    exchange_ranges,
+    offers_of,
+    project_range_map,
+    surface_planes,
+)
 from pano_mvs.algorithms.patchmatch.kernels_exchange import correlate_pixels, land_nearest
 from pano_mvs.algorithms.patchmatch.refine import reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
@@ -106,7 +112,7 @@ def test_compiled_correlations_equal_the_definition(scene: Scene) -> None:
 
 def test_true_ranges_of_a_source_land_on_true_ranges(scene: Scene) -> None:
     _, truth, sources = scene
-    landed, positions = projected(sources[0], SIZE)
+    landed, positions = project_range_map(sources[0].range_map, sources[0].from_reference, SIZE)
     assert offers_of(sources[0], np.full(SIZE, 9, np.float32)).normals is None
     np.testing.assert_array_equal(positions >= 0, np.isfinite(landed))
     ratio = (landed / truth)[np.isfinite(landed) & on_a_surface(truth)]
@@ -118,9 +124,9 @@ def test_the_nearest_of_those_that_land_in_a_pixel_counts() -> None:
     """A large source, of alternating ranges, at the place of a small reference: every second pixel is a spot."""
     ranges = np.where(np.add.outer(np.arange(32), np.arange(64)) % 2, 3.0, 2.0).astype(np.float32)
     source = SourceView(np.zeros((32, 64, 3), np.uint8), seen(ranges), Rigid3.identity())
-    np.testing.assert_allclose(projected(source, (16, 32))[0], 2.0, rtol=1e-6)
+    np.testing.assert_allclose(project_range_map(source.range_map, source.from_reference, (16, 32))[0], 2.0, rtol=1e-6)
     faint = replace(source, range_map=RangeMap(ranges, np.where(ranges < 2.5, 63, 64).astype(np.uint8)))
-    np.testing.assert_allclose(projected(faint, (16, 32))[0], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(project_range_map(faint.range_map, faint.from_reference, (16, 32))[0], 3.0, rtol=1e-6)
 
 
 def test_normals_turn_with_the_camera() -> None:
@@ -203,7 +209,9 @@ def test_confirmed_pixels_stay_whatever_other_sources_agree_on(scene: Scene) -> 
     picture, truth, sources = scene
     views = [sources[0], *(shell_around_reference(source, 0.8) for source in sources[1:])]
     settings: dict[str, Any] = {"min_agreeing": 2, "agreement": 10, "max_relative_error": 0.05}
-    judged = on_a_surface(truth) & np.isfinite(projected(sources[0], SIZE)[0])
+    judged = on_a_surface(truth) & np.isfinite(
+        project_range_map(sources[0].range_map, sources[0].from_reference, SIZE)[0]
+    )
     kept, lost = (
         (exchange_ranges(seen(truth), picture, views, min_support=least, **settings)[0].range == truth)[judged].mean()
         for least in (0.3, 2.0)

@@ -156,7 +156,9 @@ class Offers:
 
 def offers_of(source: SourceView, farthest: FloatImage) -> Offers:
     """Return the ranges of a source that are nearer than given ones, (H, W), of the reference."""
-    ranges, positions = projected(source, (farthest.shape[0], farthest.shape[1]))
+    ranges, positions = project_range_map(
+        source.range_map, source.from_reference, (farthest.shape[0], farthest.shape[1])
+    )
     with np.errstate(invalid="ignore"):
         pixels = np.flatnonzero((ranges < farthest).ravel())
     normals = source.range_map.normals_in_cam
@@ -176,16 +178,23 @@ def _replaced(range_map: RangeMap, offers: Offers) -> RangeMap:
     return RangeMap(ranges, range_map.confidence, normals, sky=range_map.sky)
 
 
-def projected(source: SourceView, size_hw: tuple[int, int]) -> tuple[FloatImage, NDArray[np.int64]]:
+def project_range_map(
+    range_map: RangeMap, from_reference: Rigid3, size_hw: tuple[int, int]
+) -> tuple[FloatImage, NDArray[np.int64]]:
     """Return the ranges of a source as the reference sees them, and the positions of its pixels, (H, W) each.
 
-    Every pixel of the source lands in one pixel of the reference; of those that land in the same one, the nearest
-    counts. Where none lands, the range is NaN and the position −1.
+    Every pixel of the source that was seen lands in one pixel of the reference; of those that land in the same one, the
+    nearest counts. Where none lands, the range is NaN and the position −1.
+
+    Args:
+        range_map: of the source.
+        from_reference: pose of the source: x_in_source = R x_in_reference + t.
+        size_hw: of the reference.
     """
     from pano_mvs.algorithms.patchmatch.kernels_exchange import land_points
 
-    ranges = seen_ranges(source.range_map, min_confidence=WEAK_CONFIDENCE[0])
-    back = source.from_reference.inverse()
+    ranges = seen_ranges(range_map, min_confidence=WEAK_CONFIDENCE[0])
+    back = from_reference.inverse()
     view = np.ascontiguousarray(back.rotation), np.ascontiguousarray(back.translation)
     nearest, positions = np.full(size_hw, np.nan), np.full(size_hw, -1, np.int64)
     land_points(ranges, sines_of_grid((ranges.shape[0], ranges.shape[1])), view, nearest, positions)

@@ -71,6 +71,7 @@ MECHANISMS = (
     Mechanism("3", "P2 that follows the picture", "depth.p2_contrast=0"),
     Mechanism("3", "low penalties", "depth.p1=80 depth.p2=1600"),
     Mechanism("3", "gradients beside census", "depth.cost=census"),
+    Mechanism("3", "free space of other views", stages={"visible": None}),
     Mechanism(
         "4",
         "slanted planes",
