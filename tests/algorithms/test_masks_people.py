@@ -13,10 +13,14 @@ from PIL import Image
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks import person_network
+from pano_mvs.algorithms.masks.areas import dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.person_network import SIDE_PX, person_presence, person_probability
+from pano_mvs.algorithms.masks.person_views import SeenPanorama, rolled, stereographic_look
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.geometry import PinholeView, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
+from pano_mvs.testing.persons import Drawn, draw_people, person
+from pano_mvs.testing.room import default_room, render
 
 SIZE_HW = (512, 1024)
 SAMPLE = Path(__file__).parents[2] / "workflows" / "samples" / "classroom" / "images" / "003.png"
@@ -81,8 +85,8 @@ def crowd(room: Picture, portrait: tuple[Picture, Mask]) -> tuple[Picture, dict[
 def test_people_are_found_and_nothing_else(crowd: tuple[Picture, dict[str, Mask]]) -> None:
     picture, shown = crowd
     found = people(picture)
-    for name, person in shown.items():
-        assert share(found, person) > 0.9, name
+    for name, pixels in shown.items():
+        assert share(found, pixels) > 0.9, name
     around = cv2.dilate(np.any(list(shown.values()), axis=0).astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
     assert share(found, ~around) < 0.01
 
@@ -119,3 +123,40 @@ def test_a_damaged_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(person_network, "_POSE", (person_network._POSE[0], "another digest"))
     with pytest.raises(StoreError, match=r"pose_landmark_lite.*Install pano-mvs again"):
         person_presence(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+
+
+def with_somebody(pose: str, *, reach: float) -> Drawn:
+    camera = Rigid3.from_center(np.eye(3), np.zeros(3))
+    picture, ranges = render(default_room(0, "weak"), camera, (256, 512), supersample=1)
+    body = person(pose, "jacket", at_xz=(0.2 * reach, -reach), ground_y=1.3, heading=2.0)
+    return draw_people(picture, ranges, camera, people=[body])
+
+
+def test_a_network_outlines_what_is_in_the_middle() -> None:
+    drawn = with_somebody("standing", reach=1.5)
+    view = stereographic_look(upright_rotation(np.array([0.2, 0.3, -1.0])), 90.0)
+    outline = view.on_map(SeenPanorama(drawn.picture).outline(view))
+    assert outline[drawn.people].mean() > 0.8
+    assert outline[~drawn.people & (view.weight > 0)].mean() < 0.1
+
+
+@pytest.mark.parametrize(("pose", "reach"), [("crouching", 0.2), ("sitting", 0.1), ("standing", 0.7)])
+def test_operators_are_found(pose: str, reach: float) -> None:
+    """Below the camera and beside it, where they reach from below it to above the horizon."""
+    drawn = with_somebody(pose, reach=reach)
+    found = people(drawn.picture)
+    weights = pixel_weights((256, 512))
+    assert weights[found & drawn.people].sum() > 0.9 * weights[drawn.people].sum()
+    assert share_of_sphere(found & ~dilated(drawn.people | drawn.shadow, 4)) < 0.005
+
+
+def test_stereographic_views_invert_their_rays() -> None:
+    view = stereographic_look(rolled(upright_rotation(np.array([0.3, 0.5, -0.8])), 0.2), 150.0).view
+    rays = view.rays()
+    offsets = np.arange(SIDE_PX) + 0.5
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
+    np.testing.assert_allclose(view.pixels_from_rays(rays), np.stack(np.meshgrid(offsets, offsets), axis=-1), atol=1e-6)
+    edge = view.pixels_from_rays(rays[128:129, :1]) - SIDE_PX / 2
+    angle = np.degrees(np.arccos(rays[128, 0] @ view.view_from_cam[2]))
+    assert angle == pytest.approx(75, abs=0.6)
+    assert np.linalg.norm(edge) == pytest.approx(127.5, abs=0.6)

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.person_network import SIDE_PX, person_presence, person_probability
+from pano_mvs.algorithms.masks.person_network import (
+    SIDE_PX,
+    person_outline,
+    person_presence,
+    person_probability,
+)
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec
 
 Picture = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-COARSE_HW, FINE_HW = (128, 256), (256, 512)
-"""Sizes of maps of directions."""
+MAP_HW = (256, 512)
+"""Size of maps of directions."""
 
 WIDTH = 1024
 """Columns of the panorama in which people are looked for, and of the result; smaller ones are used as they are."""
@@ -31,16 +35,42 @@ _WIDE_DEG = 85.0
 
 
 @dataclass(frozen=True, eq=False)
+class StereographicView:
+    """A square stereographic picture: unlike a pinhole view, it keeps the shape of what is far from its middle.
+
+    Attributes:
+        view_from_cam: (3, 3) rotation, as of `PinholeView`.
+        focal_px: pixels of a radian in the middle.
+    """
+
+    view_from_cam: FloatArray
+    focal_px: float
+
+    def rays(self) -> FloatArray:
+        """Return the unit rays (256, 256, 3) of the pixels in the panorama's camera frame."""
+        offsets = np.arange(SIDE_PX) + 0.5 - SIDE_PX / 2
+        x, y = np.meshgrid(offsets, offsets)
+        # With p on the plane, the ray is (4 p, 4 − |p|²) / (4 + |p|²), in units of the focal length.
+        squared = (x**2 + y**2) / self.focal_px**2
+        in_view = np.stack([4 * x / self.focal_px, 4 * y / self.focal_px, 4 - squared], axis=-1)
+        return np.asarray(in_view / (4 + squared)[..., None] @ self.view_from_cam)
+
+    def pixels_from_rays(self, rays_in_cam: FloatArray) -> FloatArray:
+        """Return the pixels (..., 2) in which unit rays (..., 3) arrive."""
+        in_view = rays_in_cam @ self.view_from_cam.T
+        scale = 2 * self.focal_px / np.maximum(1 + in_view[..., 2:], 1e-6)
+        return np.asarray(in_view[..., :2] * scale + SIDE_PX / 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Look:
     """A square view, and where its pixels and those of a map of directions lie in one another.
 
     Attributes:
-        view: the pinhole view.
-        map_hw: size of the map of directions.
+        view: its geometry.
     """
 
-    view: PinholeView
-    map_hw: tuple[int, int]
+    view: PinholeView | StereographicView
 
     @property
     def wide(self) -> bool:
@@ -54,17 +84,21 @@ class Look:
         return np.asarray(pixel_from_ray(self.view.rays(), size_hw) / size_hw[::-1], np.float32)
 
     @cached_property
-    def pixels(self) -> tuple[Map, Map, Map]:
-        """For each direction of the map, x and y in OpenCV's pixels, and a weight: 1 in the middle, 0 outside."""
-        pixels = np.nan_to_num(self.view.pixels_from_rays(_rays(self.map_hw)), nan=-1e3).astype(np.float32)
-        inside = np.minimum(pixels, SIDE_PX - pixels).min(axis=-1)
-        weight = np.clip(inside / np.float32(_BORDER_PX), 0, 1)
-        return pixels[..., 0] - np.float32(0.5), pixels[..., 1] - np.float32(0.5), weight
+    def pixels(self) -> Map:
+        """The position (x, y), in OpenCV's pixels, of each direction of the map in the view."""
+        pixels = np.nan_to_num(self.view.pixels_from_rays(_rays()), nan=-1e3).astype(np.float32)
+        return pixels - np.float32(0.5)
 
-    @property
+    @cached_property
     def weight(self) -> Map:
-        """The weight of each direction of the map, see `pixels`."""
-        return self.pixels[2]
+        """The weight of each direction of the map: 1 in the middle of the view, 0 outside."""
+        inside = np.minimum(self.pixels, SIDE_PX - 1 - self.pixels).min(axis=-1) + np.float32(0.5)
+        return np.asarray(np.clip(inside / np.float32(_BORDER_PX), 0, 1), np.float32)
+
+    def on_map(self, tile: Map) -> Map:
+        """Return the values (256, 256) of a view's pixels in the directions of the map; 0 outside of the view."""
+        found = cv2.remap(tile, self.pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(found, np.float32)
 
 
 class SeenPanorama:
@@ -72,61 +106,53 @@ class SeenPanorama:
 
     def __init__(self, picture: Picture) -> None:
         """Take a panorama, (H, W, 3) uint8 RGB, and reduce it to `WIDTH` columns."""
-        self._full = pad_panorama(_reduced(picture, WIDTH), _PAD_PX)
-        self._half = pad_panorama(_reduced(picture, WIDTH // 2), _PAD_PX)
-        self.size_hw = (min(picture.shape[0], WIDTH // 2), min(picture.shape[1], WIDTH))
+        reduced = _reduced(picture, WIDTH)
+        self._full = pad_panorama(reduced, _PAD_PX)
+        self._half = pad_panorama(_reduced(reduced, WIDTH // 2), _PAD_PX)
+        self.size_hw = (reduced.shape[0], reduced.shape[1])
 
-    def image(self, look: Look) -> Picture:
+    def image(self, look: Look, *, mirrored: bool = False) -> Picture:
         """Return the image of a view, (256, 256, 3) uint8 RGB."""
         padded = self._half if look.wide else self._full
         size_wh = np.array([padded.shape[1] - 2 * _PAD_PX, padded.shape[0] - 2 * _PAD_PX], np.float32)
         at = look.from_sphere * size_wh + np.float32(_PAD_PX - 0.5)
-        return np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        image = np.asarray(cv2.remap(padded, at, None, cv2.INTER_LINEAR), np.uint8)
+        return np.ascontiguousarray(image[:, ::-1]) if mirrored else image
 
     def probability(self, look: Look, *, mirrored: bool = False) -> Map:
-        """Return the probability of a person in each direction of a view's map; 0 outside of the view."""
-        image = self.image(look)
-        in_view = person_probability(image)
-        if mirrored:
-            in_view = (in_view + person_probability(np.ascontiguousarray(image[:, ::-1]))[:, ::-1]) / np.float32(2)
-        found = cv2.remap(in_view, *look.pixels[:2], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return np.asarray(found, np.float32)
+        """Return the probability of a person in each pixel of a view, (256, 256)."""
+        found = person_probability(self.image(look, mirrored=mirrored))
+        return found[:, ::-1] if mirrored else found
+
+    def outline(self, look: Look, *, mirrored: bool = False) -> Map:
+        """Return how likely each pixel of a view, (256, 256), is of what is in its middle."""
+        found = person_outline(self.image(look, mirrored=mirrored))
+        return found[:, ::-1] if mirrored else found
 
     def presence(self, look: Look, *, mirrored: bool = False) -> float:
         """Return how likely a view shows a person in its middle."""
-        image = self.image(look)
-        return person_presence(np.ascontiguousarray(image[:, ::-1]) if mirrored else image)
+        return person_presence(self.image(look, mirrored=mirrored))
 
 
-def look(view_from_cam: FloatArray, fov_deg: float, map_hw: tuple[int, int] = COARSE_HW) -> Look:
-    """Return a square view with its maps.
-
-    Args:
-        view_from_cam: (3, 3).
-        fov_deg: its field of view.
-        map_hw: size of the map of directions.
-    """
+def look(view_from_cam: FloatArray, fov_deg: float) -> Look:
+    """Return a square pinhole view with a field of view."""
     focal_px = SIDE_PX / 2 / float(np.tan(np.radians(fov_deg) / 2))
-    return Look(PinholeView(view_from_cam, focal_px, np.full(2, SIDE_PX / 2), (SIDE_PX, SIDE_PX)), map_hw)
+    return Look(PinholeView(view_from_cam, focal_px, np.full(2, SIDE_PX / 2), (SIDE_PX, SIDE_PX)))
 
 
-@lru_cache(maxsize=2)
-def _rays(map_hw: tuple[int, int]) -> FloatArray:
-    return ray_grid(map_hw)
+def stereographic_look(view_from_cam: FloatArray, fov_deg: float) -> Look:
+    """Return a square stereographic view with a field of view."""
+    return Look(StereographicView(view_from_cam, SIDE_PX / 4 / float(np.tan(np.radians(fov_deg) / 4))))
+
+
+@cache
+def _rays() -> FloatArray:
+    return ray_grid(MAP_HW)
 
 
 def rolled(view_from_cam: FloatArray, roll: float) -> FloatArray:
     """Return the rotation of a view that is rolled about its axis."""
     return np.asarray(rotation_from_rotvec(np.array([0.0, 0.0, roll])) @ view_from_cam)
-
-
-def mean_probability(maps: Iterable[tuple[Map, Look]]) -> Map:
-    """Return the weighted mean over views of the probability in each direction; 0 where no view looks."""
-    total = weight = np.zeros(1, np.float32)
-    for probability, seen in maps:
-        total = total + seen.weight * probability
-        weight = weight + seen.weight
-    return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
 
 
 def _reduced(picture: Picture, width: int) -> Picture:

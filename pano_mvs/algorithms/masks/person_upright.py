@@ -1,0 +1,250 @@
+"""Find people who stand, sit or walk around the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.layout import upright_rotation
+from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
+from pano_mvs.algorithms.masks.person_network import SIDE_PX
+from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, rolled, stereographic_look
+from pano_mvs.geometry import pixel_from_ray
+
+Mask = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
+# The views in which people are looked for.
+_RING, _RING_FOV_DEG, _RING_ELEVATION_DEG = 8, 85.0, -12.0
+# What is in the middle of a view is looked for with this standard deviation.
+_MIDDLE_PX = 55.0
+_MIN_TILE_PX = 100
+# A candidate is seen again in views this many times as wide.
+_VIEW_OF_EXTENT, _MIN_FOV_DEG, _MAX_FOV_DEG = 1.8, 30.0, 165.0
+_ROUNDS, _GROWS = 3, 1.25
+# Rolls in degrees, whether mirrored, how much wider, and by which share of its height lower, of the views that have to
+# agree; and of views in which somebody who is seen down to the waist is detected, since that is what they are lower by.
+_AGAIN = ((0.0, False, 1.0, 0.0), (12.0, True, 1.0, 0.0), (-12.0, False, 1.2, 0.0))
+_TO_THE_WAIST = ((0.0, False, 1.33, 0.5), (0.0, True, 1.33, 0.5), (0.0, False, 1.67, 0.5), (0.0, True, 1.67, 0.5))
+# The probability of a person: in the first view of a candidate, and of a person.
+_MIN_FIRST, _MIN_PROBABILITY = 0.1, 0.65
+# A person is detected in most of the views.
+_MIN_PRESENCE, _MAY_MISS = 0.5, 1
+_MIN_PROBABILITY_TO_THE_WAIST = 0.75
+# People are taller than wide; tables and benches are not.
+_MIN_FIRST_ASPECT, _MIN_ASPECT = 0.5, 1.15
+_MIN_OVERLAP = 0.72
+_BELONGS = 0.5
+# Time is limited: so many candidates are looked at.
+_MAX_CANDIDATES = 8
+# People stand on the ground: their heads are not much farther above the horizon than their feet are below it.
+# Those beside the camera may be taller than it, and may be seen in part.
+_MAX_HEAD_TO_FEET, _HEAD_ABOVE_DEG, _NEAR_DEG = 0.8, 4.0, -30.0
+# The feet of the operator are at least so far below the horizon.
+_OPERATOR_DEG = -40.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """An area of a view: its directions (N, 3), their middle, extent, and solid angle."""
+
+    rays: FloatArray
+    center: FloatArray
+    extent_deg: float
+    area_deg2: float
+    score: float
+
+    @property
+    def span_deg(self) -> tuple[float, float]:
+        """The elevations of its feet and its head."""
+        low, high = np.quantile(np.arcsin(np.clip(-self.rays[:, 1], -1, 1)), (0.01, 0.99))
+        return float(np.degrees(low)), float(np.degrees(high))
+
+    @property
+    def aspect(self) -> float:
+        """The ratio of its height to its width, as seen from the camera."""
+        across = np.arcsin(np.clip(self.rays @ upright_rotation(self.center)[:2].T, -1, 1))
+        width, height = np.ptp(np.quantile(across, (0.02, 0.98), axis=0), axis=0)
+        return float(height / max(width, 1e-6))
+
+
+def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, passers_by: bool) -> Mask:
+    """Return the pixels, `MAP_HW`, of people around the camera.
+
+    A network that outlines what is in the middle of a view looks along the horizon. Each outline is seen again in the
+    middle of views of its own, rolled and mirrored: these have to agree on it, to detect a person, and a second network
+    has to find a person there.
+
+    Args:
+        seen: the panorama.
+        known: (H, W) people who are found already, `MAP_HW`.
+        min_area_deg2: the smallest person.
+        passers_by: whether to find people whose feet are far from the camera.
+    """
+    found = known.copy()
+    candidates = [_candidate(seen.outline(each), each) for each in _ring()]
+    possible = [each for each in candidates if each is not None and _may_be_person(each, _MIN_FIRST_ASPECT)]
+    tried: list[_Candidate] = []
+    for each in sorted(possible, key=lambda candidate: -candidate.score)[:_MAX_CANDIDATES]:
+        if each.area_deg2 < min_area_deg2 / 2 or _share_in(each, found) > 0.5 or any(_same(each, o) for o in tried):
+            continue
+        tried.append(each)
+        found |= _confirmed(seen, each, passers_by=passers_by, tried=tried)
+    return found
+
+
+def _candidate(outline: Map, view: Look) -> _Candidate | None:
+    """Return the area in the middle of a view; None without one."""
+    count, labels = cv2.connectedComponents((outline > _BELONGS).astype(np.uint8), connectivity=4)
+    flat, middle = labels.ravel(), (_middle() * outline).ravel()
+    scores = np.bincount(flat, middle, count)
+    scores[0] = 0
+    best = int(scores.argmax())
+    area = labels == best
+    if best == 0 or area.sum() < _MIN_TILE_PX:
+        return None
+    rays, solid_angles = _geometry(view)
+    inside, weights = rays[area], solid_angles[area]
+    center = weights @ inside
+    center /= np.linalg.norm(center)
+    extent_deg = 2 * float(np.degrees(np.quantile(np.arccos(np.clip(inside @ center, -1, 1)), 0.97)))
+    share = float(scores[best] / outline[area].sum())
+    return _Candidate(inside, center, extent_deg, float(weights.sum()) * np.degrees(1) ** 2, share)
+
+
+def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, tried: list[_Candidate]) -> Mask:
+    """Return the pixels, `MAP_HW`, of a person; none if the views of a candidate do not agree that it is one."""
+    nobody = np.zeros(MAP_HW, np.bool_)
+    for idx in range(_ROUNDS):
+        view = _look_at(candidate)
+        if idx == 0 and _probability_in(candidate, seen.probability(view), view) < _MIN_FIRST:
+            return nobody
+        again = _candidate(seen.outline(view), view)
+        if again is None or not _may_be_person(again, _MIN_FIRST_ASPECT):
+            return nobody
+        grows = again.extent_deg > _GROWS * candidate.extent_deg
+        candidate = again
+        if not grows:
+            break
+    tried.append(candidate)
+    if not _may_be_person(candidate, _MIN_ASPECT) or (not passers_by and candidate.span_deg[0] > _OPERATOR_DEG):
+        return nobody
+    mean = _seen_again(seen, candidate)
+    if mean is None:
+        return nobody
+    labels = area_labels(np.asarray(mean > _BELONGS))
+    inside = labels[_on_map(candidate)]
+    return np.isin(labels, np.unique(inside[inside >= 0]))
+
+
+def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
+    """Return the mean outline, `MAP_HW`, in several views of a candidate; None if they do not show a person."""
+    first = _look_at(candidate)
+    probability = _probability_in(candidate, seen.probability(first), first)
+    if probability < _MIN_PROBABILITY:
+        return None
+    if not _is_present(seen, candidate, _AGAIN) and (
+        probability < _MIN_PROBABILITY_TO_THE_WAIST or not _is_present(seen, candidate, _TO_THE_WAIST)
+    ):
+        return None
+    outlines = []
+    for roll_deg, mirrored, wider, _ in _AGAIN:
+        view = _look_at(candidate, roll_deg, wider)
+        outlines.append(view.on_map(seen.outline(view, mirrored=mirrored)))
+    mean = np.asarray(np.mean(outlines, axis=0), np.float32)
+    overlaps = [_overlap(each > _BELONGS, mean > _BELONGS) for each in outlines]
+    return mean if np.mean(overlaps) >= _MIN_OVERLAP else None
+
+
+def _is_present(
+    seen: SeenPanorama,
+    candidate: _Candidate,
+    views: tuple[tuple[float, bool, float, float], ...],
+) -> bool:
+    """Return whether a person is detected in all views of a candidate but one."""
+    missed = 0
+    for roll_deg, mirrored, wider, lower in views:
+        view = _look_at(candidate, roll_deg, wider, lower=lower)
+        missed += seen.presence(view, mirrored=mirrored) < _MIN_PRESENCE
+        if missed > _MAY_MISS:
+            return False
+    return True
+
+
+def _look_at(candidate: _Candidate, roll_deg: float = 0.0, wider: float = 1.0, *, lower: float = 0.0) -> Look:
+    """Return a view with a candidate in its middle, or lower by a share of its height."""
+    fov_deg = float(np.clip(_VIEW_OF_EXTENT * wider * candidate.extent_deg, _MIN_FOV_DEG, _MAX_FOV_DEG))
+    upright = upright_rotation(candidate.center)
+    feet_deg, head_deg = candidate.span_deg
+    turn = np.radians(lower * (head_deg - feet_deg))
+    axis = np.cos(turn) * upright[2] + np.sin(turn) * upright[1]
+    return stereographic_look(rolled(upright_rotation(axis), float(np.radians(roll_deg))), fov_deg)
+
+
+def _probability_in(candidate: _Candidate, probability: Map, view: Look) -> float:
+    """Return the mean probability of a person over a candidate."""
+    x, y = np.floor(view.view.pixels_from_rays(candidate.rays)).astype(np.intp).T
+    inside = (x >= 0) & (y >= 0) & (x < SIDE_PX) & (y < SIDE_PX)
+    return float(probability[y[inside], x[inside]].mean()) if inside.any() else 0.0
+
+
+def _may_be_person(candidate: _Candidate, min_aspect: float) -> bool:
+    """Return whether a candidate is upright and stands on the ground, and is not furniture or a part of a facade."""
+    feet_deg, head_deg = candidate.span_deg
+    stands = feet_deg < _NEAR_DEG or head_deg < _HEAD_ABOVE_DEG - _MAX_HEAD_TO_FEET * feet_deg
+    return stands and candidate.aspect >= min_aspect
+
+
+def _same(first: _Candidate, second: _Candidate) -> bool:
+    """Return whether two candidates are of the same thing."""
+    apart_deg = np.degrees(np.arccos(np.clip(first.center @ second.center, -1, 1)))
+    smaller, larger = sorted((first.extent_deg, second.extent_deg))
+    return bool(apart_deg < 0.15 * smaller and larger < 1.2 * smaller)
+
+
+def _share_in(candidate: _Candidate, pixels: Mask) -> float:
+    """Return the share of a candidate that lies in some pixels of the map."""
+    x, y = np.floor(pixel_from_ray(candidate.rays, MAP_HW)).astype(np.intp).T
+    return float(pixels[np.minimum(y, MAP_HW[0] - 1), x % MAP_HW[1]].mean())
+
+
+def _on_map(candidate: _Candidate) -> Mask:
+    """Return the pixels of the map in which the directions of a candidate lie."""
+    x, y = np.floor(pixel_from_ray(candidate.rays, MAP_HW)).astype(np.intp).T
+    pixels = np.zeros(MAP_HW, np.bool_)
+    pixels[np.minimum(y, MAP_HW[0] - 1), x % MAP_HW[1]] = True
+    return pixels
+
+
+def _overlap(first: Mask, second: Mask) -> float:
+    weights = pixel_weights(MAP_HW)
+    return float(weights[first & second].sum() / max(weights[first | second].sum(), 1e-9))
+
+
+def _geometry(view: Look) -> tuple[FloatArray, FloatArray]:
+    """Return the rays (256, 256, 3) and the solid angles (256, 256) of a stereographic view's pixels."""
+    rays = view.view.rays()
+    along = rays @ view.view.view_from_cam[2]
+    return rays, ((1 + along) / 2 / view.view.focal_px) ** 2
+
+
+@cache
+def _middle() -> Map:
+    offsets = np.arange(SIDE_PX) - (SIDE_PX - 1) / 2
+    falloff = np.exp(-(offsets**2) / (2 * _MIDDLE_PX**2))
+    return np.asarray(falloff[:, None] * falloff, np.float32)
+
+
+@cache
+def _ring() -> tuple[Look, ...]:
+    elevation = np.radians(_RING_ELEVATION_DEG)
+    looks = []
+    for azimuth in np.radians(np.arange(_RING) * 360 / _RING):
+        x, z = np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth)
+        looks.append(stereographic_look(upright_rotation(np.array([x, -np.sin(elevation), z])), _RING_FOV_DEG))
+    return tuple(looks)
