@@ -40,7 +40,7 @@ _MIN_PROBABILITY_TO_THE_WAIST = 0.75
 _MIN_FIRST_ASPECT, _MIN_ASPECT = 0.5, 1.15
 _MIN_OVERLAP = 0.72
 _BELONGS = 0.5
-# Time is limited: so many candidates are looked at.
+# Time is limited: at most this many candidates are looked at.
 _MAX_CANDIDATES = 8
 # People stand on the ground: their heads are not much farther above the horizon than their feet are below it.
 # Those beside the camera may be taller than it, and may be seen in part.
