@@ -224,7 +224,7 @@ def compare_with_sources(
 
 def agreeing_sources(
     points: FloatArray,
-    sources: Sequence[RangeMap],
+    sources: Sequence[NDArray[np.float32]],
     source_from_reference: Sequence[Rigid3],
     *,
     max_relative_error: float,
@@ -235,7 +235,7 @@ def agreeing_sources(
 
     Args:
         points: (N, 3) in the reference frame.
-        sources: range maps; filled pixels are left out.
+        sources: ranges (H, W) that were seen, NaN is left out; see `seen_ranges`.
         source_from_reference: pose of each.
         max_relative_error: largest relative difference of ranges that agree.
         max_angle: largest angle between pixel and reprojection, in radians.
@@ -245,9 +245,8 @@ def agreeing_sources(
 
     agreeing = np.zeros(len(points), np.uint8)
     limits = max_relative_error, max_angle, _MAX_SURFACE_STEP
-    for source, moved in zip(sources, source_from_reference, strict=True):
-        known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
-        count_agreeing(points, _arrays_of(moved), known, limits, most, agreeing)
+    for ranges, moved in zip(sources, source_from_reference, strict=True):
+        count_agreeing(points, _arrays_of(moved), ranges, limits, most, agreeing)
     return agreeing
 
 

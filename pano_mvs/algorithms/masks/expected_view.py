@@ -93,11 +93,11 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     ranges = _enlarged(np.where(ground, on_ground, ranges), size_hw)
     ground = _enlarged(ground.astype(np.float32), size_hw) > 0.5
     colors = [_colors_around(other.picture) for other in others]
-    difference, ratio = _differences(picture, ranges, others, colors)
+    difference, ratio = _differences(picture, ranges, others, around=colors)
     # Such as a chair beside the camera that others hardly see.
     nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
     if nearer.any():
-        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others, colors)[0]
+        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others, around=colors)[0]
         difference = np.fmin(difference, own)
     height = float("nan") if plane is None else float(plane[3])
     return Expected(ranges, ground, difference, ratio, height)
@@ -186,7 +186,7 @@ def _enlarged(values: Plane, size_hw: tuple[int, int]) -> Plane:
 
 
 def _differences(
-    picture: Picture, ranges: Plane, others: Sequence[OtherView], around: Sequence[tuple[Plane, Plane, Plane]]
+    picture: Picture, ranges: Plane, others: Sequence[OtherView], *, around: Sequence[tuple[Plane, Plane, Plane]]
 ) -> tuple[Plane, Plane]:
     """Return the differences of colour, (H, W), and the ratios of the colours, (H, W, 3), see `Expected`.
 
@@ -196,7 +196,7 @@ def _differences(
     points = ray_grid((ranges.shape[0], ranges.shape[1])) * np.nan_to_num(ranges, nan=1.0)[..., None]
     differences, colors = [], []
     for other, of_other in zip(others, around, strict=True):
-        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges), of_other)
+        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges), around=of_other)
         visible = np.isfinite(middle[..., 0])
         gain = np.ones(3, np.float32)
         if visible.sum() > 100:
@@ -222,7 +222,7 @@ def _nan_median(values: Plane) -> Plane:
 
 
 def _seen_colors(
-    other: OtherView, points: FloatArray, known: Mask, around: tuple[Plane, Plane, Plane]
+    other: OtherView, points: FloatArray, known: Mask, *, around: tuple[Plane, Plane, Plane]
 ) -> tuple[Plane, Plane, Plane]:
     """Return the darkest, the mean and the lightest colours (H, W, 3) of points in another view; NaN if hidden."""
     in_view = points @ other.pose.rotation.T + other.pose.translation

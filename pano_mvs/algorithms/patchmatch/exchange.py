@@ -109,19 +109,22 @@ def exchange_ranges(
     unsure = seen & ((own.agreeing < 1) | (own.support < min_support))
     least = min(min_agreeing, max(len(sources), 2))
     farthest = np.where(unsure, range_map.range * (1 - max_relative_error), np.float32(0)).astype(np.float32)
-    offers = Offers.joined([offers_of(source, farthest) for source in sources])
-    points = _rays_of(offers.pixels, farthest.shape) * offers.ranges.astype(np.float64)[:, None]
-    agreeing = agreeing_sources(points, *views, **limits, most=max(least, _MOST_AGREEING))
-    offers, agreeing = offers.chosen(agreeing >= least), agreeing[agreeing >= least]
-    wanted = np.unique(offers.pixels)
+    known = [seen_ranges(view, min_confidence=WEAK_CONFIDENCE[0]) for view in views[0]]
     match = _Matcher(reference, sources)
-    normals = range_map.normals_in_cam
-    own_normals = None if normals is None else normals.reshape(-1, 3)[wanted]
-    score = np.zeros(seen.size)
-    score[wanted] = match.correlation(Offers(wanted, range_map.range.ravel()[wanted], own_normals))
-    score[wanted] += agreement * np.minimum(own.agreeing.ravel()[wanted], _MOST_AGREEING)
-    scores = match.correlation(offers) + agreement * np.minimum(agreeing, _MOST_AGREEING)
-    better = np.flatnonzero(scores > score[offers.pixels])
+    offered, scored = [], []
+    for source in sources:
+        offers = offers_of(source, farthest)
+        points = _rays_of(offers.pixels, farthest.shape) * offers.ranges.astype(np.float64)[:, None]
+        agreeing = agreeing_sources(points, known, views[1], **limits, most=max(least, _MOST_AGREEING))
+        offers, agreeing = offers.chosen(agreeing >= least), agreeing[agreeing >= least]
+        offered.append(offers)
+        scored.append(match.correlation(offers) + agreement * np.minimum(agreeing, _MOST_AGREEING))
+    offers, scores = Offers.joined(offered), np.concatenate(scored)
+    wanted = np.unique(offers.pixels)
+    own_scores = np.zeros(seen.size)
+    own_scores[wanted] = match.correlation(_own_offers(range_map, wanted))
+    own_scores[wanted] += agreement * np.minimum(own.agreeing.ravel()[wanted], _MOST_AGREEING)
+    better = np.flatnonzero(scores > own_scores[offers.pixels])
     # The last of a pixel counts: the best one, and of equals that of the first source.
     better = better[::-1][np.argsort(scores[better[::-1]], kind="stable")]
     share = float(len(np.unique(offers.pixels[better])) / max(seen.sum(), 1))
@@ -166,6 +169,11 @@ def offers_of(source: SourceView, farthest: FloatImage) -> Offers:
         turn = source.from_reference.rotation
         normals = (normals.reshape(-1, 3)[positions.ravel()[pixels]].astype(np.float64) @ turn).astype(np.float16)
     return Offers(pixels, ranges.ravel()[pixels], normals)
+
+
+def _own_offers(range_map: RangeMap, pixels: NDArray[np.int64]) -> Offers:
+    normals = range_map.normals_in_cam
+    return Offers(pixels, range_map.range.ravel()[pixels], None if normals is None else normals.reshape(-1, 3)[pixels])
 
 
 def _replaced(range_map: RangeMap, offers: Offers) -> RangeMap:

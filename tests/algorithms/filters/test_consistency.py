@@ -72,11 +72,12 @@ def test_sources_that_agree_are_counted_alone_or_with_all_figures(true_maps: lis
     moved = [pose @ POSES[0].inverse() for pose in POSES[1:]]
     limits: dict[str, Any] = {"max_relative_error": 0.02, "max_angle": 0.03}
     points = (ray_grid(SIZE) * true_maps[0].range[..., None]).reshape(-1, 3)
-    found = agreeing_sources(points, true_maps[1:], moved, **limits)
+    known = [seen_ranges(true, min_confidence=64) for true in true_maps[1:]]
+    found = agreeing_sources(points, known, moved, **limits)
     expected = compare_with_sources(true_maps[0].range, true_maps[1:], moved, **limits).agreeing.ravel()
     assert found.max() == len(moved)
     np.testing.assert_array_equal(found, expected)
-    enough = agreeing_sources(points, true_maps[1:], moved, **limits, most=2)
+    enough = agreeing_sources(points, known, moved, **limits, most=2)
     np.testing.assert_array_equal(enough, np.minimum(expected, 2))
 
 
