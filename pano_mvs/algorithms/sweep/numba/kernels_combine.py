@@ -12,7 +12,7 @@ _F = np.float32
 _U = np.uint64
 # Sources hold the share that is asked for although their weights, added up, fall short of it by rounding.
 ENOUGH = 1 - 1e-5
-# Up to so many sources, of which at most half are used, are combined by `_combine_few`, so many pixels at a time.
+# `_combine_few` combines at most this many sources, of which at most half count, and this many pixels at a time.
 _FEW, _BLOCK = 8, 256
 
 

@@ -9,7 +9,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U
 
 _F = np.float32
 _U = np.uint64
-# Windows of up to so many columns on either side are added up column by column.
+# Windows of at most this many columns on either side are added up column by column.
 _FEW = 6
 
 
