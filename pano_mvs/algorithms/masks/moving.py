@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights
 from pano_mvs.algorithms.masks.expected_view import Expected, OtherView, expected_view
 from pano_mvs.algorithms.masks.people import person_at
+from pano_mvs.algorithms.masks.person_views import SeenPanorama
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
@@ -105,13 +106,12 @@ def moving_pixels(
     changed = np.nan_to_num(expected.difference, nan=0.0) > _CHANGED
     shadow = _shadows(expected) & valid
     found = nothing.copy()
+    seen = SeenPanorama(picture)
     for area in _areas(changed & valid & ~shadow, expected, min_area_deg2):
-        if _extends_mask(area, ~valid):
+        if _extends_mask(area, ~valid) or (vehicles and _is_vehicle(area, expected)):
             found |= area
-        elif (person := _of_person(picture, area, passers_by=passers_by)).any():
-            found |= person
-        elif vehicles and _is_vehicle(area, expected):
-            found |= area
+        else:
+            found |= _person_in(seen, area, passers_by=passers_by)
     if not found.any():
         return Moving(nothing, nothing)
     found = _closed(found, size_hw)
@@ -136,22 +136,6 @@ def _off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
     return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
 
 
-def _of_person(picture: Picture, area: Mask, *, passers_by: bool) -> Mask:
-    """Return an area that shows the operator, or with the pixels of the person in it; nothing without a person.
-
-    The operator stands below the camera, to where such an area extends.
-    """
-    below = _off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG
-    if below or passers_by:
-        probability, pixels = person_at(picture, area)
-        if below and probability >= _OPERATOR:
-            return area
-        if passers_by and probability >= _PERSON:
-            reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
-            return area | (pixels & dilated(area, reach))
-    return np.zeros_like(area)
-
-
 def _extends_mask(area: Mask, masked: Mask) -> bool:
     """Return whether an area lies within the operator's reach and extends what is masked there."""
     weights = pixel_weights(area.shape)
@@ -160,6 +144,19 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
     return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
+
+
+def _person_in(seen: SeenPanorama, area: Mask, *, passers_by: bool) -> Mask:
+    """Return an area if it is the operator, or with the pixels of the person in it; nothing if neither."""
+    below = bool(_off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG)
+    nobody = np.zeros_like(area)
+    if not below and not passers_by:
+        return nobody
+    probability, pixels = person_at(seen, area, least=_OPERATOR if below else _PERSON)
+    if passers_by and probability >= _PERSON:
+        reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
+        return area | (pixels & dilated(area, reach))
+    return area if below and probability >= _OPERATOR else nobody
 
 
 def _is_vehicle(area: Mask, expected: Expected) -> bool:

@@ -71,27 +71,32 @@ def people(
     return _large_and_dilated(_at_size(found.astype(np.float32), seen.size_hw) > 0.5, min_area_deg2, margin_deg)
 
 
-def person_at(picture: Picture, area: Mask) -> tuple[float, Mask]:
+def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, Mask]:
     """Return the mean probability of a person over an area, in views of its own, and the pixels of the person.
 
     Args:
-        picture: (H, W, 3) uint8 RGB, the full sphere.
+        seen: the panorama.
         area: (H, W) bool, not empty.
+        least: if the first view gives less than half of this probability, the others are left out.
 
     Returns:
-        The probability, 0 unless a person is detected in one of the views; and (H, W) bool.
+        The probability, 0 if it is too low, or unless a person is detected in one of the views; and (H, W) bool.
     """
-    seen, reduced = SeenPanorama(picture), _reduced_mask(area)
-    if reduced.any():
-        looks = _views_of(reduced)
-        if any(seen.presence(each) >= _MIN_PRESENCE for each in looks):
-            both = [seen.probability(each, mirrored=mirrored) for each in looks for mirrored in (False, True)]
-            seen_again = [
-                each.on_map((both[2 * idx] + both[2 * idx + 1]) / np.float32(2)) for idx, each in enumerate(looks)
-            ]
-            mean = _at_size(np.asarray(np.mean(seen_again, axis=0), np.float32), (area.shape[0], area.shape[1]))
-            return float(np.average(mean[area], weights=pixel_weights(area.shape)[area])), mean > _BELONGS
-    return 0.0, np.zeros_like(area)
+    reduced, size_hw = _reduced_mask(area), (area.shape[0], area.shape[1])
+    if not reduced.any():
+        return 0.0, np.zeros_like(area)
+    looks = _views_of(reduced)
+    first = looks[0].on_map(seen.probability(looks[0]))
+    if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= _MIN_PRESENCE for each in looks):
+        return 0.0, np.zeros_like(area)
+    maps = [first, *(each.on_map(seen.probability(each)) for each in looks[1:])]
+    maps += [each.on_map(seen.probability(each, mirrored=True)) for each in looks]
+    mean = _at_size(np.asarray(np.mean(maps, axis=0), np.float32), size_hw)
+    return _mean_in(mean, area), mean > _BELONGS
+
+
+def _mean_in(probability: Map, area: Mask) -> float:
+    return float(np.average(probability[area], weights=pixel_weights(area.shape)[area]))
 
 
 def _large_and_dilated(found: Mask, min_area_deg2: float, margin_deg: float) -> Mask:
