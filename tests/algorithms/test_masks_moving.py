@@ -107,13 +107,29 @@ def test_what_touches_a_mask_near_the_nadir_belongs_to_it() -> None:
     assert not (found_in(part, ranges, valid=valid, min_area_deg2=3).pixels & ~valid).any()
 
 
-def test_vehicles_stand_on_the_ground() -> None:
+def test_vehicles_stand_on_the_ground_below_the_sky() -> None:
     pose = empty_room()[0][2]
     room = default_room(0, "weak")
     picture, ranges = render(Room((*room.surfaces, BOX), room.texture, room.seed), pose, SIZE_HW, supersample=1)
     shown = np.abs(ranges - empty_room()[0][1]) > 0.02
-    assert share(found_in(picture, ranges, vehicles=True).pixels, shown) > 0.8
-    assert not found_in(picture, ranges).pixels.any()
+    assert not found_in(picture, ranges, vehicles=True).pixels.any()
+    valid = np.ones(SIZE_HW, np.bool_)
+    open_to_the_sky = [replace(other, range_map=without_ceiling(other.range_map)) for other in others()]
+    for vehicles in (True, False):
+        found = moving_pixels(
+            picture,
+            without_ceiling(range_map(ranges)),
+            open_to_the_sky,
+            valid=valid,
+            passers_by=False,
+            vehicles=vehicles,
+        )
+        assert share(found.pixels, shown) > 0.8 if vehicles else not found.pixels.any()
+
+
+def without_ceiling(ranges: RangeMap) -> RangeMap:
+    above = np.arange(SIZE_HW[0])[:, None] < SIZE_HW[0] * 0.3
+    return range_map(np.where(above, np.float32(np.nan), ranges.range))
 
 
 def test_the_ground_is_known_below_the_camera() -> None:

@@ -41,6 +41,9 @@ _PERSON_REACH_DEG = 4.0
 # A vehicle's length, height and distance, in heights of the camera; it fills much of its outline.
 _VEHICLE_LENGTH, _VEHICLE_HEIGHT = (0.8, 4.5), (0.35, 1.5)
 _MIN_FILLED = 0.55
+# There are no vehicles in rooms: below a surface that other views see over this share of what is within an angle of
+# straight up, in the median at most this many heights of the camera away.
+_CEILING_DEG, _MIN_CEILING_SHARE, _MAX_CEILING = 45.0, 0.5, 4.0
 _MIN_ON_GROUND, _MIN_ENDS_ON_GROUND = 0.15, 0.5
 # A shadow is at least this bright, at most that bright, and changes the channels alike.
 _SHADOW, _MAX_TINT = (0.28, 0.88), 0.13
@@ -68,7 +71,7 @@ def moving_pixels(
     *,
     valid: Mask,
     passers_by: Annotated[bool, Setting("also find people at a distance, not only the operator")] = True,
-    vehicles: Annotated[bool, Setting("also find areas with the size and the shape of vehicles")] = True,
+    vehicles: Annotated[bool, Setting("outdoors, also find areas with the size and the shape of vehicles")] = True,
     shadows: Annotated[bool, Setting("also mask the shadows on the ground beside what is found")] = False,
     min_area_deg2: Annotated[float, Setting("minimum size of an area, in square degrees", ge=0)] = 12.0,
     margin_deg: Annotated[float, Setting("angle by which areas are dilated", ge=0, le=20)] = 1.0,
@@ -88,7 +91,7 @@ def moving_pixels(
         others: two or more views around it.
         valid: (H, W), False is masked already.
         passers_by: whether to find people who do not reach to the nadir.
-        vehicles: whether to find vehicles.
+        vehicles: whether to find vehicles, where there is no ceiling.
         shadows: whether to find shadows beside what is found.
         min_area_deg2: minimum size of an area.
         margin_deg: angle by which areas are dilated.
@@ -107,6 +110,7 @@ def moving_pixels(
     shadow = _shadows(expected) & valid
     found = nothing.copy()
     seen = SeenPanorama(picture)
+    vehicles = vehicles and not _has_ceiling(expected)
     for area in _areas(changed & valid & ~shadow, expected, min_area_deg2):
         if _extends_mask(area, ~valid) or (vehicles and _is_vehicle(area, expected)):
             found |= area
@@ -181,6 +185,14 @@ def _is_vehicle(area: Mask, expected: Expected) -> bool:
     filled = area.sum() / max((top - bottom) * width * (area.shape[0] / np.pi) ** 2, 1)
     inside = _VEHICLE_LENGTH[0] < length < _VEHICLE_LENGTH[1] and _VEHICLE_HEIGHT[0] < height < _VEHICLE_HEIGHT[1]
     return bool(inside and filled > _MIN_FILLED)
+
+
+def _has_ceiling(expected: Expected) -> bool:
+    """Return whether other views see a surface not far above the camera."""
+    size_hw = (expected.ranges.shape[0], expected.ranges.shape[1])
+    above = expected.ranges[_off_nadir_deg(size_hw) > 180 - _CEILING_DEG]
+    known = above[np.isfinite(above)]
+    return bool(len(known) > _MIN_CEILING_SHARE * len(above) and np.median(known) < _MAX_CEILING * expected.height)
 
 
 def _shadows(expected: Expected) -> Mask:
