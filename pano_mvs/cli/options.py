@@ -24,7 +24,7 @@ TargetArgument = Annotated[
     ),
 ]
 ImagesOption = Annotated[
-    Path | None, typer.Option("--images", help="Folder of panoramas; default: that of the workflow.")
+    Path | None, typer.Option("--images", help="Folder of panoramas, or a video; default: that of the workflow.")
 ]
 SetOption = Annotated[
     list[str] | None,

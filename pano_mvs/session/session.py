@@ -15,6 +15,7 @@ from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
+from pano_mvs.io.images.captures import VIDEO_SUFFIXES
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 
@@ -30,11 +31,29 @@ class Session:
     run_options: RunOptions = DEFAULT_OPTIONS
 
 
+_VIDEO_SOURCE = "source.video"
+
+
 def presets_folder() -> Path:
     """Return the folder of the shipped workflows: inside the installed package, or beside it in a checkout."""
     package = Path(pano_mvs.__file__).parent
     inside = package / "workflows"
     return inside if is_folder(inside) else package.parent / "workflows"
+
+
+def _check_images(images: Path) -> None:
+    """Check that there is a folder of images, or a video.
+
+    Raises:
+        InputError: if there is neither.
+    """
+    if is_folder(images):
+        return
+    if not exists(images):
+        denied = f"cannot be read ({problem_of(images)})" if is_denied(images) else "there is no such folder or video"
+        raise InputError(f"--images {images}: {denied}")
+    if images.suffix.lower() not in VIDEO_SUFFIXES:
+        raise InputError(f"--images {images}: this is a file; give the folder that contains the images, or a video")
 
 
 def open_session(
@@ -54,24 +73,23 @@ def open_session(
     Raises:
         UsageError: if there is no such workflow.
         WorkflowError: with every mistake in it.
-        InputError: if the folder of images does not exist.
+        InputError: if the folder of images, or the video, does not exist or cannot be used.
         UsageError: if a stage reads the folder of the cache.
     """
     path, is_preset = find_workflow(str(name), presets_folder())
     images = None if images is None else Path(images)
-    if images is not None and not is_folder(images):
-        if exists(images):
-            raise InputError(f"--images {images}: this is a file; give the folder that contains the images")
-        raise InputError(
-            f"--images {images}: cannot be read ({problem_of(images)})"
-            if is_denied(images)
-            else f"--images {images}: there is no such folder"
-        )
+    if images is not None:
+        _check_images(images)
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except InvalidWorkflowError as error:
         raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
+    if images is not None and not is_folder(images) and workflow.stages["images"].spec.name != _VIDEO_SOURCE:
+        raise InputError(
+            f"--images {images}: this is a video. Use the preset walk, or "
+            f"--set images.use={_VIDEO_SOURCE} --set pairs.use=pairs.sequential"
+        )
     workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
     root = Path(cache) if cache else default_cache(path, is_preset=is_preset)

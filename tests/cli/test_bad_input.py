@@ -44,7 +44,7 @@ def test_empty_folder(pano_mvs: Command, tmp_path: Path) -> None:
 def test_folder_that_is_not_there(pano_mvs: Command) -> None:
     result = pano_mvs("run", "quickstart", "--images", "nowhere")
     assert result.code == 2
-    assert "there is no such folder" in result.flat
+    assert "there is no such folder or video" in result.flat
 
 
 def test_file_instead_of_a_folder(pano_mvs: Command, tmp_path: Path) -> None:

@@ -94,6 +94,16 @@ def test_a_folder_of_videos_is_pointed_to_the_other_source(pano_mvs: Command, tm
     assert result.code == 0, result.text
 
 
+def test_a_single_video_is_read_by_the_preset_for_walks(pano_mvs: Command, tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.avi", 60)
+    result = pano_mvs("run", "quickstart", "--images", tmp_path / "walk.avi")
+    assert result.code == 2
+    assert "this is a video. Use the preset walk, or --set images.use=source.video" in result.flat
+    settings = ("--set", "images.keyframes=time", "--until", "images", "--out", "out")
+    result = pano_mvs("run", "walk", "--images", tmp_path / "walk.avi", *settings)
+    assert result.code == 0, result.text
+
+
 def test_where_pictures_and_masks_lie_does_not_count(pano_mvs: Command, tmp_path: Path) -> None:
     """The path of the masks was once part of the key."""
     for folder in ("photos", "masks"):
