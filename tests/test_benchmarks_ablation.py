@@ -38,7 +38,7 @@ def test_a_removed_stage_is_bypassed(tmp_path: Path) -> None:
     exchange = next(one for one in MECHANISMS if one.name == "exchange between views")
     chain = DenseChain(exchange.workflow("quality", tmp_path))
     assert "exchanged" not in chain.dense
-    assert {port: edge.producer for port, edge in chain.graph.edges["checked"].items()}["range_map"] == "slanted"
+    assert {port: edge.producer for port, edge in chain.graph.edges["checked"].items()}["range_map"] == "plain"
 
 
 def test_constants_change_for_a_while() -> None:

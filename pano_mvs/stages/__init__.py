@@ -31,7 +31,7 @@ from pano_mvs.stages.fusion import photographs, scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import bridges, brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
-from pano_mvs.stages.patchmatch import exchange, patchmatch
+from pano_mvs.stages.patchmatch import exchange, patchmatch, plain_surfaces
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
@@ -83,6 +83,7 @@ __all__ = [
     "orb_tangent",
     "patchmatch",
     "photographs",
+    "plain_surfaces",
     "planes",
     "ply",
     "position",

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges
 from pano_mvs.algorithms.patchmatch.refine import refine_range
+from pano_mvs.algorithms.patchmatch.second_round import refine_plain_surfaces
 from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
 from pano_mvs.algorithms.plain_scale import coarser_levels
 from pano_mvs.algorithms.sharp_scale import sharp_halvings
@@ -55,6 +56,39 @@ def patchmatch(
         **arguments_from(refine_range, params),
     )
     ctx.metric("completeness", float(refined.valid.mean()))
+    ctx.metric("sources", len(sources))
+    return refined
+
+
+@stage("depth.plain_surfaces", memory=bytes_per_pixel(150, each_source=20))
+def plain_surfaces(
+    range_map: Each[RangeMap],
+    filtered: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[Panorama],
+    source_poses: Near[Pose],
+    params: PatchMatchParams,
+    ctx: Context,
+) -> RangeMap:
+    """Refine pixels without texture again where filters changed their ranges; all other pixels keep theirs.
+
+    `range_map` comes from depth.patchmatch, `filtered` from a consistency check and filters after it.
+    """
+    require_one_group(pose, source_poses)
+    reference = ref.load()
+    refined, share = refine_plain_surfaces(
+        range_map,
+        filtered,
+        reference,
+        sources=[source.load() for source in sources],
+        source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
+        source_masks=[source.load_mask() for source in sources],
+        halvings=sharp_halvings(reference) if params.scale == "sharp" else 0,
+        **arguments_from(refine_range, params),
+    )
+    ctx.metric("completeness", float(refined.valid.mean()))
+    ctx.metric("refined", share)
     ctx.metric("sources", len(sources))
     return refined
 

@@ -56,11 +56,12 @@ class Mechanism:
             yield
 
 
+_ONE_ROUND: Mapping[str, Any] = dict.fromkeys(("first_smooth", "first_planes", "plain"))
 FULL = Mechanism("", "the workflow as it is")
 # Add a mechanism with one line. Removed stages: name the producers of the stages behind them, if these name it in `in`.
 MECHANISMS = (
     Mechanism("1", "better half of the sources", "depth.combination=sum"),
-    Mechanism("1", "exchange between views", stages={"exchanged": None, "checked": {"in": {"range_map": "slanted"}}}),
+    Mechanism("1", "exchange between views", stages={"exchanged": None, "checked": {"in": {"range_map": "plain"}}}),
     Mechanism("2", "planes even in parallax", "depth.spacing=inverse"),
     Mechanism(
         "2",
@@ -74,14 +75,36 @@ MECHANISMS = (
     Mechanism("3", "free space of other views", stages={"visible": None}),
     Mechanism(
         "4",
+        "second round on plain surfaces",
+        stages={
+            **_ONE_ROUND,
+            "exchanged": {"in": {"range_map": "sky", "sources": "slanted"}},
+            "checked": {"in": {"range_map": "exchanged", "sources": "slanted"}},
+        },
+    ),
+    Mechanism(
+        "4",
         "slanted planes",
-        stages={"slanted": None, "checked": {"in": {"range_map": "exchanged", "sources": "depth"}}},
+        stages={
+            **_ONE_ROUND,
+            "slanted": None,
+            "exchanged": {"in": {"range_map": "sky", "sources": "depth"}},
+            "checked": {"in": {"range_map": "exchanged", "sources": "depth"}},
+        },
     ),
     Mechanism(
         "4", "the sharp resolution", "depth.scale=nominal slanted.scale=nominal checked.scale=nominal", needs="soft"
     ),
     Mechanism("4", "coarse to fine", "depth.levels=2", is_default=False),
-    Mechanism("4", "planes on plain walls", stages={"planes": None}),
+    Mechanism(
+        "4",
+        "planes on plain walls",
+        stages={
+            "planes": None,
+            "first_planes": None,
+            "plain": {"in": {"range_map": "slanted", "filtered": "first_smooth"}},
+        },
+    ),
     Mechanism("5", "sky", "sky.enabled=false"),
     Mechanism("6", "mask of what moves with the camera", "static.enabled=false", needs="rig"),
     Mechanism("6", "mask of the operator", "people.enabled=false", needs="rig"),

@@ -17,7 +17,7 @@ def test_exchanged_ranges_are_checked_against_those_before_the_exchange() -> Non
     """Otherwise the view that a range comes from confirms it."""
     edges = open_session("quality").graph.edges["checked"]
     assert edges["range_map"].producer == "exchanged"
-    assert edges["sources"].producer == "slanted"
+    assert edges["sources"].producer == "plain"
 
 
 @pytest.mark.slow

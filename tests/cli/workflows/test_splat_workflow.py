@@ -19,6 +19,7 @@ from tests.stored import read_picture
 # What makes quality slow is tested with it.
 PLAIN_RANGES = (
     *("--set", "slanted=null", "--set", "filled=null", "--set", "planes=null", "--set", "smooth=null"),
+    *("--set", "first_check=null", "--set", "first_smooth=null", "--set", "first_planes=null", "--set", "plain=null"),
     *("--set", "exchanged=null", "--set", "checked.in={}"),
     *("--set", "previews=null", "--set", "views.sources=2", "--set", "depth.cost=census", "--set", "depth.planes=16"),
 )
