@@ -14,6 +14,7 @@ from pano_mvs.algorithms.matching.neighbours import similarities
 from pano_mvs.algorithms.poses.growth import grown_models
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors
+from pano_mvs.algorithms.poses.joining.further_pairs import further_pairs
 from pano_mvs.algorithms.poses.joining.level_pairs import level_from_world
 from pano_mvs.algorithms.poses.joining.models import are_apart, cross_matches, joined_model
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
@@ -78,6 +79,9 @@ def find_bridges(
         float, Setting("maximum error of a match that agrees with an alignment", gt=0, le=5)
     ] = 0.4,
     neighbours: Annotated[int, Setting("number of most similar groups to compare each group with", ge=1)] = 5,
+    candidates: Annotated[
+        int, Setting("number of further images to match each image of a group of at most six images with", ge=0)
+    ] = 5,
 ) -> Bridges:
     """Align groups of images that no reliable pair connects, and return the pairs between them.
 
@@ -96,21 +100,24 @@ def find_bridges(
         significance: minimum negative log10 of the false alarms (see `significance` of two views).
         threshold_deg: maximum error of a match.
         neighbours: number of most similar groups with which each group is compared.
+        candidates: number of further images with which each image of a small group is matched; see `further_pairs`.
     """
     names = tuple(features)
     if is_linked(names, two_views):
         return Bridges()
-    models = local_models(features, two_views)
-    if len(models) < 2:
+    before = len(local_models(features, two_views))
+    if before < 2:
         return Bridges()
     search = _Search(features, names, rng, significance, threshold_deg, neighbours)
-    joined, bridges = search.join(models)
-    found: dict[tuple[str, str], TwoView] = {}
+    found = further_pairs(features, two_views, search.similar, candidates=candidates, rng=rng)
+    two_views = {**two_views, **found}
+    models = local_models(features, two_views)
+    joined, bridges = search.join(models) if len(models) > 1 else (models, [])
     for (one, other), view in sorted(search.views.items()):
         pair = (names[one], names[other]) if (names[other], names[one]) not in two_views else (names[other], names[one])
         if not two_views.get(pair):
             found[pair] = view if pair[0] == names[one] else _swapped(view)
-    return Bridges(found, tuple(bridges), (len(models), len(joined)))
+    return Bridges(found, tuple(bridges), (before, len(joined)))
 
 
 def is_linked(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> bool:
@@ -164,7 +171,7 @@ class _Search:
 
     def __post_init__(self) -> None:
         self._matched: dict[tuple[Pair, float], NDArray[np.int32]] = {}
-        self._similar = similarities(tuple(self.features.values()))
+        self.similar = similarities(tuple(self.features.values()))
 
     def join(self, models: list[PlacedModel]) -> tuple[list[PlacedModel], list[Bridge]]:
         """Return the models after joining those that can be aligned, the most certain first."""
@@ -190,7 +197,7 @@ class _Search:
     def _pairs_to_try(self, models: Mapping[int, PlacedModel]) -> Iterator[tuple[int, int]]:
         """Yield pairs of models, at least one with several cameras, among the most similar ones of either."""
         likeness = {
-            (a, b): max(float(self._similar[i, j]) for i in models[a].cameras for j in models[b].cameras)
+            (a, b): max(float(self.similar[i, j]) for i in models[a].cameras for j in models[b].cameras)
             for a in models
             for b in models
             if a != b and (len(models[a].cameras) > 1 or len(models[b].cameras) > 1)
@@ -240,7 +247,7 @@ class _Search:
     def _matches(self, first: PlacedModel, second: PlacedModel, ratio: float) -> dict[Pair, NDArray[np.int32]]:
         """Return the matches of the most similar pairs of images of two models."""
         pairs = sorted(
-            ((i, j) for i in first.cameras for j in second.cameras), key=lambda pair: (-self._similar[pair], pair)
+            ((i, j) for i in first.cameras for j in second.cameras), key=lambda pair: (-self.similar[pair], pair)
         )
         return {pair: self._match(pair, ratio) for pair in pairs[:_PAIRS_OF_GROUPS]}
 
