@@ -62,8 +62,8 @@ def solve_scaled_translation(
         kappa: the paper's κ.
         adjust: whether to adjust all cameras and points together at intervals, which keeps errors from accumulating. If
             False, the poses are those of the chain, as in the paper.
-        join_rooms: whether to align whole groups that pairs connect, as with `find_bridges`. Where structure repeats,
-            a group may be joined in the wrong place without a doubt.
+        join_rooms: whether to align whole groups that pairs connect, as with `find_bridges`. Groups whose joint the
+            images do not confirm are doubtful (see `joint_doubts`).
         load: returns the panorama and the mask of an image by its name; None leaves every decision to the pairs.
         rng: not used; part of the interface of pose solvers.
 

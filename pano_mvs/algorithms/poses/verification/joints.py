@@ -72,7 +72,7 @@ def joint_doubts(model: PlacedModel, confirmation: Confirmation) -> dict[int, st
     doubts: dict[int, str] = {}
     for first, second in _meeting(model, parts):
         several = min(len(first), len(second)) > 1
-        evidence = joint_evidence(model, confirmation, first, second) if several else None
+        evidence = joint_evidence(model, confirmation, (first, second)) if several else None
         if evidence is not None and evidence.contradicts:
             reason = (
                 f"the images of {_named(model, first)} contradict those of {_named(model, second)}, and few points "
@@ -156,23 +156,22 @@ def _is_certain(
 
 
 def joint_evidence(
-    model: PlacedModel, confirmation: Confirmation, first: Collection[int], second: Collection[int]
+    model: PlacedModel, confirmation: Confirmation, parts: tuple[Collection[int], Collection[int]]
 ) -> JointEvidence:
     """Return how the surfaces that two parts of a model see by themselves agree.
 
     Args:
         model: the cameras and their pairs.
         confirmation: of the same capture.
-        first: images of one part, two or more.
-        second: images of the other part, two or more.
+        parts: images of both parts, two or more each.
     """
     cameras = model.cameras
-    sides = _nearest(cameras, first, second), _nearest(cameras, second, first)
+    sides = _nearest(cameras, *parts), _nearest(cameras, *parts[::-1])
     ranges, own_density = {}, []
-    for part, side in zip((first, second), sides, strict=True):
+    for part, side in zip(parts, sides, strict=True):
         for image in side:
             partners = _partners(cameras, image, part)
-            ranges[image] = _own_range(confirmation, cameras, image, partners)
+            ranges[image] = _own_range(confirmation, cameras, image, partners=partners)
             matches = np.mean([_matches_of(model, image, partner) for partner in partners])
             own_density.append(matches / max(_solid_angle(np.isfinite(ranges[image])), _MIN_AGREEING_SR))
     agreeing = contradicting = matches_between = 0.0
@@ -216,7 +215,7 @@ def _compared(
 
 
 def _own_range(
-    confirmation: Confirmation, cameras: Mapping[int, Rigid3], image: int, partners: Collection[int]
+    confirmation: Confirmation, cameras: Mapping[int, Rigid3], image: int, *, partners: Collection[int]
 ) -> FloatArray:
     """Return the ranges (H, W) of an image that one of its partners confirms, NaN elsewhere."""
     found = np.full(confirmation.small(image).mask.shape, np.nan)

@@ -35,8 +35,6 @@ def test_pairs_that_were_compared_are_not_matched_again() -> None:
 
 def test_a_capture_in_one_group_gets_no_further_pairs() -> None:
     features = room_features(room_poses(), door=120)
-    verified = TwoView(
-        np.zeros((1, 2), np.int32), np.eye(3), np.array([1.0, 0, 0]), np.zeros(1, np.float32), "general"
-    )
+    verified = TwoView(np.zeros((1, 2), np.int32), np.eye(3), np.array([1.0, 0, 0]), np.zeros(1, np.float32), "general")
     chain = {("a1", "a2"): verified, ("a2", "b1"): verified, ("b1", "b2"): verified}
     assert further_pairs(features, chain, ALIKE, candidates=3, rng=np.random.default_rng(0)) == {}

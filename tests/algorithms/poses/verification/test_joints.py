@@ -63,7 +63,7 @@ def test_pairs_that_share_key_points_are_one_part() -> None:
 
 def test_a_true_joint_is_confirmed(confirmation: Confirmation) -> None:
     model = two_parts({(1, 2): 40})
-    evidence = joint_evidence(model, confirmation, [0, 1], [2, 3])
+    evidence = joint_evidence(model, confirmation, ([0, 1], [2, 3]))
     assert evidence.confirms
     assert not evidence.contradicts
     assert joint_doubts(model, confirmation) == {}
@@ -71,7 +71,7 @@ def test_a_true_joint_is_confirmed(confirmation: Confirmation) -> None:
 
 def test_parts_that_look_through_each_other_make_everything_doubtful(confirmation: Confirmation) -> None:
     model = two_parts({(1, 2): 40}, second=moved_part(90.0, (0.0, 0.0, 0.0)))
-    assert joint_evidence(model, confirmation, [0, 1], [2, 3]).contradicts
+    assert joint_evidence(model, confirmation, ([0, 1], [2, 3])).contradicts
     doubts = joint_doubts(model, confirmation)
     assert list(doubts) == [0, 1, 2, 3]
     assert "contradict" in doubts[0]
@@ -79,7 +79,7 @@ def test_parts_that_look_through_each_other_make_everything_doubtful(confirmatio
 
 def test_parts_that_see_the_same_and_match_nothing_contradict_each_other(confirmation: Confirmation) -> None:
     model = two_parts({(1, 2): 1})
-    evidence = joint_evidence(model, confirmation, [0, 1], [2, 3])
+    evidence = joint_evidence(model, confirmation, ([0, 1], [2, 3]))
     assert evidence.agreeing_sr > 0.5
     assert evidence.contradicts
 
