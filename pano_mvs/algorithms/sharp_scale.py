@@ -121,7 +121,8 @@ def _details(picture: Picture) -> list[FloatImage]:
 
 def finest_detail(grey: FloatImage) -> FloatImage:
     """Return the detail of an image (H, W) that is lost if it is halved."""
-    return grey - cv2.resize(_halved(grey), grey.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    enlarged = cv2.resize(_halved(grey), grey.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.asarray(grey - enlarged, np.float32)
 
 
 def _halved(grey: FloatImage) -> FloatImage:
