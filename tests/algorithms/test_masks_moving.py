@@ -95,6 +95,16 @@ def test_shadows_are_masked_on_demand() -> None:
     assert (found.pixels | ~found.shadow).all()
 
 
+def test_shadows_beside_people_who_are_masked_already() -> None:
+    """Nothing else has changed, and the shadow was left in."""
+    drawn = with_operator()
+    valid = ~dilated(drawn.people, 1)
+    for shadows, least in ((True, 0.6), (False, 0.0)):
+        found = found_in(drawn.picture, drawn.ranges, valid=valid, margin_deg=0, shadows=shadows)
+        assert share(found.shadow, drawn.shadow & valid) >= least
+        assert found.shadow.any() == shadows
+
+
 def test_what_touches_a_mask_near_the_nadir_belongs_to_it() -> None:
     """The first pass has masked the operator except for a part beyond 30° from the nadir."""
     drawn = with_operator()

@@ -116,9 +116,8 @@ def moving_pixels(
             found |= area
         else:
             found |= _person_in(seen, area, passers_by=passers_by)
-    if not found.any():
-        return Moving(nothing, nothing)
-    found = _closed(found, size_hw)
+    if found.any():
+        found = _closed(found, size_hw)
     cast = _beside(shadow, found | ~valid) if shadows else nothing
     margin = round(margin_deg * size_hw[0] / 180)
     everything = found | cast
