@@ -19,7 +19,7 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.filters.support.free_space import respect_free_space
+from pano_mvs.algorithms.patchmatch.free_space import respect_free_space
 from pano_mvs.algorithms.sharp_scale import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.geometry import pixel_solid_angle
