@@ -17,7 +17,7 @@ from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.paint import BRICK, LEAVES, OAK, STONE
 from pano_mvs.testing.room import Room, default_room, render
-from pano_mvs.testing.scenes import SKIES
+from pano_mvs.testing.scenes import SKIES, window_room
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod
 
 SIZE_HW = (128, 256)
@@ -118,6 +118,30 @@ def test_rooms_have_no_sky(gain: float) -> None:
     room = replace(default_room(), texture="none")
     views = views_of(room, gain=gain)
     assert not found_in(views, range_map=measured(views[1][0], confirmed=0.33)).any()
+
+
+@pytest.mark.slow
+def test_the_sky_is_found_through_windows_and_walls_stay() -> None:
+    """Panes look like plain panels in the frames of the windows, and get their ranges."""
+    scene, size = window_room(seed=0, sky="blue"), (256, 512)
+    views = [scene.view(idx, size, supersample=1) for idx in range(3)]
+    true = views[1][1]
+    sky = np.isnan(true)
+    ranges = np.where(sky, np.float32(2.7), true)
+    confidence = np.where(sky, 90, 200).astype(np.uint8)
+    everything = np.ones(size, np.bool_)
+    found = sky_pixels(
+        RangeMap(ranges, confidence),
+        views[1][0],
+        [views[0][0], views[2][0]],
+        source_from_reference=[scene.poses[idx] @ scene.poses[1].inverse() for idx in (0, 2)],
+        valid=everything,
+        source_valid=[everything] * 2,
+        rng=np.random.default_rng(0),
+    )
+    area = np.broadcast_to(pixel_solid_angle(size)[:, None], size)
+    assert area[found & sky].sum() > 0.4 * area[sky].sum()
+    assert area[found & ~sky].sum() < 0.005 * area[~sky].sum()
 
 
 def test_masked_pixels_are_not_sky(blue: Views) -> None:

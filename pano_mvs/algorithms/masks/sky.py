@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.sphere.box import box_sum
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.sky_colors import SkyColors, sharpened_sky, sky_colors
-from pano_mvs.algorithms.masks.sky_comparison import Comparison, compare_with_source, errors_of_area, pixel_errors
+from pano_mvs.algorithms.masks.sky_comparison import (
+    Comparison,
+    compare_with_source,
+    errors_of_area,
+    pixel_errors,
+    source_errors,
+)
 from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -57,6 +63,11 @@ _ROUNDS = 3
 _MIN_INNER = 0.3
 _CREEP_PX, _CREEP_LEVELS = 4, 16
 _ENCLOSED = 0.7
+# A window: the smallest and the largest pane, how far what is behind it is, and how many pixels beside must show it.
+_PANE_SHARES, _FAR_PARALLAX = (2e-4, 0.01), 0.125
+_BESIDE_PX, _MIN_BESIDE, _MIN_FAR_SHARE = 4, 8, 0.04
+# At infinity, one source agrees; at the range of the frame, another one sees what is behind the window.
+_MAX_BESIDE_ERROR, _MIN_SEEN_BEHIND, _MOST_MOVED = 4.0, 30.0, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +124,10 @@ def sky_pixels(
         return np.zeros_like(valid)
     used = list(zip(sources, source_valid, source_from_reference, strict=True))[:MAX_SOURCES]
     view = _view(range_map, picture, valid, sources=used)
-    seeds = _seeds(view, min_share=min_share, rng=rng)
+    seeds, walls = _seeds(view, min_share=min_share, rng=rng)
     if not seeds.any():
         return np.zeros_like(valid)
-    sky, colors = _grown(view, seeds, rng)
+    sky, colors = _grown(view, seeds, rng, walls=walls)
     return sharpened_sky(sky, colors, picture) & valid
 
 
@@ -151,14 +162,46 @@ def _contrast(picture: Picture) -> NDArray[np.int16]:
     return np.asarray(contrast[1:-1, 1:-1].max(axis=-1), np.int16)
 
 
-def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> Mask:
-    """Return the large areas that are sky: smooth ones, and clouds."""
+def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
+    """Return the large areas that are sky: smooth ones, and clouds; otherwise, panes, and what cannot be sky with them.
+
+    If the sky is only seen through windows, other large smooth areas are walls and ceilings.
+    """
     possible = view.valid & ((_contrast(view.picture) < _SMOOTH) | _clouds(view))
     labels, weights = area_labels(possible), pixel_weights(possible.shape)
     sizes = np.bincount(labels[possible], weights[possible], labels.size)
-    found = np.zeros_like(possible)
-    for label in np.flatnonzero(sizes >= min_share * weights.sum()):
+    found, large = np.zeros_like(possible), np.flatnonzero(sizes >= min_share * weights.sum())
+    for label in large:
         if _is_sky(view, area := labels == label, rng, min_flat_share=_MIN_FLAT_SHARE):
+            found |= area
+    if found.any():
+        return found, np.zeros_like(found)
+    return _panes(view, labels, sizes), dilated(np.isin(labels, large), 1)
+
+
+def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
+    """Return the smooth areas that lie behind far surfaces: the sky above a skyline that is seen through a window.
+
+    A pane with the sky looks like a plain panel in the frame of the window. But beside a far surface, such as a roof,
+    the sources see that surface or the sky as far away as it is, and not where a panel in the frame would be.
+    """
+    at_infinity, at_range = source_errors(view.picture, view.consistent, view.comparisons)
+    parallax = np.max([source.parallax_px for source in view.comparisons], axis=0) * (2 * np.pi / labels.shape[1])
+    known = view.consistent & ~is_bare(view.picture)
+    far = known & (parallax > 0) & (parallax < _FAR_PARALLAX)
+    best, worst = np.fmin.reduce(at_infinity), np.nan_to_num(np.fmax.reduce(at_range))
+    near_far = dilated(far, _BESIDE_PX)
+    found: Mask = np.zeros(far.shape, np.bool_)
+    least, most = (share * pixel_weights(far.shape).sum() for share in _PANE_SHARES)
+    for label in np.unique(labels[near_far & (labels >= 0)]):
+        area = labels == label
+        beside = area & near_far & np.isfinite(best)
+        if not least <= sizes[label] <= most or beside.sum() < _MIN_BESIDE:
+            continue
+        around = dilated(area, _BESIDE_PX) & ~dilated(area, 1)
+        is_open = (far & around).sum() >= _MIN_FAR_SHARE * max((known & around).sum(), 1)
+        moved = np.quantile(worst[beside], _MOST_MOVED) >= _MIN_SEEN_BEHIND
+        if is_open and moved and np.median(best[beside]) <= _MAX_BESIDE_ERROR:
             found |= area
     return found
 
@@ -220,19 +263,19 @@ def _plane_share(ranges: NDArray[np.float32], border: Mask, area: Mask, *, rng: 
     return best
 
 
-def _grown(view: _View, seeds: Mask, rng: np.random.Generator) -> tuple[Mask, SkyColors]:
-    """Return the sky with the smaller areas of its colours, and its colours.
+def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -> tuple[Mask, SkyColors]:
+    """Return the sky with the smaller areas of its colours outside of `walls`, and its colours.
 
     A part of the colours of the sky needs no further evidence if it is small: in a window or between branches, the
     sources see the window's frame or the branches at infinity, and at their range the part moves with them.
     """
     at_infinity, at_range = pixel_errors(view.picture, seeds, view.comparisons, area_at_infinity=True)
     solid = view.consistent & ~is_bare(view.picture) & (at_range + _SOLID_MARGIN < at_infinity)
-    agrees = (at_infinity <= _MAX_ERROR) & ~solid & view.valid
+    agrees = (at_infinity <= _MAX_ERROR) & ~solid & view.valid & ~walls
     sky, most = seeds, _MAX_PART_SHARE * pixel_weights(seeds.shape).sum()
     for _ in range(_ROUNDS):
         colors = sky_colors(view.picture, sky)
-        reached = view.valid & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        reached = view.valid & ~walls & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
         alike = reached & colors.match(view.picture) & (~solid | dilated(sky, 1))
         labels = area_labels(alike & ~sky)
         inside, weights = labels >= 0, pixel_weights(sky.shape)

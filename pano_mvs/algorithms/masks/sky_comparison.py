@@ -120,6 +120,24 @@ def pixel_errors(
     return least[0], least[1]
 
 
+def source_errors(
+    picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the colour differences to each source, (S, H, W) in grey levels, at infinity and at the ranges.
+
+    NaN where a source is masked or a range is missing. Pixels of `area`, at their ranges, give the factor of each
+    channel.
+    """
+    own = smoothed(picture)
+    errors = []
+    for source in comparisons:
+        seen = area & np.isfinite(source.at_range[..., 0])
+        gain = _gain(own[seen], source.at_range[seen]) if seen.any() else np.ones(3, np.float32)
+        errors.append([np.abs(other / gain - own).max(axis=-1) for other in (source.at_infinity, source.at_range)])
+    found = np.array(errors, np.float32)
+    return found[:, 0], found[:, 1]
+
+
 def _median_error(own: Colors, other: Colors) -> float:
     return float(np.median(np.abs(other / _gain(own, other) - own).max(axis=-1)))
 

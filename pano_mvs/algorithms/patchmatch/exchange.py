@@ -64,6 +64,9 @@ def exchange_ranges(
     *,
     max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
     max_reprojection_px: Annotated[float, Setting("maximum forward-backward reprojection error", gt=0)] = 1.0,
+    max_reprojection_deg: Annotated[
+        float, Setting("the same as an angle, which replaces a smaller max_reprojection_px", ge=0)
+    ] = 0.35,
     min_agreeing: Annotated[
         int, Setting("sources, or all if there are fewer, that must agree on a range to take it over", ge=1)
     ] = 3,
@@ -87,6 +90,7 @@ def exchange_ranges(
         sources: one or more.
         max_relative_error: largest relative difference of ranges that agree; another range is nearer by more.
         max_reprojection_px: largest reprojection error of ranges that agree, in pixels of the reference.
+        max_reprojection_deg: the same in degrees; the larger of the two counts, as in `checked_with_agreement`.
         min_agreeing: smallest number of sources that agree on a range, including the one that it comes from; all of
             them if there are fewer sources, but one source alone is not enough.
         min_support: support from which on a pixel is confirmed and keeps its range.
@@ -99,9 +103,7 @@ def exchange_ranges(
         UsageError: if there are no sources, or shapes do not match.
     """
     _check(range_map, reference, sources)
-    px_per_rad = reference.shape[1] / (2 * np.pi)
-    reprojection = max_reprojection_px / px_per_rad
-
+    reprojection = max(max_reprojection_px * 2 * np.pi / reference.shape[1], np.radians(max_reprojection_deg))
     views = [source.range_map for source in sources], [source.from_reference for source in sources]
     limits = {"max_relative_error": max_relative_error, "max_angle": reprojection}
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]

@@ -105,6 +105,7 @@ SYNTHETIC = (
     AblationPlace("yard", 384, 3, arguments=(("seed", 21), ("sky", "overcast"))),
     AblationPlace("weak_room", 384, 3, arguments=(("seed", 15),)),
     AblationPlace("desk", 1024, 3, arguments=(("seed", 5),), soft=True),
+    AblationPlace("corridor", 2048, 3, arguments=(("seed", 14),), soft=True),
     AblationPlace("desk", 384, 4, arguments=(("seed", 5),), rig="tripod"),
 )
 

@@ -61,6 +61,7 @@ FULL = Mechanism("", "the workflow as it is")
 # Add a mechanism with one line. Removed stages: name the producers of the stages behind them, if these name it in `in`.
 MECHANISMS = (
     Mechanism("1", "better half of the sources", "depth.combination=sum"),
+    Mechanism("1", "weights of the sources", "slanted.view_weights=false"),
     Mechanism("1", "exchange between views", stages={"exchanged": None, "checked": {"in": {"range_map": "plain"}}}),
     Mechanism("2", "planes even in parallax", "depth.spacing=inverse"),
     Mechanism(
@@ -70,6 +71,11 @@ MECHANISMS = (
     ),
     Mechanism("2", "windows of equal solid angle", "depth.spherical_window=false"),
     Mechanism("3", "P2 that follows the picture", "depth.p2_contrast=0"),
+    Mechanism(
+        "3", "P2 by squared contrast of colours", "depth.p2_falloff=inverse depth.p2_contrast=15 depth.edges=grey"
+    ),
+    Mechanism("3", "averages of similar colours", "depth.edge_support=1"),
+    Mechanism("3", "pixels that neighbours support", "smooth.keep_supported=false"),
     Mechanism("3", "low penalties", "depth.p1=80 depth.p2=1600"),
     Mechanism("3", "gradients beside census", "depth.cost=census"),
     Mechanism("3", "free space of other views", stages={"visible": None}),
@@ -95,6 +101,8 @@ MECHANISMS = (
     Mechanism(
         "4", "the sharp resolution", "depth.scale=nominal slanted.scale=nominal checked.scale=nominal", needs="soft"
     ),
+    Mechanism("4", "several resolutions", "depth.multiscale=false slanted.multiscale=false", needs="soft"),
+    Mechanism("4", "parallel planes", "planes.parallel_share=0"),
     Mechanism("4", "coarse to fine", "depth.levels=2", is_default=False),
     Mechanism(
         "4",
