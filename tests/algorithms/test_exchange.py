@@ -257,3 +257,21 @@ def test_inputs_that_do_not_fit_are_refused(scene: Scene) -> None:
         exchange_ranges(seen(truth), picture, [sources[0], replace(sources[1], picture=picture[:, :64])])
     with pytest.raises(UsageError, match="min_agreeing"):
         exchange_ranges(seen(truth), picture, sources, min_agreeing=0)
+
+
+@pytest.mark.parametrize(("width", "degrees"), [(512, 360 / 512), (2048, 0.35)])
+def test_the_larger_of_the_two_limits_of_the_reprojection_counts(
+    monkeypatch: pytest.MonkeyPatch, width: int, degrees: float
+) -> None:
+    """A pixel is a smaller angle in a large panorama, but poses and stitching are no more accurate there."""
+
+    def compared(*_: object, max_angle: float, **__: object) -> None:
+        raise RuntimeError(f"compared within {np.degrees(max_angle):.4f}°")
+
+    monkeypatch.setattr("pano_mvs.algorithms.patchmatch.exchange.compare_with_sources", compared)
+    size = (width // 2, width)
+    plain = RangeMap(np.ones(size, np.float32), np.full(size, 100, np.uint8))
+    picture = np.zeros((*size, 3), np.uint8)
+    source = SourceView(picture, plain, Rigid3(np.eye(3), np.ones(3)))
+    with pytest.raises(RuntimeError, match=f"compared within {degrees:.4f}°"):
+        exchange_ranges(plain, picture, [source])
