@@ -377,8 +377,9 @@ def split_capture(
 ) -> None:
     """Divide a capture into overlapping blocks: folders of links to its images."""
     from pano_mvs.cli.merge_command import split_command
+    from pano_mvs.session.merging.split import Division
 
-    split_command(images, to, size=size, overlap=overlap, loop=loop, poses=poses, console=Console())
+    split_command(images, to, Division(size, overlap, loop, poses), console=Console())
 
 
 @app.command("merge")

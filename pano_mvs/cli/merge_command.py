@@ -8,12 +8,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.merging.split import split_images
+from pano_mvs.session.merging.split import Division, split_images
 
 
-def split_command(
-    images: Path, to: Path, *, size: int, overlap: int, loop: bool, poses: Path | None, console: Console
-) -> None:
+def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:
     """Write the blocks of a capture, and print them and the commands that follow.
 
     Raises:
@@ -21,7 +19,7 @@ def split_command(
         InputError: if there are no images, or the poses are of other images.
         StoreError: if a link cannot be made.
     """
-    blocks = split_images(images, to, size=size, overlap=overlap, loop=loop, poses=poses)
+    blocks = split_images(images, to, division)
     outs = [f"out/{block.folder.name}" for block in blocks]
     for block, out in zip(blocks, outs, strict=True):
         console.print(

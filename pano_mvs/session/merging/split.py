@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,38 +31,83 @@ class ImageBlock:
     names: tuple[str, ...]
 
 
-def split_images(
-    images: Path, to: Path, *, size: int, overlap: int, loop: bool = False, poses: Path | None = None
-) -> list[ImageBlock]:
+@dataclass(frozen=True)
+class Division:
+    """How a capture is divided.
+
+    Attributes:
+        size: maximum number of images along the path in a block.
+        overlap: number of images that consecutive blocks have in common.
+        loop: whether the path ends where it began.
+        poses: rough poses in any format that `read_poses` reads, to find where the path returns; None without.
+    """
+
+    size: int
+    overlap: int
+    loop: bool = False
+    poses: Path | None = None
+
+
+def split_images(images: Path, to: Path, division: Division) -> list[ImageBlock]:
     """Divide a folder of images into blocks, and write a folder of links for each (block_1, block_2 …).
 
     Args:
         images: the folder of the capture, in natural order.
         to: folder to write to; new or empty.
-        size: maximum number of images along the path in a block.
-        overlap: number of images that consecutive blocks have in common.
-        loop: whether the path ends where it began.
-        poses: rough poses in any format that `read_poses` reads, to find where the path returns; None without.
+        division: how to divide it.
 
     Raises:
         UsageError: if a setting or a folder cannot be used.
         InputError: if there are no images, or the poses are of other images.
         StoreError: if a link cannot be made.
     """
-    paths = {path.relative_to(images).as_posix(): path for path in list_pictures(images)}
     if exists(to) and (not is_folder(to) or children(to)):
         raise UsageError(f"--out {to}: exists and is not an empty folder. Choose a new one")
     if resolved(images) in (resolved(to), *resolved(to).parents):
         raise UsageError(f"--out {to}: is in the folder of the images. Choose a folder elsewhere")
-    positions = None if poses is None else _positions(poses, tuple(paths))
-    blocks = divide_capture(list(paths), size=size, overlap=overlap, loop=loop, positions=positions)
+    return link_blocks(images, to, divide_images(images, division))
+
+
+def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] = ()) -> list[tuple[str, ...]]:
+    """Return the names of the images of each block, relative to the folder of the capture.
+
+    Args:
+        images: the folder of the capture, in natural order.
+        division: how to divide it.
+        ignored: files and folders in it that are no images of the capture, such as masks.
+
+    Raises:
+        UsageError: if a setting cannot be used, or all images fit into one block.
+        InputError: if there are no images, or the poses are of other images.
+    """
+    left_out = [resolved(path) for path in ignored]
+    names = tuple(
+        path.relative_to(images).as_posix()
+        for path in list_pictures(images)
+        if not any(resolved(path).is_relative_to(place) for place in left_out)
+    )
+    positions = None if division.poses is None else _positions(division.poses, names)
+    blocks = divide_capture(
+        names, size=division.size, overlap=division.overlap, loop=division.loop, positions=positions
+    )
     if len(blocks) == 1:
-        raise UsageError(f"{images}: its {len(paths)} images fit into one block of {size}. Run them without blocks")
+        raise UsageError(
+            f"{images}: its {len(names)} images fit into one block of {division.size}. Run them without blocks"
+        )
+    return [tuple(block) for block in blocks]
+
+
+def link_blocks(images: Path, to: Path, blocks: Sequence[Sequence[str]]) -> list[ImageBlock]:
+    """Write a folder of links to the images of each block, and to their masks.
+
+    Raises:
+        StoreError: if a link cannot be made.
+    """
     found = []
     for number, names in enumerate(blocks, start=1):
         folder = to / f"block_{number}"
         for name in names:
-            _link(paths[name], folder / name)
+            _link(images / name, folder / name)
         if is_folder(images / "masks"):
             _link(images / "masks", folder / "masks")
         found.append(ImageBlock(folder, tuple(names)))

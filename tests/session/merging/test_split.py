@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.session.merging.split import split_images
+from pano_mvs.session.merging.split import Division, split_images
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def images(tmp_path: Path) -> Path:
 
 
 def test_blocks_are_links_in_natural_order(images: Path, tmp_path: Path) -> None:
-    blocks = split_images(images, tmp_path / "blocks", size=12, overlap=4)
+    blocks = split_images(images, tmp_path / "blocks", Division(12, 4))
     assert [block.folder.name for block in blocks] == ["block_1", "block_2", "block_3", "block_4"]
     assert blocks[0].names[:3] == ("1.png", "2.png", "3.png")
     assert set(blocks[0].names[-4:]) == set(blocks[1].names[:4])
@@ -39,17 +39,17 @@ def test_rough_poses_show_where_the_path_returns(images: Path, tmp_path: Path) -
         {"image": f"{number}.png", "R": np.eye(3).tolist(), "t": [-x, 0, 0]} for number, x in enumerate(along, start=1)
     ]
     (tmp_path / "poses.json").write_text(json.dumps({"metric": True, "views": views}))
-    blocks = split_images(images, tmp_path / "blocks", size=12, overlap=4, poses=tmp_path / "poses.json")
+    blocks = split_images(images, tmp_path / "blocks", Division(12, 4, poses=tmp_path / "poses.json"))
     assert len(set(blocks[0].names) & set(blocks[-1].names)) >= 3
     (tmp_path / "poses.json").write_text(json.dumps({"views": [views[0] | {"image": "other.png"}]}))
     with pytest.raises(InputError, match="none of its images is one of this capture"):
-        split_images(images, tmp_path / "again", size=12, overlap=4, poses=tmp_path / "poses.json")
+        split_images(images, tmp_path / "again", Division(12, 4, poses=tmp_path / "poses.json"))
 
 
 def test_folders_and_sizes_that_cannot_be_used(images: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="its 30 images fit into one block of 100"):
-        split_images(images, tmp_path / "blocks", size=100, overlap=4)
+        split_images(images, tmp_path / "blocks", Division(100, 4))
     with pytest.raises(UsageError, match="is in the folder of the images"):
-        split_images(images, images / "blocks", size=12, overlap=4)
+        split_images(images, images / "blocks", Division(12, 4))
     with pytest.raises(UsageError, match="exists and is not an empty folder"):
-        split_images(images, tmp_path / "walk/masks", size=12, overlap=4)
+        split_images(images, tmp_path / "walk/masks", Division(12, 4))
