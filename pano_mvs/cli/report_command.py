@@ -19,19 +19,25 @@ from pano_mvs.results.summary import RunSummary, cache_of
 def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     """Write `report.html` of an output folder from its run.json and the cache that the run used.
 
-    The cache is `cache`, else $PANO_MVS_CACHE, else the one that run.json names.
+    The cache is `cache`, else $PANO_MVS_CACHE, else the one that run.json names. Merged runs need none.
 
     Raises:
         InputError: if there is no run.json or no cache, since a page without images would replace one with images.
         StoreError: if the cache's list of runs is damaged, or a run is writing into the folder.
     """
     summary = RunSummary.read(out)
+    # Merged runs have no values in a cache: their pictures are files in the folder.
+    values = StoredValues() if summary.merged is not None else _stored_values(out, summary, cache)
+    with output_lock(out):
+        write_report(out, summary, values)
+    console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)
+
+
+def _stored_values(out: Path, summary: RunSummary, cache: Path | None) -> StoredValues:
     root = cache_of(summary, cache)
     if not is_file(root / "layout.json"):
         raise InputError(
             f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
             "with --cache DIR"
         )
-    with output_lock(out):
-        write_report(out, summary, StoredValues.of_folder(out, summary, Store(root, for_reading=True)))
-    console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)
+    return StoredValues.of_folder(out, summary, Store(root, for_reading=True))

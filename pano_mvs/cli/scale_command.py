@@ -15,6 +15,7 @@ from pano_mvs.session.running import Execution
 from pano_mvs.session.scaling import (
     WORKFLOW_FILE,
     Measurement,
+    how_to_scale_blocks,
     measured_between,
     measured_camera_height,
     metres_from_text,
@@ -41,10 +42,12 @@ def scale_output(
         console: where to print.
 
     Raises:
-        UsageError: if the measurement cannot be used.
+        UsageError: if the measurement cannot be used, or the results are merged from blocks.
         InputError: if the folder holds no run.
     """
     run = load(out, cache=cache)
+    if run.summary.merged is not None:
+        raise UsageError(how_to_scale_blocks(run))
     if not known and not camera_height:
         return _print_guess(run, group, console)
     measurement = _measurement(run, known, camera_height=camera_height, group=group)

@@ -52,6 +52,18 @@ class WorkflowSummary(Entry):
     overrides: tuple[str, ...] = ()
 
 
+class MergedSummary(Entry):
+    """The blocks of a merged capture.
+
+    Attributes:
+        blocks: the output folders of the blocks.
+        images: folder of all images; empty if the blocks are not links to one folder.
+    """
+
+    blocks: tuple[str, ...] = ()
+    images: str = ""
+
+
 class UnitCounts(Entry):
     """Number of units of work, by outcome."""
 

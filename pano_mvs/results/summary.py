@@ -18,6 +18,7 @@ from pano_mvs.results.records import (
     Entry,
     FailedUnit,
     ImageReason,
+    MergedSummary,
     Number,
     PosesSummary,
     ScoresSummary,
@@ -73,6 +74,7 @@ class RunSummary(Entry):
         files: file in the output folder to its digest.
         left_over: existing files of earlier runs that this run did not write, with their digests.
         verdict: whether the result is reliable; None if the run ended before it could be judged.
+        merged: the blocks, if the folder holds merged runs and not a run.
     """
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
@@ -104,6 +106,7 @@ class RunSummary(Entry):
     files: Mapping[str, str] = {}
     left_over: Mapping[str, str] = {}
     verdict: Verdict | None = None
+    merged: MergedSummary | None = None
 
     @staticmethod
     def from_json(value: object) -> RunSummary:
@@ -173,7 +176,9 @@ class RunSummary(Entry):
 
     @property
     def source_folder(self) -> Path | None:
-        """Folder from which the run read its images, if it read a folder."""
+        """Folder from which the run, or the blocks that were merged, read the images, if it is one folder."""
+        if self.merged is not None:
+            return Path(self.merged.images) if self.merged.images else None
         paths = [stage.params.get("path") for stage in self.stages if stage.use.startswith("source.")]
         return next((Path(str(path)) for path in paths if path), None)
 

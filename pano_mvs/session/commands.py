@@ -49,7 +49,7 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
 
     Raises:
         UsageError: if there is no such workflow or folder.
-        InputError: if the folder has no run.json, or its workflow file is missing.
+        InputError: if the folder has no run.json, its workflow file is missing, or it is merged from blocks.
     """
     out = Path(target)
     if not is_folder(out):
@@ -59,6 +59,11 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
             raise UsageError(f"there is no output folder {target[:80]!r}, and {error}") from error
         return open_session(target, overrides=overrides, images=images, cache=cache)
     summary = RunSummary.read(out)
+    if summary.merged is not None:
+        raise InputError(
+            f"{out} is merged from blocks, each of which is a run of its own. Give a block: "
+            f"{', '.join(summary.merged.blocks)}"
+        )
     workflow = Path(summary.workflow.path)
     if not is_file(workflow):
         raise InputError(f"{out}: its workflow {workflow} is missing. Give another workflow in place of the folder")

@@ -7,6 +7,7 @@ cached results are multiplied, and only exports, scores and other stages that re
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -146,6 +147,17 @@ def lost_scale(session: Session) -> str:
     return (
         f"{session.out} was put into metres before, by pano-mvs scale, and is in the units of the workflow again. To "
         f"use metres, repeat the measurement: pano-mvs scale {session.out} A B 3.42m"
+    )
+
+
+def how_to_scale_blocks(run: RunOutput) -> str:
+    """Return what to do to put results into metres that are merged from blocks."""
+    blocks = [] if run.summary.merged is None else run.summary.merged.blocks
+    return (
+        f"{run.out} is merged from blocks. Put a block into metres by two images, or two points, of its own, and merge "
+        "again; the merged results take over its unit:\n"
+        f"  {shlex.join(['pano-mvs', 'scale', *blocks[:1]])} A B 3.42m\n"
+        f"  {shlex.join(['pano-mvs', 'merge', *blocks, '--out', str(run.out)])}"
     )
 
 

@@ -36,6 +36,41 @@ def test_merge_of_blocks_without_overlap_ends_with_the_reason(pano_mvs: Command,
     assert "3 are needed" in " ".join(result.text.split())
 
 
+@pytest.fixture
+def merged(pano_mvs: Command, tmp_path: Path) -> Path:
+    """Two merged blocks."""
+    write_block(tmp_path / "one", list(range(12)), some_world(1))
+    write_block(tmp_path / "two", list(range(7, 20)), some_world(2))
+    assert pano_mvs("merge", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "both").code == 0
+    return tmp_path / "both"
+
+
+def test_the_report_of_a_merge_is_written_again_without_a_cache(pano_mvs: Command, merged: Path) -> None:
+    before = (merged / "report.html").read_text(encoding="utf-8")
+    (merged / "report.html").unlink()
+    result = pano_mvs("report", merged)
+    assert result.code == 0, result.text
+    assert (merged / "report.html").read_text(encoding="utf-8") == before
+
+
+def test_a_merge_is_put_into_metres_by_a_block(pano_mvs: Command, merged: Path) -> None:
+    for measured in ((), ("000.png", "005.png", "3m"), ("--camera-height", "1.6m")):
+        result = pano_mvs("scale", merged, *measured)
+        assert result.code == 2
+        block = merged.parent
+        assert f"pano-mvs scale {block / 'one'} A B 3.42m" in result.flat
+        assert f"pano-mvs merge {block / 'one'} {block / 'two'} --out {merged}" in result.flat
+
+
+@pytest.mark.parametrize("command", [("status",), ("inspect", "000.png", "1", "1")])
+def test_commands_that_need_a_workflow_name_the_blocks(
+    command: tuple[str, ...], pano_mvs: Command, merged: Path
+) -> None:
+    result = pano_mvs(command[0], merged, *command[1:])
+    assert result.code == 2
+    assert f"is merged from blocks, each of which is a run of its own. Give a block: {merged.parent}" in result.flat
+
+
 def test_split_prints_the_commands_that_follow(pano_mvs: Command, tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for number in range(20):

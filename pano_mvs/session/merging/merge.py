@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pano_mvs
 from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks
@@ -19,7 +19,7 @@ from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.geometry import Similarity3
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
-from pano_mvs.results.records import CloudSummary, ImageReason, PairLink, ViewSummary, WorkflowSummary
+from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.merging.agreement import (
@@ -33,6 +33,9 @@ from pano_mvs.session.merging.agreement import (
 from pano_mvs.session.merging.block import Block, load_blocks
 from pano_mvs.session.merging.files import MergeFiles
 from pano_mvs.session.summarise import poses_summary
+
+BLOCKS = "blocks"
+"""Folder in the output folder in which `pano-mvs run --block-size` computes the blocks."""
 
 _STAGE = "merge"
 
@@ -73,7 +76,9 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     """
     started, clock = datetime.now(UTC), time.perf_counter()
     blocks = load_blocks(outs, cache)
-    _require_free(to, outs)
+    if resolved(to) in {resolved(out) for out in outs}:
+        raise UsageError(f"--out {to}: this is one of the blocks. Choose another folder")
+    require_free(to)
     reference = max(
         range(len(blocks)), key=lambda number: (blocks[number].poses.metric, len(blocks[number].poses.names), -number)
     )
@@ -102,20 +107,24 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     return MergeResult(summary, tuple(blocks), alignment, merged)
 
 
-def _require_free(to: Path, outs: Sequence[Path]) -> None:
-    if resolved(to) in {resolved(out) for out in outs}:
-        raise UsageError(f"--out {to}: this is one of the blocks. Choose another folder")
+def require_free(to: Path) -> None:
+    """Check that merged results may be written to a folder.
+
+    Raises:
+        UsageError: if it is not a folder, or holds anything but the result of an earlier merge and its blocks.
+    """
     if not exists(to):
         return
     if not is_folder(to):
         raise UsageError(f"--out {to}: this is not a folder. Choose another one")
-    if not children(to):
+    if all(path.name in {OUTPUT_MARK, BLOCKS} for path in children(to)):
         return
     try:
-        is_merge = RunSummary.read(to).workflow.name == _STAGE
+        earlier = RunSummary.read(to)
+        is_merged = earlier.merged is not None or earlier.workflow.name == _STAGE
     except InputError:
-        is_merge = False
-    if not is_merge:
+        is_merged = False
+    if not is_merged:
         raise UsageError(f"--out {to}: the folder holds something else. Choose a new or an empty one")
 
 
@@ -138,6 +147,7 @@ def _written(
     is_doubted = bool(doubts) or any(is_doubtful(link) for link in alignment.links)
     return RunSummary(
         workflow=WorkflowSummary(name=_STAGE),
+        merged=MergedSummary(blocks=tuple(str(resolved(block.run.out)) for block in blocks), images=_images(blocks)),
         version=pano_mvs.__version__,
         exit_code=3 if is_doubted or poses.rejected else 0,
         rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.rejected.items()},
@@ -153,6 +163,20 @@ def _written(
         cloud=CloudSummary(points=points or None),
         versions=dict(_latest_versions(blocks)),
     )
+
+
+def _images(blocks: Sequence[Block]) -> str:
+    """Return the folder in which all images are, or to which the blocks are links; "" if there is no such folder."""
+    folders = set()
+    for block in blocks:
+        source = block.run.summary.source_folder
+        for name in block.poses.names:
+            path = resolved(source / name) if source is not None else Path()
+            folders.add(
+                path.parents[len(PurePosixPath(name).parts) - 1] if path.as_posix().endswith(f"/{name}") else None
+            )
+    found = folders.pop() if len(folders) == 1 else None
+    return "" if found is None else str(found)
 
 
 def _notes(blocks: Sequence[Block], alignment: BlockAlignment) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
@@ -162,3 +163,25 @@ def test_folders_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> 
         merge_outputs([block, folder / "block_1"], tmp_path / "mine")
     with pytest.raises(InputError, match=r"run\.json cannot be read"):
         merge_outputs([block, tmp_path / "mine"], tmp_path / "merged")
+
+
+def test_the_images_are_found_through_the_links_of_the_blocks(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    outs = []
+    for number, chosen in enumerate((range(12), range(8, 20))):
+        links, out = tmp_path / f"links_{number}", tmp_path / f"block_{number}"
+        links.mkdir()
+        for idx in chosen:
+            (tmp_path / f"walk/{idx:03d}.png").touch()
+            (links / f"{idx:03d}.png").symlink_to(tmp_path / f"walk/{idx:03d}.png")
+        write_block(out, list(chosen), some_world(number))
+        stage = StageOutcome(name="images", use="source.folder", params={"path": str(links)})
+        RunSummary.read(out).model_copy(update={"stages": (stage,)}).write(out)
+        outs.append(out)
+    merged = merge_outputs(outs, tmp_path / "merged").summary
+    assert merged.source_folder == tmp_path / "walk"
+    assert merged.merged is not None
+    assert merged.merged.blocks == tuple(map(str, outs))
+    (tmp_path / "links_1/019.png").unlink()
+    (tmp_path / "links_1/019.png").touch()
+    assert merge_outputs(outs, tmp_path / "merged").summary.source_folder is None
