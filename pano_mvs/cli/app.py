@@ -23,6 +23,10 @@ from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.evaluate.app import evaluate_app
 from pano_mvs.cli.options import (
     AcceptOption,
+    BlockLoopOption,
+    BlockOverlapOption,
+    BlockPosesOption,
+    BlockSizeOption,
     CacheOption,
     DurableOption,
     ImagesOption,
@@ -115,9 +119,14 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
     ] = False,
+    block_size: BlockSizeOption = 0,
+    block_overlap: BlockOverlapOption = 0,
+    block_loop: BlockLoopOption = False,
+    block_poses: BlockPosesOption = None,
 ) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.plan.command import show_dry_run
+    from pano_mvs.cli.run.blocks import division_of, run_in_blocks
     from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.engine.planning.run_options import RunOptions
     from pano_mvs.session.running import Execution
@@ -128,6 +137,9 @@ def run(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
     execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
+    if division is not None:
+        raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
     if dry_run:
         show_dry_run(session, execution, Console(), as_json=as_json)
         return

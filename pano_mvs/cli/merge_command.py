@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from rich.console import Console
@@ -48,7 +49,8 @@ def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None
     points = f", cloud of {summary.cloud.points:,} points" if summary.cloud.points else ""
     console.print(
         f"{len(summary.poses.registered)} cameras, {summary.poses.points:,} sparse points, {len(summary.views)} range "
-        f"maps{points}\nreport: {escape(str(to / 'report.html'))}",
+        f"maps{points}\nreport: {escape(str(to / 'report.html'))}\n"
+        f"next:\n  {escape(shlex.join(['pano-mvs', 'view', str(to)]))}",
         highlight=False,
         soft_wrap=True,
     )

@@ -14,6 +14,7 @@ from pano_mvs.cli.run.json_events import JsonEvents
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
@@ -27,16 +28,27 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
             if as_json:
                 with redirect_stdout(sys.stderr):  # a plugin may print in this process
                     return run_session(session, execution, JsonEvents(stream)).summary.exit_code
-            console = Console(file=stream)
-            with ProgressDisplay(console) as bars:
-                output = run_session(session, execution, bars)
-            print_summary(output, console, following=next_commands(output, session))
-            if note := lost_scale(session):
-                console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
-            return output.summary.exit_code
+            return run_shown(session, execution, Console(file=stream), advise=True).exit_code
     finally:
         if stream is not sys.stdout:
             stream.close()
+
+
+def run_shown(session: Session, execution: Execution, console: Console, *, advise: bool) -> RunSummary:
+    """Run a workflow, print progress and a summary, and return it.
+
+    Args:
+        session: the session.
+        execution: how units are computed.
+        console: where to print.
+        advise: whether to print the commands that can follow.
+    """
+    with ProgressDisplay(console) as bars:
+        output = run_session(session, execution, bars)
+    print_summary(output, console, following=next_commands(output, session) if advise else ())
+    if note := lost_scale(session):
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    return output.summary
 
 
 @contextmanager

@@ -80,11 +80,11 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
         UsageError: if a setting cannot be used, or all images fit into one block.
         InputError: if there are no images, or the poses are of other images.
     """
-    left_out = [resolved(path) for path in ignored]
+    left_out = [path.absolute() for path in ignored]
     names = tuple(
         path.relative_to(images).as_posix()
         for path in list_pictures(images)
-        if not any(resolved(path).is_relative_to(place) for place in left_out)
+        if not any(path.absolute().is_relative_to(place) for place in left_out)
     )
     positions = None if division.poses is None else _positions(division.poses, names)
     blocks = divide_capture(

@@ -1,0 +1,255 @@
+"""`pano-mvs run --block-size` runs a workflow block by block, and merges the blocks; the same command resumes it."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import PanoMvsError, RunStoppedError
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.output_lock import output_lock
+from pano_mvs.geometry import similarity_from_points
+from pano_mvs.io.images.captures import list_pictures
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.results.records import StageOutcome
+from pano_mvs.results.run_output import RunOutput, load
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.session import Session
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.algorithms.blocks.walked_blocks import some_world
+from tests.cli.conftest import Command, Outcome, deliverables, run_json
+from tests.session.merging.written_blocks import write_block
+
+BLOCKS = ("--block-size", "12", "--block-overlap", "5")
+"""26 images in three blocks."""
+
+
+@dataclass
+class Runs:
+    """Stands in for runs: writes what the run of a block would.
+
+    Attributes:
+        seen: block to the images in its folder, in the order of the runs.
+        ends: block to the error with which its run ends.
+        codes: block to the exit code of its run, if it is not 0.
+    """
+
+    seen: dict[str, list[str]] = field(default_factory=dict)
+    ends: dict[str, BaseException] = field(default_factory=dict)
+    codes: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, session: Session, *_: Any) -> RunOutput:
+        Store(session.store_root)
+        params: Any = session.workflow.stages["images"].params
+        block, out = session.out.name, session.out
+        self.seen[block] = sorted(path.name for path in params.path.iterdir())
+        if block in self.ends:
+            raise self.ends[block]
+        shutil.rmtree(out, ignore_errors=True)
+        write_block(out, [int(name[:3]) for name in self.seen[block]], some_world(int(block[-1])))
+        stage = StageOutcome(name="images", use="source.folder", params={"path": str(params.path)})
+        code = self.codes.get(block, 0)
+        update = {"stages": (stage,), "exit_code": code, "stopped": "too few matches" if code == 4 else ""}
+        RunSummary.read(out).model_copy(update=update).write(out)
+        return load(out)
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
+    found = Runs()
+    monkeypatch.setattr("pano_mvs.cli.run.command.run_session", found)
+    return found
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """The folder of a walk of 26 images, which nothing reads."""
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    for number in range(26):
+        (folder / f"{number:03d}.png").write_bytes(b"x")
+    return folder
+
+
+def test_blocks_run_one_after_the_other_and_are_merged(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert result.code == 0, result.text
+    assert [*runs.seen] == ["block_1", "block_2", "block_3"]
+    names = [f"{number:03d}.png" for number in range(26)]
+    assert runs.seen["block_1"] == names[:12]
+    assert runs.seen["block_3"] == names[14:]
+    assert "block 2 of 3: 12 images, 007.png to 018.png, in out/blocks/block_2" in result.flat
+    assert "merging 3 blocks into out" in result.flat
+    assert "26 cameras," in result.text
+    assert result.text.endswith("next:\n  pano-mvs view out\n")
+    assert read_poses(Path("out")).names == tuple(names)
+    assert load(Path("out")).summary.source_folder == walk
+
+
+def test_the_same_command_resumes_and_replaces_the_links(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    runs.ends["block_2"] = RunStoppedError("the disk is full")
+    result = pano_mvs(*command)
+    assert result.code == RunStoppedError.exit_code
+    assert [*runs.seen] == ["block_1", "block_2"]
+    assert "error: block_2: the disk is full" in result.flat
+    assert "give the same command again" in result.flat
+    alone = result.flat.partition("This block alone: ")[2]
+    assert alone == "pano-mvs run quickstart --images out/blocks/images/block_2 --out out/blocks/block_2"
+    assert not Path("out/run.json").exists()
+    runs.ends.clear()
+    (walk / "025.png").unlink()
+    assert pano_mvs(*command).code == 0
+    assert runs.seen["block_3"][-1] == "024.png"
+    assert len(read_poses(Path("out")).names) == 25
+    assert pano_mvs(*command).code == 0, "a merged folder is replaced"
+
+
+@pytest.mark.parametrize("end", [RunStoppedError("the disk is full"), None])
+def test_with_keep_going_the_other_blocks_run(
+    end: PanoMvsError | None, pano_mvs: Command, runs: Runs, walk: Path
+) -> None:
+    if end is None:
+        runs.codes["block_1"] = 4
+    else:
+        runs.ends["block_1"] = end
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--keep-going")
+    assert result.code == 4
+    assert f"error: block_1: {end or 'too few matches'}" in result.flat
+    assert [*runs.seen] == ["block_1", "block_2", "block_3"]
+    assert "not merged, because block_1 did not finish" in result.flat
+    assert not Path("out/run.json").exists()
+
+
+def test_failed_items_of_a_block_are_in_the_exit_code(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.codes["block_2"] = 3
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS).code == 3
+    assert run_json(Path("out"))["exit_code"] == 0
+
+
+def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.ends["block_2"] = KeyboardInterrupt()
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--keep-going")
+    assert result.code == 130
+    assert [*runs.seen] == ["block_1", "block_2"]
+    assert "To continue, run the same command again" in result.flat
+
+
+def test_blocks_that_cannot_be_merged_are_named(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+
+    def lonely(session: Session, *rest: Any) -> RunOutput:
+        output = runs(session, *rest)
+        if session.out.name == "block_3":
+            shutil.rmtree(session.out)
+            write_block(session.out, list(range(20, 26)), some_world(3))
+        return output
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pano_mvs.cli.run.command.run_session", lonely)
+        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert result.code == 2
+    assert "out/blocks/block_3: shares 0 registered cameras" in result.flat
+    assert "All blocks have run; their results are in out/blocks" in result.flat
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--block-overlap", "5"), "--block-overlap: only blocks have this. Give --block-size N as well"),
+        (("--block-loop", "--block-poses", "x"), "--block-loop, --block-poses: only blocks have this"),
+        (("--block-size", "5"), "a block needs at least 7 images"),
+        (("--block-size", "12", "--block-overlap", "6"), "must be less than half of the size of a block, 12"),
+        (("--block-size", "26"), "its 26 images fit into one block of 26. Run them without blocks"),
+        ((*BLOCKS, "--json"), "--json reports one run, and each block is a run"),
+        ((*BLOCKS, "--only", "depth:001.png"), "--images out/blocks/images/block_1 --out out/blocks/block_1"),
+        ((*BLOCKS, "--refresh", "depth:001.png"), "name units of one run"),
+        ((*BLOCKS, "--until", "features"), "--block-size --until features: blocks are merged by their poses"),
+        ((*BLOCKS, "--set", "images.use=source.video"), "this workflow has source.video. Extract the frames"),
+    ],
+)
+def test_options_that_do_not_fit_together_are_refused(
+    options: tuple[str, ...], reason: str, pano_mvs: Command, runs: Runs, walk: Path
+) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *options)
+    assert result.code == 2
+    assert reason in result.flat
+    assert not Path("out").exists()
+    assert runs.seen == {}
+
+
+def test_folders_in_use_are_refused_before_anything_runs(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    Path("out/blocks").mkdir(parents=True)
+    with output_lock(Path("out/blocks")):
+        result = pano_mvs(*command)
+    assert result.code == 4
+    assert "another run is writing into out/blocks" in result.flat
+    Path("out/mine.txt").write_text("x")
+    result = pano_mvs(*command)
+    assert result.code == 2
+    assert "--out out: the folder holds something else" in result.flat
+    assert runs.seen == {}
+
+
+def test_masks_in_the_folder_are_no_images_of_a_block(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    (walk / "own").mkdir()
+    (walk / "own/000.png.png").write_bytes(b"x")
+    options = ("--set", f"images.masks={walk / 'own'}", *BLOCKS)
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", walk / "out", *options).code == 0
+    assert sorted({name for names in runs.seen.values() for name in names}) == [f"{n:03d}.png" for n in range(26)]
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", walk / "out", *options).code == 0
+
+
+def test_a_dry_run_shows_the_blocks_and_writes_nothing(
+    pano_mvs: Command, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned = []
+
+    def plan(session: Session, *_: Any, **__: Any) -> None:
+        params: Any = session.workflow.stages["images"].params
+        planned.append((session.out.as_posix(), len(list_pictures(params.path))))
+
+    monkeypatch.setattr("pano_mvs.cli.run.blocks.show_dry_run", plan)
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--dry-run")
+    assert result.code == 0, result.text
+    assert "block 3 of 3: 12 images, 014.png to 025.png, in out/blocks/block_3" in result.flat
+    assert planned == [(f"out/blocks/block_{number}", 12) for number in (1, 2, 3)]
+    assert not Path("out").exists()
+
+
+@pytest.mark.slow
+def test_a_rendered_capture_in_blocks_is_one_model_and_resumes_from_the_cache(
+    pano_mvs: Command, tmp_path: Path
+) -> None:
+    cameras = capture_poses(10, spread=0.4)
+    write_capture(tmp_path / "capture", default_room(), cameras, size_hw=(96, 192))
+    command = (
+        "run", "known_poses", "--images", tmp_path / "capture/images", "--out", "out", "--cache", "cache",
+        "--set", f"poses.path={tmp_path / 'capture/truth/poses.json'}", "--set", "depth.planes=16",
+        "--set", "features.max_keypoints=400", "--block-size", "8", "--block-overlap", "3",
+    )  # fmt: skip
+
+    def checked(result: Outcome) -> dict[str, bytes]:
+        assert result.code in (0, 3), result.text
+        return deliverables(Path("out"))
+
+    written = checked(pano_mvs(*command))
+    poses = read_poses(Path("out"))
+    assert len(poses.names) == 10
+    centers = np.array([camera.center for camera in cameras])
+    room_from_merged = similarity_from_points(poses.centers, centers)
+    np.testing.assert_allclose(room_from_merged.apply(poses.centers), centers, atol=1e-3)
+    shutil.rmtree("out/blocks/block_2")
+    again = pano_mvs(*command)
+    assert checked(again) == written
+    assert again.text.count("nothing to compute") == 2
+    for arguments in (("report", "out"), ("view", "out", "--view", "inside:003.png", "--screenshot", "view.png")):
+        result = pano_mvs(*arguments)
+        assert result.code == 0, result.text
+        assert "note:" not in result.text, result.text
+    assert pano_mvs("share", "out", "--to", "page").code == 0
