@@ -226,12 +226,12 @@ def test_a_dry_run_shows_the_blocks_and_writes_nothing(
 def test_a_rendered_capture_in_blocks_is_one_model_and_resumes_from_the_cache(
     pano_mvs: Command, tmp_path: Path
 ) -> None:
-    cameras = capture_poses(10, spread=0.4)
-    write_capture(tmp_path / "capture", default_room(), cameras, size_hw=(96, 192))
+    cameras = capture_poses(8, spread=0.4)
+    write_capture(tmp_path / "capture", default_room(), cameras, size_hw=(48, 96))
     command = (
         "run", "known_poses", "--images", tmp_path / "capture/images", "--out", "out", "--cache", "cache",
         "--set", f"poses.path={tmp_path / 'capture/truth/poses.json'}", "--set", "depth.planes=16",
-        "--set", "features.max_keypoints=400", "--block-size", "8", "--block-overlap", "3",
+        "--set", "features.max_keypoints=400", "--executor", "serial", "--block-size", "7", "--block-overlap", "3",
     )  # fmt: skip
 
     def checked(result: Outcome) -> dict[str, bytes]:
@@ -240,7 +240,7 @@ def test_a_rendered_capture_in_blocks_is_one_model_and_resumes_from_the_cache(
 
     written = checked(pano_mvs(*command))
     poses = read_poses(Path("out"))
-    assert len(poses.names) == 10
+    assert len(poses.names) == 8
     centers = np.array([camera.center for camera in cameras])
     room_from_merged = similarity_from_points(poses.centers, centers)
     np.testing.assert_allclose(room_from_merged.apply(poses.centers), centers, atol=1e-3)
@@ -251,5 +251,4 @@ def test_a_rendered_capture_in_blocks_is_one_model_and_resumes_from_the_cache(
     for arguments in (("report", "out"), ("view", "out", "--view", "inside:003.png", "--screenshot", "view.png")):
         result = pano_mvs(*arguments)
         assert result.code == 0, result.text
-        assert "note:" not in result.text, result.text
-    assert pano_mvs("share", "out", "--to", "page").code == 0
+        assert "panoramas are not in" not in result.text
