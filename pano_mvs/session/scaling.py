@@ -153,6 +153,11 @@ def lost_scale(session: Session) -> str:
 def how_to_scale_blocks(run: RunOutput) -> str:
     """Return what to do to put results into metres that are merged from blocks."""
     blocks = [] if run.summary.merged is None else run.summary.merged.blocks
+    if run.summary.poses.metric:
+        return (
+            f"{run.out} is merged from blocks and is in metres ({run.summary.poses.scale}). To correct the lengths, "
+            f"correct each block that is in metres, then merge again. Blocks: {', '.join(blocks)}"
+        )
     return (
         f"{run.out} is merged from blocks. Put a block into metres by two images, or two points, of its own, and merge "
         "again; the merged results take over its unit:\n"

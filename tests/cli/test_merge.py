@@ -11,6 +11,7 @@ from pano_mvs.geometry import ray_grid, similarity_from_points
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.room import capture_poses, default_room, range_along, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
 from tests.cli.conftest import SIZE_HW, SMALL, Command
@@ -60,6 +61,15 @@ def test_a_merge_is_put_into_metres_by_a_block(pano_mvs: Command, merged: Path) 
         block = merged.parent
         assert f"pano-mvs scale {block / 'one'} A B 3.42m" in result.flat
         assert f"pano-mvs merge {block / 'one'} {block / 'two'} --out {merged}" in result.flat
+
+
+def test_a_merge_in_metres_is_corrected_by_its_blocks(pano_mvs: Command, merged: Path) -> None:
+    summary = RunSummary.read(merged)
+    metric = summary.poses.model_copy(update={"metric": True, "scale": "metres, by GPS"})
+    summary.model_copy(update={"poses": metric}).write(merged)
+    result = pano_mvs("scale", merged)
+    assert result.code == 2
+    assert "is in metres (metres, by GPS). To correct the lengths, correct each block" in result.flat
 
 
 @pytest.mark.parametrize("command", [("status",), ("inspect", "000.png", "1", "1")])

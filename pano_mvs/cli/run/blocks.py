@@ -74,7 +74,7 @@ def run_in_blocks(
     with interrupted_by_termination(), open_blocks(session, blocks) as runs:
         codes = []
         for number, run in enumerate(runs, start=1):
-            _print_heading(run, number, len(runs), console)
+            _print_heading(run, number, len(runs), console=console)
             code = _run_block(run, execution, console)
             codes.append(code)
             if _is_early(code) and not session.run_options.keep_going:
@@ -90,7 +90,7 @@ def _is_early(code: int) -> bool:
     return code not in (0, _FAILED_ITEMS)
 
 
-def _print_heading(run: BlockRun, number: int, count: int, console: Console) -> None:
+def _print_heading(run: BlockRun, number: int, count: int, *, console: Console) -> None:
     console.print(
         f"\n[bold]block {number} of {count}[/]: {len(run.names)} images, "
         f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}",
@@ -140,5 +140,5 @@ def _show_dry_run(
     with tempfile.TemporaryDirectory() as folder:
         for number, run in enumerate(block_runs(session, blocks, Path(folder)), start=1):
             shown = replace(run, session=replace(run.session, out=session.out / BLOCKS / run.name))
-            _print_heading(shown, number, len(blocks), console)
+            _print_heading(shown, number, len(blocks), console=console)
             show_dry_run(shown.session, execution, console, as_json=False)

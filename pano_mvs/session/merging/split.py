@@ -74,7 +74,7 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
     Args:
         images: the folder of the capture, in natural order.
         division: how to divide it.
-        ignored: files and folders in it that are no images of the capture, such as masks.
+        ignored: files and folders in it that do not belong to the capture, such as masks.
 
     Raises:
         UsageError: if a setting cannot be used, or all images fit into one block.

@@ -196,7 +196,7 @@ def test_folders_in_use_are_refused_before_anything_runs(pano_mvs: Command, runs
     assert runs.seen == {}
 
 
-def test_masks_in_the_folder_are_no_images_of_a_block(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+def test_masks_in_the_folder_do_not_count_as_images(pano_mvs: Command, runs: Runs, walk: Path) -> None:
     (walk / "own").mkdir()
     (walk / "own/000.png.png").write_bytes(b"x")
     options = ("--set", f"images.masks={walk / 'own'}", *BLOCKS)
