@@ -125,8 +125,8 @@ def run(
     block_poses: BlockPosesOption = None,
 ) -> None:
     """Run a workflow; the same command resumes it."""
+    from pano_mvs.cli.blocks_command import division_of, run_in_blocks
     from pano_mvs.cli.plan.command import show_dry_run
-    from pano_mvs.cli.run.blocks import division_of, run_in_blocks
     from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.engine.planning.run_options import RunOptions
     from pano_mvs.session.running import Execution

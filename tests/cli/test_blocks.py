@@ -214,7 +214,7 @@ def test_a_dry_run_shows_the_blocks_and_writes_nothing(
         params: Any = session.workflow.stages["images"].params
         planned.append((session.out.as_posix(), len(list_pictures(params.path))))
 
-    monkeypatch.setattr("pano_mvs.cli.run.blocks.show_dry_run", plan)
+    monkeypatch.setattr("pano_mvs.cli.blocks_command.show_dry_run", plan)
     result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--dry-run")
     assert result.code == 0, result.text
     assert "block 3 of 3: 12 images, 014.png to 025.png, in out/blocks/block_3" in result.flat
