@@ -69,8 +69,9 @@ def localise(
 ) -> Photographs:
     """Find where ordinary photographs were taken, and their focal lengths, by the panoramas and their ranges.
 
-    The key points of each photograph are matched with those of the panoramas that have range maps. Photographs that
-    cannot be localised reliably are left out, each with a reason. Only the largest group of poses is used.
+    The key points of each photograph are matched with those of the most similar panoramas that have range maps.
+    Photographs that cannot be localised reliably are left out, each with a reason. Only the largest group of poses is
+    used.
     """
     group = split_groups(poses)[0]
     known: dict[str, KnownPoints] = {}

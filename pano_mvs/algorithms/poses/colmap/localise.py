@@ -13,6 +13,7 @@ from pano_mvs.algorithms.features.photograph import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
+from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_from_ray
 from pano_mvs.scene import Features, RangeMap
@@ -115,16 +116,20 @@ def localise_photograph(
     *,
     focal_px: float | None,
     patches: PhotographPatches | None = None,
+    candidates: Annotated[
+        int, Setting("number of most similar panoramas to match each photograph with; 0: all", ge=0)
+    ] = 20,
     min_inliers: Annotated[int, Setting("minimum number of key points that agree with the pose", ge=6)] = 30,
     max_error_deg: Annotated[float, Setting("maximum error of a key point that agrees", gt=0, le=5)] = 0.4,
     rng: np.random.Generator,
 ) -> Localised | str:
     """Estimate the pose and the focal length of a photograph, or return the reason why that is not possible.
 
-    Its key points are matched with those of each panorama. LO-RANSAC finds the pose, with the focal length unless it is
-    known (as implemented by COLMAP). Pose, focal length and one coefficient of radial distortion are then refined, with
-    more matches, which are looked for near the places that the pose predicts, and with patches of the panoramas. If the
-    key points alone are too few, the patches decide: also between the poses that single panoramas suggest.
+    Its key points are matched with those of the most similar panoramas. LO-RANSAC finds the pose, with the focal length
+    unless it is known (as implemented by COLMAP). Pose, focal length and one coefficient of radial distortion are then
+    refined, with more matches, which are looked for near the places that the pose predicts, and with patches of the
+    panoramas. If the key points alone are too few, the patches decide: also between the poses that single panoramas
+    suggest.
 
     Args:
         keypoints: of the photograph.
@@ -132,10 +137,12 @@ def localise_photograph(
         panoramas: key points with positions, by name.
         focal_px: focal length if it is known, None otherwise.
         patches: the photograph and the panoramas, to align patches; None: key points only.
+        candidates: number of most similar panoramas that are used; 0: all.
         min_inliers: minimum number of key points that agree with the pose.
         max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
+    panoramas = _similar(keypoints, panoramas, candidates)
     each = {name: _matches(keypoints, known) for name, known in panoramas.items()}
     matches = _joined(each.values())
     if len(matches.pixels_px) < (min_inliers if patches is None else _FEW):
@@ -162,6 +169,13 @@ def localise_photograph(
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
     singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO) for name in most]
     return search.confirmed([matches, *(one for one in singly if len(one.pixels_px) >= _FEW)], rng) or found
+
+
+def _similar(
+    keypoints: PhotographKeypoints, panoramas: Mapping[str, KnownPoints], count: int
+) -> dict[str, KnownPoints]:
+    described = {name: known.descriptors for name, known in panoramas.items()}
+    return {name: panoramas[name] for name in similar_panoramas(keypoints.descriptors, described, count=count)}
 
 
 class _Matches(NamedTuple):
