@@ -13,7 +13,18 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.api import Context, InputError, Panorama, PointCloud, Poses, RangeMap, Rigid3, ray_grid
+from pano_mvs.api import (
+    Context,
+    FilePart,
+    InputError,
+    Panorama,
+    PointCloud,
+    Poses,
+    RangeMap,
+    Rigid3,
+    ray_grid,
+    write_png,
+)
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
@@ -21,6 +32,7 @@ from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.nerfstudio.frames import SplatFrames
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_confidence_png, read_normals
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.stages.exports.splat_bundle import (
     SplatBundleParams,
@@ -29,6 +41,7 @@ from pano_mvs.stages.exports.splat_bundle import (
     splat_frames,
     splat_frames_memory_bytes,
 )
+from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points
@@ -48,6 +61,8 @@ def delivered(
     *,
     points: TrackedPoints | None = None,
     cloud: PointCloud | None = None,
+    photographs: Photographs | None = None,
+    listed: bool = True,
     **settings: Any,
 ) -> Path:
     """Write a bundle as a run does, through the store, and return its folder."""
@@ -67,7 +82,7 @@ def delivered(
         frames[name] = read
     (folder / "scratch").mkdir()
     ctx = Context(np.random.default_rng(0), folder / "scratch")
-    files = splat_bundle(frames, poses, cloud, points, SplatBundleParams(), ctx)
+    files = splat_bundle(frames, poses, cloud, points, photographs, SplatBundleParams(photographs=listed), ctx)
     publisher.publish("bundle", "", store.put_value(files))
     return folder / "out" / "splat_bundle"
 
@@ -310,6 +325,141 @@ def test_poses_are_read_back_by_our_own_reader(room: Path) -> None:
     np.testing.assert_allclose(poses.rotations, [pose.rotation for pose in capture.poses], atol=1e-12)
 
 
+PHOTO_HW = (60, 80)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Photographs:
+    """Two photographs of the room by cameras with distortion, one upright."""
+    folder = tmp_path_factory.mktemp("phone")
+    poses = [
+        Rigid3.from_center(rotation_from_rotvec(np.array(turn)), np.array([0.2, 0.1, 0.1]))
+        for turn in ([0.1, 0.6, -0.1], [0.0, -2.0, 0.1])
+    ]
+    sizes, focals, radials = [PHOTO_HW, PHOTO_HW[::-1]], np.array([70.0, 90.0]), np.array([-0.15, 0.1])
+    for idx, pose in enumerate(poses):
+        picture = render_photograph(
+            default_room(), pose, sizes[idx], focal_px=focals[idx], radial=radials[idx], supersample=1
+        )
+        write_png(folder / f"{idx}.png", picture)
+    return Photographs(
+        names=("phone/0.png", "phone/1.png"),
+        sizes_hw=np.array(sizes, np.int32),
+        focals_px=focals,
+        radials=radials,
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations=np.array([pose.translation for pose in poses]),
+        inliers=np.array([50, 50], np.int32),
+        errors_px=np.array([0.5, 0.5], np.float32),
+        pictures=tuple(FilePart(folder / f"{idx}.png") for idx in range(2)),
+    )
+
+
+@pytest.fixture(scope="module")
+def with_photographs(photographs: Photographs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with photographs; some panoramas are masked."""
+    capture, folder = tiny_capture(Variant((64, 128), masked=True)), tmp_path_factory.mktemp("mixed")
+    points = capture.whole(TrackedPoints)
+    return delivered(
+        folder,
+        capture.whole(Poses),
+        capture.images,
+        true_ranges(capture),
+        points=points,
+        photographs=photographs,
+        size_px=48,
+    )
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def test_photographs_are_pinhole_cameras_of_the_model_of_faces(
+    with_photographs: Path, photographs: Photographs
+) -> None:
+    """As readers of pinhole models see them: the pictures show the room where the cameras are."""
+    model = pycolmap.Reconstruction(str(with_photographs / "faces" / "sparse" / "0"))
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    images = {image.name: image for image in model.images.values()}
+    for idx, name in enumerate(photographs.names):
+        image = images[f"{name}.jpg"]
+        pose = photographs.cam_from_world(idx)
+        np.testing.assert_allclose(image.cam_from_world().matrix()[:, :3], pose.rotation, atol=1e-12)
+        camera = model.cameras[image.camera_id]
+        picture = read_picture(with_photographs / "faces" / "images" / image.name)[..., ::-1]
+        assert picture.shape[:2] == (camera.height, camera.width) == tuple(photographs.sizes_hw[idx])
+        expected = render_photograph(default_room(), pose, picture.shape[:2], focal_px=camera.params[0], supersample=1)
+        away = np.abs(picture.astype(float) - expected).mean()
+        assert away < 0.6 * np.abs(picture[:, 1:].astype(float) - expected[:, :-1]).mean()
+    faces = [image for image in model.images.values() if "phone" not in image.name]
+    assert len(faces) == len(views_of(with_photographs, "faces"))
+    assert any(image.num_points3D for image in faces)
+    panoramas = pycolmap.Reconstruction(str(with_photographs / "equirectangular" / "sparse" / "0"))
+    assert {camera.model.name for camera in panoramas.cameras.values()} == {"EQUIRECTANGULAR"}
+
+
+def test_the_manifest_and_nerfstudio_list_the_same_photographs(with_photographs: Path) -> None:
+    manifest = manifest_of(with_photographs)
+    variants = manifest["groups"][0]["variants"]
+    assert "photographs" not in variants["equirectangular"]
+    document = json.loads((with_photographs / variants["faces"]["photographs"]).read_text())
+    assert document["camera_model"] == "PINHOLE"
+    assert document["ply_file_path"] == "seed.ply"
+    frames = {frame["file_path"]: frame for frame in document["frames"]}
+    assert len(frames) == len(views_of(with_photographs, "faces")) + 2
+    assert len(manifest["photographs"]) == 2
+    for listed in manifest["photographs"]:
+        frame, camera = frames[listed["image"].removeprefix("faces/")], listed["camera"]
+        assert (frame["w"], frame["h"], frame["fl_x"]) == (camera["width"], camera["height"], camera["fx"])
+        assert "k1" not in frame
+        world_from_cam = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        pose = pose_of(listed)
+        np.testing.assert_allclose(world_from_cam[:3, :3], pose.rotation.T, atol=1e-12)
+        np.testing.assert_allclose(world_from_cam[:3, 3], pose.center, atol=1e-12)
+        assert f"faces/{frame['mask_path']}" == listed["mask"]
+        assert read_picture(with_photographs / listed["mask"]).shape[:2] == (camera["height"], camera["width"])
+
+
+def test_photographs_change_nothing_else_and_can_be_left_out(photographs: Photographs, tmp_path: Path) -> None:
+    capture = tiny_capture(Variant((64, 128)))
+    ranges = dict(list(true_ranges(capture).items())[:1])
+    bundles = []
+    for number, (given, listed) in enumerate([(None, True), (photographs, False), (photographs, True)]):
+        (tmp_path / str(number)).mkdir()
+        made = (capture.whole(Poses), capture.images, ranges)
+        bundles.append(files_of(delivered(tmp_path / str(number), *made, photographs=given, listed=listed, size_px=24)))
+    plain, left_out, full = bundles
+    assert left_out == plain
+    changed = {name for name in full if full[name] != plain.get(name)}
+    assert changed == {
+        "manifest.json",
+        "faces/images/phone/0.png.jpg",
+        "faces/images/phone/1.png.jpg",
+        "faces/transforms_photographs.json",
+        *(f"faces/sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "rigs")),
+    }
+    document = json.loads(full["manifest.json"])
+    del document["photographs"]
+    del document["groups"][0]["variants"]["faces"]["photographs"]
+    assert document == json.loads(plain["manifest.json"])
+
+
+def test_photographs_need_faces(photographs: Photographs, tmp_path: Path) -> None:
+    capture = tiny_capture(Variant((64, 128)))
+    folder = delivered(
+        tmp_path,
+        capture.whole(Poses),
+        capture.images,
+        true_ranges(capture),
+        photographs=photographs,
+        variants=["equirectangular"],
+    )
+    assert "photographs" not in manifest_of(folder)
+    assert not (folder / "faces").exists()
+
+
 def test_masked_pixels_have_no_layer(tmp_path: Path) -> None:
     capture = tiny_capture(Variant((64, 128), masked=True))
     images = dict(capture.images)
@@ -356,7 +506,7 @@ def test_layers_that_are_not_wanted_are_null(tmp_path: Path) -> None:
 def test_without_frames_there_is_no_bundle(tmp_path: Path) -> None:
     poses = tiny_capture(Variant((64, 128))).whole(Poses)
     with pytest.raises(InputError, match="no panorama has both a pose and frames"):
-        splat_bundle({}, poses, None, None, SplatBundleParams(), Context(np.random.default_rng(0), tmp_path))
+        splat_bundle({}, poses, None, None, None, SplatBundleParams(), Context(np.random.default_rng(0), tmp_path))
 
 
 def test_the_memory_grows_with_panorama_and_face() -> None:

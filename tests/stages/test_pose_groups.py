@@ -278,7 +278,13 @@ _FRAME = NerfstudioFrame(
 def test_each_room_of_a_splat_bundle_has_its_own_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
     frames = {name: SplatFrames({}, {}, (_FRAME,), 0.001) for name in _ORDER}
     files = splat_bundle(
-        frames=frames, poses=rooms.poses, cloud=_fused(rooms), points=None, params=SplatBundleParams(), ctx=ctx
+        frames=frames,
+        poses=rooms.poses,
+        cloud=_fused(rooms),
+        points=None,
+        photographs=None,
+        params=SplatBundleParams(),
+        ctx=ctx,
     )
     out = _placed(files, tmp_path) / "splat_bundle"
     manifest = json.loads((out / "manifest.json").read_text())

@@ -20,6 +20,7 @@ from pano_mvs.io.colmap.model_reader import (
     read_images,
     read_points,
 )
+from pano_mvs.io.colmap.photographs import add_photographs
 from pano_mvs.io.colmap.points import ModelForm, ModelPoints, write_model
 from pano_mvs.io.colmap.sphere_sfm import has_sphere_cameras, read_sphere_model
 from pano_mvs.io.images.captures import natural_key
@@ -48,7 +49,7 @@ def write_colmap_model(
         folder: the folder of the files, which is created if necessary.
         poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each image by name.
-        photographs: ordinary photographs, in the same world; each has a SIMPLE_RADIAL camera and no key points.
+        photographs: ordinary photographs, in the same world; see `add_photographs`.
         form: "bin" (COLMAP's default), "txt", or "both", of which COLMAP reads the binary files.
 
     Raises:
@@ -72,7 +73,7 @@ def write_colmap_model(
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.asarray(poses.translations[idx])))
         points.observe(idx + 1, observed, pixels_per_rad=sizes_hw[name][1] / (2 * np.pi))
     if photographs is not None:
-        _add_photographs(model, photographs, first_camera=len(camera_ids) + 1, first_image=len(poses.names) + 1)
+        add_photographs(model, photographs, first_camera=len(camera_ids) + 1, first_image=len(poses.names) + 1)
     points.add_to(model)
     write_model(model, folder, form)
 
@@ -158,23 +159,6 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
             camera.camera_id = ids[height, width]
             model.add_camera_with_trivial_rig(camera)
     return ids
-
-
-def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int, first_image: int) -> None:
-    import pycolmap
-
-    for idx, name in enumerate(photographs.names):
-        height, width = photographs.sizes_hw[idx].tolist()
-        params = [photographs.focals_px[idx], width / 2, height / 2, photographs.radials[idx]]
-        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
-        camera.camera_id = first_camera + idx
-        model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(
-            name=name, keypoints=np.zeros((0, 2)), camera_id=camera.camera_id, image_id=first_image + idx
-        )
-        rotation = pycolmap.Rotation3d(np.asarray(photographs.rotations[idx]))
-        pose = pycolmap.Rigid3d(rotation, np.asarray(photographs.translations[idx]))
-        model.add_image_with_trivial_frame(image, pose)
 
 
 def _pose(image: ModelImage) -> Rigid3:

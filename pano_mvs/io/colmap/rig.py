@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import PinholeView, Rigid3
+from pano_mvs.io.colmap.photographs import add_photographs
 from pano_mvs.io.colmap.points import ModelForm, ModelPoints, write_model
 from pano_mvs.scene import Poses
+from pano_mvs.scene.photographs import Photographs
 
 FloatArray = NDArray[np.float64]
 
@@ -31,7 +33,12 @@ class CutPanorama:
 
 
 def write_rig_model(
-    folder: Path, poses: Poses, cuts: Mapping[str, CutPanorama], *, form: ModelForm = "both"
+    folder: Path,
+    poses: Poses,
+    cuts: Mapping[str, CutPanorama],
+    *,
+    photographs: Photographs | None = None,
+    form: ModelForm = "both",
 ) -> Mapping[str, int]:
     """Write a COLMAP model of the faces of panoramas: rigs, a PINHOLE camera per face, frames, points, tracks.
 
@@ -43,10 +50,11 @@ def write_rig_model(
         folder: the folder of the files, which is created if necessary.
         poses: poses of the panoramas with points and tracks. Errors become pixels at a face's centre (f per radian).
         cuts: panorama name to its faces; panoramas without an entry are omitted.
+        photographs: ordinary photographs, in the same world; see `add_photographs`.
         form: "bin", "txt" or "both". COLMAP prefers binary files; some versions of OpenMVS read only text.
 
     Returns:
-        Image name to the number of points that it observes. COLMAP does not fuse images without points.
+        Name of each face's image to the number of points that it observes. COLMAP does not fuse images without points.
     """
     import pycolmap
 
@@ -74,6 +82,8 @@ def write_rig_model(
             points.observe(image_id, observed, pixels_per_rad=view.focal_px)
             seen[image_name] = len(observed)
         model.register_frame(frame_id)
+    if photographs is not None:
+        add_photographs(model, photographs, first_camera=len(model.cameras) + 1, first_image=len(seen) + 1)
     points.add_to(model, only_seen=True)
     write_model(model, folder, form)
     return seen

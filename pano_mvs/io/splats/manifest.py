@@ -14,6 +14,7 @@ import numpy as np
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, Variant
 from pano_mvs.io.nerfstudio.transforms import CAMERA_MODELS, open_mask
+from pano_mvs.scene.photographs import Photographs
 
 ROOT = "splat_bundle"
 """Folder of the bundle in the output folder."""
@@ -55,7 +56,11 @@ class BundleView:
 
 
 def manifest_document(
-    views: Sequence[BundleView], groups: Sequence[Mapping[str, Any]], *, depth_unit: float
+    views: Sequence[BundleView],
+    groups: Sequence[Mapping[str, Any]],
+    *,
+    depth_unit: float,
+    photographs: Photographs | None = None,
 ) -> dict[str, Any]:
     """Return the contents of manifest.json.
 
@@ -63,9 +68,10 @@ def manifest_document(
         views: all images.
         groups: by number: frame and unit of the world, and the files of each variant.
         depth_unit: scene units per step of the depths.
+        photographs: photographs without distortion beside the faces, in the world of group 0.
     """
     masked = {view.frame.variant for view in views if view.frame.mask}
-    return {
+    document = {
         "schema": MANIFEST_VERSION,
         "program": "pano_mvs",
         "conventions": _CONVENTIONS,
@@ -73,6 +79,11 @@ def manifest_document(
         "groups": list(groups),
         "views": [_entry(view, masked) for view in views],
     }
+    if photographs is not None:
+        document["photographs"] = [
+            _photograph(photographs, idx, masked="faces" in masked) for idx in range(len(photographs))
+        ]
+    return document
 
 
 def _layers(depth_unit: float) -> dict[str, dict[str, Any]]:
@@ -118,5 +129,20 @@ def _entry(view: BundleView, masked: Iterable[Variant]) -> dict[str, Any]:
         **placed,
         "depth_semantics": _DEPTHS[frame.variant] if frame.depth else None,
         "camera": camera,
+        "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
+    }
+
+
+def _photograph(photographs: Photographs, idx: int, *, masked: bool) -> dict[str, Any]:
+    """Return the entry of a photograph, which has no layers."""
+    height, width = photographs.sizes_hw[idx].tolist()
+    focal, pose = float(photographs.focals_px[idx]), photographs.cam_from_world(idx)
+    size = {"width": width, "height": height}
+    return {
+        "variant": "faces",
+        "group": 0,
+        "image": f"faces/images/{photographs.names[idx]}",
+        "mask": f"faces/{open_mask((width, height))}" if masked else None,
+        "camera": {"model": "PINHOLE", **size, "fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2},
         "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
     }

@@ -30,9 +30,10 @@ from pano_mvs.core.paths import children
 from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, SplatFrames
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, SplatFrames
 from pano_mvs.io.splats.manifest import ROOT, BundleView, manifest_document
 from pano_mvs.scene.files import group_file
+from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups, with_cameras
 from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.stages.exports.frame_files import (
@@ -42,8 +43,12 @@ from pano_mvs.stages.exports.frame_files import (
     PosedGroup,
     SeedParams,
     frames_with_poses,
+    write_photographs,
     write_transforms,
 )
+from pano_mvs.stages.exports.pinhole_photographs import pinhole_photographs
+
+_PHOTOGRAPHS = "faces/transforms_photographs.json"
 
 
 class SplatFramesParams(FramesParams):
@@ -89,6 +94,10 @@ def splat_frames(
 class SplatBundleParams(SeedParams):
     """Settings of export.splat_bundle."""
 
+    photographs: bool = Field(
+        default=True, description="also list the photographs of poses.localise, undistorted, beside the faces"
+    )
+
 
 @stage("export.splat_bundle")
 def splat_bundle(
@@ -96,6 +105,7 @@ def splat_bundle(
     poses: One[Poses],
     cloud: One[PointCloud] | None,
     points: One[TrackedPoints] | None,
+    photographs: One[Photographs] | None,
     params: SplatBundleParams,
     ctx: Context,
 ) -> Files:
@@ -103,7 +113,8 @@ def splat_bundle(
 
     Each variant is a folder that is complete in itself: transforms.json for nerfstudio, a COLMAP model in sparse/0 for
     gsplat and others, and seed.ply. The points of points.tracked, if available, are added to the model. Further groups
-    of poses are transforms_1.json, seed_1.ply and sparse/1 …
+    of poses are transforms_1.json, seed_1.ply and sparse/1 … Photographs that poses.localise has placed are written
+    without distortion into the folder of the faces, and listed in its model and in transforms_photographs.json.
     """
     loaded = frames_with_poses(poses, frames, ctx)
     joined = poses if points is None else points.joined_to(poses, keep_points=True)
@@ -111,6 +122,8 @@ def splat_bundle(
     files: dict[str, Path] = {}
     groups: list[dict[str, Any]] = []
     views: list[BundleView] = []
+    shown = photographs if params.photographs else None
+    taken = None if shown is None else _taken(shown, loaded, ctx)
     for number, (group, with_points) in enumerate(zip(split_groups(poses), split_groups(joined), strict=True)):
         own = {name: loaded[name] for name in group.names if name in loaded}
         written: dict[str, Path] = {}
@@ -118,15 +131,31 @@ def splat_bundle(
             posed = PosedGroup(number, group, own)
             given = clouds[number] if number < len(clouds) else None
             written = write_transforms(ROOT, posed, given, params=params, ctx=ctx)
-            written |= _write_models(posed, with_points, ctx)
+            placed = taken if number == 0 else None
+            written |= _write_models(posed, with_points, placed, ctx=ctx)
+            if placed is not None:
+                seed = f"{ROOT}/faces/seed.ply" in written
+                written |= write_photographs(ROOT, posed, placed, seed=seed, ctx=ctx)
             views += _views(posed)
         groups.append(_about(number, group, written))
         files |= written
-    document = manifest_document(views, groups, depth_unit=next(iter(loaded.values())).depth_unit)
+    unit = next(iter(loaded.values())).depth_unit
+    document = manifest_document(views, groups, depth_unit=unit, photographs=taken)
     files[f"{ROOT}/manifest.json"] = ctx.scratch / "manifest.json"
     files[f"{ROOT}/manifest.json"].write_text(json.dumps(document, indent=1), encoding="utf-8")
     ctx.metric("views", len(views))
     return Files(files)
+
+
+def _taken(photographs: Photographs, frames: Mapping[str, PanoramaFrames], ctx: Context) -> Photographs | None:
+    """Return the photographs as they are listed beside the faces; None if there are none, or no faces."""
+    if not len(photographs):
+        return None
+    if not any(frame.variant == "faces" for each in frames.values() for frame in each.frames):
+        ctx.note("photographs are only listed beside faces: add faces to the variants of export.splat_frames")
+        return None
+    ctx.metric("photographs", len(photographs))
+    return pinhole_photographs(photographs, ctx)
 
 
 def _views(group: PosedGroup) -> list[BundleView]:
@@ -146,6 +175,8 @@ def _about(number: int, poses: Poses, written: Mapping[str, Path]) -> dict[str, 
         places = {key: f"{variant}/{name}" for key, name in names.items() if f"{ROOT}/{variant}/{name}" in written}
         if places:
             variants[variant] = places | {"colmap": f"{variant}/sparse/{number}"}
+    if f"{ROOT}/{_PHOTOGRAPHS}" in written:
+        variants["faces"]["photographs"] = _PHOTOGRAPHS
     return {
         "number": number,
         "metric": poses.metric,
@@ -155,13 +186,13 @@ def _about(number: int, poses: Poses, written: Mapping[str, Path]) -> dict[str, 
     }
 
 
-def _write_models(group: PosedGroup, poses: Poses, ctx: Context) -> dict[str, Path]:
+def _write_models(group: PosedGroup, poses: Poses, photographs: Photographs | None, *, ctx: Context) -> dict[str, Path]:
     """Write a COLMAP model of each variant, whose image names are relative to the folder images/ of the variant."""
     files: dict[str, Path] = {}
     for variant, listed in group.listed().items():
         folder = ctx.scratch / f"{variant}_{group.number}"
         if variant == "faces":
-            write_rig_model(folder, poses, _cuts(listed), form="bin")
+            write_rig_model(folder, poses, _cuts(listed), photographs=photographs, form="bin")
         else:
             _write_panoramas(folder, poses, dict(listed))
         target = f"{ROOT}/{variant}/sparse/{group.number}"
