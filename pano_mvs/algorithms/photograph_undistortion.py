@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ROUNDS = 50
+_ROWS_AT_ONCE = 64
 _MIN_SCALE = 0.5
 # The distortion moves directions beyond a radius back towards the centre; this share of the radius is used.
 _BEFORE_FOLD = 0.99
@@ -30,11 +31,14 @@ def undistorted_photograph(
     half = np.array(picture.shape[1::-1]) / 2
     focal = _focal_px(half, focal_px, radial)
     x, y = (np.arange(side) + 0.5 - side / 2 for side in picture.shape[1::-1])
-    factor = focal_px / focal * (1 + radial * (x**2 + y[:, None] ** 2) / focal**2)
-    at_x = (factor * x + half[0] - 0.5).astype(np.float32)
-    at_y = (factor * y[:, None] + half[1] - 0.5).astype(np.float32)
-    straight = cv2.remap(picture, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(straight, np.uint8), focal
+    straight = np.empty_like(picture)
+    for start in range(0, len(y), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        factor = focal_px / focal * (1 + radial * (x**2 + y[rows, None] ** 2) / focal**2)
+        at_x = (factor * x + half[0] - 0.5).astype(np.float32)
+        at_y = (factor * y[rows, None] + half[1] - 0.5).astype(np.float32)
+        straight[rows] = cv2.remap(picture, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return straight, focal
 
 
 def _focal_px(half: NDArray[np.float64], focal_px: float, radial: float) -> float:

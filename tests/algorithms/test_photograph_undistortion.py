@@ -25,7 +25,7 @@ def test_the_result_is_what_a_pinhole_camera_shows(radial: float) -> None:
     assert np.abs(found - expected).mean() < 0.6 * min(moved)
 
 
-@pytest.mark.parametrize("radial", [-0.4, -0.1, 0.1, 0.4])
+@pytest.mark.parametrize("radial", [-0.25, -0.1, 0.1, 0.4])
 @pytest.mark.parametrize("size_hw", [(90, 120), (120, 90)])
 def test_every_pixel_is_inside_the_photograph_and_no_field_of_view_is_wasted(
     radial: float, size_hw: tuple[int, int]
@@ -37,13 +37,14 @@ def test_every_pixel_is_inside_the_photograph_and_no_field_of_view_is_wasted(
     plane = border * half / focal_px
     seen = np.abs(FOCAL_PX * plane * (1 + radial * (plane**2).sum(axis=1, keepdims=True))) / half
     assert seen.max() <= 1 + 1e-9
-    assert seen.max() > 1 - 1e-9 or focal_px * half.max() < FOCAL_PX * half.max()
+    assert seen.max() > 1 - 1e-9
 
 
 def test_strong_distortion_does_not_fold_the_result() -> None:
     focal_px = undistorted_photograph(np.zeros((*SIZE_HW, 3), np.uint8), focal_px=60.0, radial=-0.5)[1]
     radii = np.linspace(0, np.hypot(*SIZE_HW) / 2 / focal_px, 100)
     assert (np.diff(radii * (1 - 0.5 * radii**2)) > 0).all()
+    assert radii[-1] > 0.98 / np.sqrt(1.5)  # as far as it can be used
 
 
 def test_a_pinhole_photograph_stays_as_it_is() -> None:
