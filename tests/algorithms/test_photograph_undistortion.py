@@ -40,11 +40,12 @@ def test_every_pixel_is_inside_the_photograph_and_no_field_of_view_is_wasted(
     assert seen.max() > 1 - 1e-9
 
 
-def test_strong_distortion_does_not_fold_the_result() -> None:
-    focal_px = undistorted_photograph(np.zeros((*SIZE_HW, 3), np.uint8), focal_px=60.0, radial=-0.5)[1]
+@pytest.mark.parametrize(("taken_px", "radial"), [(60.0, -0.5), (100.0, -0.5)])
+def test_strong_distortion_does_not_fold_the_result(taken_px: float, radial: float) -> None:
+    focal_px = undistorted_photograph(np.zeros((*SIZE_HW, 3), np.uint8), focal_px=taken_px, radial=radial)[1]
     radii = np.linspace(0, np.hypot(*SIZE_HW) / 2 / focal_px, 100)
-    assert (np.diff(radii * (1 - 0.5 * radii**2)) > 0).all()
-    assert radii[-1] > 0.98 / np.sqrt(1.5)  # as far as it can be used
+    assert (np.diff(radii * (1 + radial * radii**2)) > 0).all()
+    assert radii[-1] > 0.98 / np.sqrt(-3 * radial)  # as far as it can be used
 
 
 def test_a_pinhole_photograph_stays_as_it_is() -> None:
