@@ -44,7 +44,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "phone"
     folder.mkdir()
-    panorama = render(default_room(), Rigid3.from_center(np.eye(3), np.array([0.2, 0.1, 0.1])), (512, 1024))[0]
+    panorama = render(
+        default_room(), Rigid3.from_center(np.eye(3), np.array([0.2, 0.1, 0.1])), (512, 1024), supersample=1
+    )[0]
     view = PinholeView(TURN, FOCAL_PX, np.array(PHOTO_HW[::-1]) / 2, PHOTO_HW)
     Image.fromarray(face_image(panorama, view)).save(folder / "2.png")
     Image.new("RGB", PHOTO_HW[::-1]).save(folder / "10.jpg")

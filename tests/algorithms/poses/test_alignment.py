@@ -114,7 +114,7 @@ def room() -> Room:
     rng = np.random.default_rng(6)
     centers = np.array([[0, 0, 0], [0.4, 0.1, 0.2], [-0.3, -0.1, 0.3], [0.1, 0.2, -0.4]])
     cameras = {f"{n}.png": Rigid3.from_center(random_rotation(rng), center) for n, center in enumerate(centers)}
-    views = [render(default_room(1), camera, SIZE_HW) for camera in cameras.values()]
+    views = [render(default_room(1), camera, SIZE_HW, supersample=1) for camera in cameras.values()]
     pictures = {name: (image, np.ones(SIZE_HW, np.bool_)) for name, (image, _) in zip(cameras, views, strict=True)}
     first = next(iter(cameras.values()))
     x, y = rng.integers(0, SIZE_HW[1], 1500), rng.integers(20, SIZE_HW[0] - 20, 1500)
