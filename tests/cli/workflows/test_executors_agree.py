@@ -14,8 +14,7 @@ from tests.cli.conftest import SMALL, deliverables
 
 WAYS = {
     "serial": ("--executor", "serial", "--threads-per-worker", "2"),
-    "two": ("--executor", "processes", "--workers", "2"),
-    "three": ("--executor", "processes", "--workers", "3", "--threads-per-worker", "1"),
+    "two": ("--executor", "processes", "--workers", "2", "--threads-per-worker", "1"),
     "dask": ("--executor", "dask", "--workers", "2"),
 }
 

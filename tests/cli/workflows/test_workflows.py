@@ -149,6 +149,7 @@ def test_second_run_computes_nothing_and_separate_stores_agree(pano_mvs: Command
     assert scores["median_pair_error_deg"] < 1e-6, "known poses do not move"
 
 
+@pytest.mark.slow
 def test_touching_one_image_under_known_poses_runs_exactly_its_units(pano_mvs: Command, capture: Path) -> None:
     limits = ("--set", "views.sources=2", "--set", "depth.near=0.4", "--set", "depth.far=6")
     arguments = ("known_poses", *known(capture), *limits)
