@@ -63,11 +63,11 @@ def squeezed_keypoints(image: NDArray[np.uint8], mask: NDArray[np.bool_], *, squ
     bearings, descriptors = [np.zeros((0, 3))], [np.zeros((0, 128), np.float32)]
     for turn in range(_TILES):
         tile = _tile(turn, image.shape[1])
-        keypoints, described = detector.detectAndCompute(_squeezed(sample_view(gray, tile), squeeze), None)
+        picture = _squeezed(sample_view(gray, tile), squeeze)
+        keypoints, described = detector.detectAndCompute(picture, None)
         if described is None:
             continue
-        width = _squeezed_width(tile, squeeze)
-        pixels = (np.array([k.pt for k in keypoints]) + 0.5) * (tile.size_hw[1] / width, 1.0)
+        pixels = (np.array([k.pt for k in keypoints]) + 0.5) * (tile.size_hw[1] / picture.shape[1], 1.0)
         rays = tile.bearings_from_pixels(pixels)
         in_view = rays @ tile.view_from_cam.T
         kept = np.abs(np.arctan2(in_view[:, 0], in_view[:, 2])) < np.deg2rad(_OWNED_DEG)
@@ -150,10 +150,6 @@ def _tile(turn: int, width: int) -> PinholeView:
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     tile_from_cam = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
     return PinholeView(tile_from_cam, focal_px, np.full(2, side / 2), (side, side))
-
-
-def _squeezed_width(tile: PinholeView, squeeze: float) -> int:
-    return max(2, round(tile.size_hw[1] / squeeze))
 
 
 def _squeezed(picture: NDArray[np.uint8], squeeze: float) -> NDArray[np.uint8]:
