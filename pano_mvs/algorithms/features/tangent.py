@@ -28,7 +28,7 @@ _SIFT_EDGE_RATIO = 20
 # Distance from masked pixels, in key point sizes: SIFT's patch extends three sizes from its centre, with decreasing
 # weights, with less than a quarter of the weight beyond this distance; ORB's extends half a size plus a tenth for
 # smoothing.
-_SIFT_CLEARANCE, _ORB_CLEARANCE = 1.5, 0.6
+SIFT_CLEARANCE, _ORB_CLEARANCE = 1.5, 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def extract_sift(
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
         return _Found(pixels, *_sizes_and_scores(keypoints), root_sift(described) if root else described)
 
-    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=_SIFT_CLEARANCE)
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=SIFT_CLEARANCE)
 
 
 @checks_settings

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
-from pano_mvs.algorithms.matching.nearest_two import nearest_two
+from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
@@ -54,12 +54,31 @@ def match_l2(
     first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = 0.8, mutual: bool = True
 ) -> NDArray[np.int32]:
     """Match descriptors, (N, D) and (M, D), by Euclidean distance; see `match_features`."""
-    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
-    found = nearest_two_integers(first, second) if whole else nearest_two(first, second)
+    found = nearest_descriptors(first, second)
     kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)
     if mutual:
         kept &= found.squared <= found.squared_back[found.nearest]
-    return _one_to_one(np.flatnonzero(kept), found.nearest, found.squared, mutual=mutual)
+    return _matches(np.flatnonzero(kept), found.nearest, found.squared, mutual=mutual)
+
+
+def nearest_descriptors(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
+    """Return the two nearest of M ≥ 2 descriptors (M, D) for each of (N, D), by exact integers where possible."""
+    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
+    return nearest_two_integers(first, second) if whole else nearest_two(first, second)
+
+
+def one_to_one(kept: NDArray[np.intp], nearest: NDArray[np.intp], distance: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return matches (M, 2), only the first of several equally near ones of a second key point.
+
+    Args:
+        kept: (K,) positions of the first image's key points that are matched.
+        nearest: (N,) their nearest key points in the second image.
+        distance: (N,) to these.
+    """
+    by_distance = kept[np.argsort(distance[kept], kind="stable")]
+    _, first_use = np.unique(nearest[by_distance], return_index=True)
+    kept = np.sort(by_distance[first_use])
+    return np.stack([kept, nearest[kept]], axis=1).astype(np.int32)
 
 
 def _match_hamming(
@@ -74,15 +93,10 @@ def _match_hamming(
         back = cv2.BFMatcher(cv2.NORM_HAMMING).match(second, first)
         best_of_column = np.array([match.distance for match in back], np.float32)
         kept &= distance <= best_of_column[nearest]
-    return _one_to_one(np.flatnonzero(kept), nearest, distance, mutual=mutual)
+    return _matches(np.flatnonzero(kept), nearest, distance, mutual=mutual)
 
 
-def _one_to_one(
+def _matches(
     kept: NDArray[np.intp], nearest: NDArray[np.intp], distance: NDArray[np.float32], *, mutual: bool
 ) -> NDArray[np.int32]:
-    """Return the matches; if mutual, only the first of several equally near ones of a second key point."""
-    if mutual:
-        by_distance = kept[np.argsort(distance[kept], kind="stable")]
-        _, first_use = np.unique(nearest[by_distance], return_index=True)
-        kept = np.sort(by_distance[first_use])
-    return np.stack([kept, nearest[kept]], axis=1).astype(np.int32)
+    return one_to_one(kept, nearest, distance) if mutual else np.stack([kept, nearest[kept]], axis=1).astype(np.int32)

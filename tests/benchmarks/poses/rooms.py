@@ -4,8 +4,9 @@ Run it with `python -m tests.benchmarks.poses.rooms --seeds 0 1 2`.
 
 The captures are houses whose rooms see each other through doors only (`house_of_rooms`), the same houses with the first
 and the last room furnished alike ("twins"), and places with repeated structure (`tests.repeating.places`). Each is
-solved and verified twice, with and without `matches.bridges` and `join_rooms`. The table has the groups, the cameras
-that are right within their group (see `placements`), wrong, doubted, and wrong without being doubted, and CPU-seconds.
+solved and verified three times: without joining, and with `matches.bridges` and `join_rooms`, without and with squeezed
+tiles. The table has the groups, the cameras that are right within their group (see `placements`), wrong, doubted, and
+wrong without being doubted, and CPU-seconds.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ Views = dict[tuple[str, str], TwoView]
 Truth = dict[str, Rigid3]
 
 KINDS = ("house", "twins", "turned", *REPEATS)
+WAYS = ("apart", "joined", "squeezed")
 
 
 def capture(kind: str, seed: int, width: int, folder: Path) -> tuple[Pictures, Truth]:
@@ -61,32 +63,36 @@ def _place(kind: str, seed: int) -> House | Scene:
     return House(seed=seed, twins=kind == "twins", turned=kind == "turned")
 
 
-def solved(pictures: Pictures, features: dict[str, Features], views: Views, *, join: bool) -> Poses:
-    """Return verified poses, with or without joining groups."""
+def solved(pictures: Pictures, features: dict[str, Features], views: Views, *, way: str) -> Poses:
+    """Return verified poses without joining groups, or with it, then with or without squeezed tiles."""
 
     def load(name: str) -> Picture:
         return pictures[name], np.ones(pictures[name].shape[:2], np.bool_)
 
-    if join:
-        views = {**views, **find_bridges(features, views, rng=np.random.default_rng(SEED)).two_views}
+    if way != "apart":
+        load_tiles = load if way == "squeezed" else None
+        found = find_bridges(features, views, rng=np.random.default_rng(SEED), load=load_tiles)
+        views = {**views, **found.two_views}
     rng = np.random.default_rng(SEED)
-    poses = solve_scaled_translation(features, views, join_rooms=join, load=load, rng=rng)
+    poses = solve_scaled_translation(features, views, join_rooms=way != "apart", load=load, rng=rng)
     return verify_poses(poses, load, features=features, two_views=views)
 
 
-def rows(kind: str, seed: int, width: int, folder: Path) -> Iterator[tuple[bool, list[int], float]]:
-    """Yield, without and with joining, the numbers of a capture and the CPU-seconds."""
+def rows(
+    kind: str, seed: int, *, width: int, folder: Path, ways: Sequence[str]
+) -> Iterator[tuple[str, list[int], float]]:
+    """Yield the numbers of a capture and the CPU-seconds for each way of solving it."""
     pictures, truth = capture(kind, seed, width, folder)
     features, views = matched(pictures)
-    for join in (False, True):
+    for way in ways:
         start = time.process_time()
-        poses = solved(pictures, features, views, join=join)
+        poses = solved(pictures, features, views, way=way)
         cpu_s = time.process_time() - start
         placed = judge_placements(poses, truth)
         right, wrong = int(placed.right.sum()), int((~placed.right).sum())
         doubted = int(placed.doubted.sum())
         unreported = len(placed.unreported)
-        yield join, [len(truth), len(poses.worlds), right, wrong, doubted, unreported], cpu_s
+        yield way, [len(truth), len(poses.worlds), right, wrong, doubted, unreported], cpu_s
 
 
 def main() -> None:
@@ -95,20 +101,22 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=["house", "twins", "colonnade"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--width", type=int, default=1024, help="width of the pictures in pixels")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     parser.add_argument("--work", type=Path, help="folder for pictures; by default a temporary one")
     options = parser.parse_args()
-    print("place        seed joined  views groups right wrong doubted unreported  CPU-s")
-    total = {False: np.zeros(6, int), True: np.zeros(6, int)}
+    print("place        seed way       views groups right wrong doubted unreported  CPU-s")
+    total = {way: np.zeros(6, int) for way in options.ways}
     with tempfile.TemporaryDirectory() as temporary:
         for kind in options.kinds:
             for seed in options.seeds:
-                for join, numbers, cpu_s in rows(kind, seed, options.width, options.work or Path(temporary)):
+                folder = options.work or Path(temporary)
+                for way, numbers, cpu_s in rows(kind, seed, width=options.width, folder=folder, ways=options.ways):
                     views, groups, right, wrong, doubted, unreported = numbers
-                    total[join] += numbers
-                    label = f"{kind:12s} {seed:4d} {'yes' if join else 'no':6s} {views:6d} {groups:6d} {right:5d}"
+                    total[way] += numbers
+                    label = f"{kind:12s} {seed:4d} {way:8s} {views:6d} {groups:6d} {right:5d}"
                     print(f"{label} {wrong:5d} {doubted:7d} {unreported:10d} {cpu_s:6.1f}", flush=True)
-    for join, sums in total.items():
-        print(f"all, {'joined' if join else 'apart'}: " + " ".join(map(str, sums)))
+    for way, sums in total.items():
+        print(f"all, {way}: " + " ".join(map(str, sums)))
 
 
 if __name__ == "__main__":

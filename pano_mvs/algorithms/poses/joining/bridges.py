@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import similarities
 from pano_mvs.algorithms.poses.growth import grown_models
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
@@ -17,6 +16,7 @@ from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_
 from pano_mvs.algorithms.poses.joining.further_pairs import further_pairs
 from pano_mvs.algorithms.poses.joining.level_pairs import level_from_world
 from pano_mvs.algorithms.poses.joining.models import are_apart, cross_matches, joined_model
+from pano_mvs.algorithms.poses.joining.pair_matcher import LoadPicture, PairMatcher
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.two_view.cheirality import agreement
@@ -82,6 +82,7 @@ def find_bridges(
     candidates: Annotated[
         int, Setting("number of further images to match each image of a group of at most six images with", ge=0)
     ] = 5,
+    load: LoadPicture | None = None,
 ) -> Bridges:
     """Align groups of images that no reliable pair connects, and return the pairs between them.
 
@@ -101,6 +102,8 @@ def find_bridges(
         threshold_deg: maximum error of a match.
         neighbours: number of most similar groups with which each group is compared.
         candidates: number of further images with which each image of a small group is matched; see `further_pairs`.
+        load: loads an image by its name; images of groups that are compared are then also matched by squeezed tiles
+            (see `squeezed_layers`).
     """
     names = tuple(features)
     if is_linked(names, two_views):
@@ -108,7 +111,7 @@ def find_bridges(
     before = len(local_models(features, two_views))
     if before < 2:
         return Bridges()
-    search = _Search(features, names, rng, significance, threshold_deg, neighbours)
+    search = _Search(features, names, rng, significance, threshold_deg, neighbours, load)
     found = further_pairs(features, two_views, search.similar, candidates=candidates, rng=rng)
     two_views = {**two_views, **found}
     models = local_models(features, two_views)
@@ -167,10 +170,11 @@ class _Search:
     significance: float
     threshold_deg: float
     neighbours: int
+    load: LoadPicture | None
     views: dict[Pair, TwoView] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._matched: dict[tuple[Pair, float], NDArray[np.int32]] = {}
+        self._matcher = PairMatcher(self.features, self.load)
         self.similar = similarities(tuple(self.features.values()))
 
     def join(self, models: list[PlacedModel]) -> tuple[list[PlacedModel], list[Bridge]]:
@@ -249,15 +253,7 @@ class _Search:
         pairs = sorted(
             ((i, j) for i in first.cameras for j in second.cameras), key=lambda pair: (-self.similar[pair], pair)
         )
-        return {pair: self._match(pair, ratio) for pair in pairs[:_PAIRS_OF_GROUPS]}
-
-    def _match(self, pair: Pair, ratio: float) -> NDArray[np.int32]:
-        if pair[0] > pair[1]:
-            return self._match((pair[1], pair[0]), ratio)[:, ::-1]
-        if (pair, ratio) not in self._matched:
-            one, other = (self.features[self.names[image]] for image in pair)
-            self._matched[pair, ratio] = match_features(one, other, ratio=ratio)
-        return self._matched[pair, ratio]
+        return {pair: self._matcher.matches(pair, ratio) for pair in pairs[:_PAIRS_OF_GROUPS]}
 
     def _note_views(self, model: PlacedModel, alignment: Alignment, matches: CrossMatches) -> None:
         """Add the two-view geometries of the pairs that the matches of an alignment connect."""
