@@ -58,6 +58,8 @@ class JointEvidence:
     @property
     def confirms(self) -> bool:
         """Whether the images confirm that the parts are where they are."""
+        if self.contradicting_sr > _MAX_CONTRADICTING * (self.agreeing_sr + self.contradicting_sr):
+            return False  # also where parts see too little of the same surfaces for a contradiction
         return self.agreeing_sr > _MIN_AGREEING_SR and self.density >= _MIN_DENSITY and not self.contradicts
 
 

@@ -10,7 +10,7 @@ import pytest
 from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
-from pano_mvs.algorithms.poses.verification.joints import joint_doubts, joint_evidence, linked_parts
+from pano_mvs.algorithms.poses.verification.joints import JointEvidence, joint_doubts, joint_evidence, linked_parts
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.poses.aliased_capture import view_of
 from tests.algorithms.poses.synthetic_capture import features_from_bearings
@@ -82,6 +82,14 @@ def test_parts_that_see_the_same_and_match_nothing_contradict_each_other(confirm
     evidence = joint_evidence(model, confirmation, ([0, 1], [2, 3]))
     assert evidence.agreeing_sr > 0.5
     assert evidence.contradicts
+
+
+def test_parts_that_see_little_in_common_are_confirmed_only_if_hardly_any_of_it_disagrees() -> None:
+    """A tenth of what both see is too little for a contradiction if that is a small part of the sphere."""
+    assert JointEvidence(agreeing_sr=0.12, contradicting_sr=0.01, density=1.0).confirms
+    unclear = JointEvidence(agreeing_sr=0.12, contradicting_sr=0.018, density=1.0)
+    assert not unclear.contradicts
+    assert not unclear.confirms
 
 
 def test_a_joint_with_another_geometry_is_doubtful(confirmation: Confirmation) -> None:
