@@ -15,8 +15,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.core.text import plural
-from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.geometry import Similarity3
+from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
 from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
@@ -38,6 +37,10 @@ BLOCKS = "blocks"
 """Folder in the output folder in which `pano-mvs run --block-size` computes the blocks."""
 
 _STAGE = "merge"
+_MERGED_NAMES = {
+    *(OUTPUT_MARK, LOCK_NAME, BLOCKS, "cloud.ply", "colmap", "transforms.json", "poses.json"),
+    *("range", "confidence", "uncertainty", "preview"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +81,7 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     blocks = load_blocks(outs, cache)
     if resolved(to) in {resolved(out) for out in outs}:
         raise UsageError(f"--out {to}: this is one of the blocks. Choose another folder")
-    require_free(to)
+    earlier = require_free(to)
     reference = max(
         range(len(blocks)), key=lambda number: (blocks[number].poses.metric, len(blocks[number].poses.names), -number)
     )
@@ -93,7 +96,9 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     to.mkdir(parents=True, exist_ok=True)
     (to / OUTPUT_MARK).touch()
     with output_lock(to):
-        summary = _written(to, blocks, alignment, merged=merged, similarities=similarities)
+        files = MergeFiles(to, blocks, similarities, merged)
+        summary = _written(files, alignment)
+        files.remove_stale(earlier)
         summary = summary.model_copy(
             update={
                 "started": started.isoformat(timespec="seconds"),
@@ -107,41 +112,35 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     return MergeResult(summary, tuple(blocks), alignment, merged)
 
 
-def require_free(to: Path) -> None:
-    """Check that merged results may be written to a folder.
+def require_free(to: Path) -> RunSummary:
+    """Check that merged results may be written to a folder, and return what an earlier merge states about them.
 
     Raises:
         UsageError: if it is not a folder, or holds anything but the result of an earlier merge and its blocks.
     """
     if not exists(to):
-        return
+        return RunSummary()
     if not is_folder(to):
         raise UsageError(f"--out {to}: this is not a folder. Choose another one")
-    if all(path.name in {OUTPUT_MARK, BLOCKS} for path in children(to)):
-        return
+    names = {path.name for path in children(to) if not path.name.startswith(".tmp-")}
+    # Without run.json, these are of a merge that was interrupted.
+    if names <= {OUTPUT_MARK, LOCK_NAME, BLOCKS} or (OUTPUT_MARK in names and names <= _MERGED_NAMES):
+        return RunSummary()
     try:
         earlier = RunSummary.read(to)
-        is_merged = earlier.merged is not None or earlier.workflow.name == _STAGE
     except InputError:
-        is_merged = False
-    if not is_merged:
+        earlier = RunSummary()
+    if earlier.merged is None and earlier.workflow.name != _STAGE:
         raise UsageError(f"--out {to}: the folder holds something else. Choose a new or an empty one")
+    return earlier
 
 
-def _written(
-    to: Path,
-    blocks: Sequence[Block],
-    alignment: BlockAlignment,
-    *,
-    merged: MergedBlocks,
-    similarities: Sequence[Similarity3],
-) -> RunSummary:
+def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
     """Write all files except run.json and the report, and return the summary."""
-    files = MergeFiles(to, blocks, similarities, merged)
+    blocks, poses = files.blocks, files.merged.poses
     points = files.write_cloud()
-    files.write_model()
+    files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    poses = merged.poses
     notes = _notes(blocks, alignment)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     is_doubted = bool(doubts) or any(is_doubtful(link) for link in alignment.links)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.merging.files import MergeFiles
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
 from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
@@ -163,6 +165,67 @@ def test_folders_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> 
         merge_outputs([block, folder / "block_1"], tmp_path / "mine")
     with pytest.raises(InputError, match=r"run\.json cannot be read"):
         merge_outputs([block, tmp_path / "mine"], tmp_path / "merged")
+
+
+def _changed(out: Path, **fields: object) -> None:
+    RunSummary.read(out).model_copy(update=fields).write(out)
+
+
+def test_files_of_an_earlier_merge_do_not_stay_beside_those_of_another_world(tmp_path: Path) -> None:
+    """A range map of an image that is gone, and a cloud that no block has, stayed in the merged folder."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs, merged = [tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged"
+    merge_outputs(outs, merged)
+    (merged / "range/mine.tiff").write_bytes(b"x")
+    shutil.rmtree(outs[1])
+    write_block(outs[1], list(range(7, 19)), some_world(5))
+    for out in outs:
+        _changed(out, left_over={"cloud.ply": "digest"})
+    result = merge_outputs(outs, merged)
+    assert result.summary.cloud.points is None
+    assert not (merged / "cloud.ply").exists()
+    assert "ply_file_path" not in json.loads((merged / "transforms.json").read_text())
+    left = {f"{number:03d}.tiff" for number in range(19)}
+    assert {path.name for path in (merged / "range").iterdir()} == left | {"mine.tiff"}
+    assert len(list((merged / "confidence").iterdir())) == 19
+
+
+def test_files_that_a_block_did_not_write_are_not_its_results(tmp_path: Path) -> None:
+    """After `--until poses` with other settings, the cloud and the model of the earlier run are in another world."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    _changed(tmp_path / "block_1", left_over={"cloud.ply": "digest", "range/019.tiff": "digest"})
+    run = load(tmp_path / "block_1")
+    assert run.poses is not None
+    assert run.cloud is None
+    assert run.views["019.png"].range_map is None
+    assert run.views["018.png"].range_map is not None
+    _changed(tmp_path / "block_1", left_over={"colmap/sparse/0/images.bin": "digest"})
+    with pytest.raises(InputError, match=r"block_1: no poses: the cache of the run was deleted"):
+        merge_outputs([tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged")
+
+
+def test_a_merge_that_was_interrupted_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cloud that it had written looked like something else in the folder."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs, merged = [tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged"
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MergeFiles, "write_ranges", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            merge_outputs(outs, merged)
+    assert (merged / "cloud.ply").exists()
+    merge_outputs(outs, merged)
+    assert len(load(merged).views) == 20
+    (merged / "run.json").unlink()
+    (merged / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="holds something else"):
+        merge_outputs(outs, merged)
 
 
 def test_the_images_are_found_through_the_links_of_the_blocks(tmp_path: Path) -> None:
