@@ -25,7 +25,7 @@ def split_command(images: Path, to: Path, division: Division, *, console: Consol
     for block, out in zip(blocks, outs, strict=True):
         console.print(
             f"{escape(str(block.folder))}: {len(block.names)} images\n"
-            f"  pano-mvs run WORKFLOW --images {escape(str(block.folder))} --out {out}",
+            f"  pano-mvs run WORKFLOW --images {escape(shlex.quote(str(block.folder)))} --out {out}",
             highlight=False,
             soft_wrap=True,
         )

@@ -85,11 +85,13 @@ def test_split_prints_the_commands_that_follow(pano_mvs: Command, tmp_path: Path
     (tmp_path / "walk").mkdir()
     for number in range(20):
         (tmp_path / f"walk/{number}.png").write_bytes(b"x")
-    result = pano_mvs("split", tmp_path / "walk", "--out", tmp_path / "blocks", "--size", "12", "--overlap", "4")
+    folder = tmp_path / "my blocks"
+    result = pano_mvs("split", tmp_path / "walk", "--out", folder, "--size", "12", "--overlap", "4")
     assert result.code == 0, result.text
+    assert f"--images '{folder}/block_2' --out out/block_2" in result.text
     assert "--out out/block_2" in result.text
     assert "then: pano-mvs merge out/block_1 out/block_2 --out out/merged" in " ".join(result.text.split())
-    assert (tmp_path / "blocks/block_2/19.png").read_bytes() == b"x"
+    assert (folder / "block_2/19.png").read_bytes() == b"x"
 
 
 @pytest.mark.slow
