@@ -25,12 +25,12 @@ class Block:
     Attributes:
         run: its output.
         poses: of the largest group.
-        left_out: number of cameras in other groups.
+        left_out: names of the cameras in other groups.
     """
 
     run: RunOutput
     poses: Poses
-    left_out: int
+    left_out: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -122,7 +122,7 @@ def _loaded(out: Path, cache: Path | None) -> Block:
         raise InputError(f"{out}: only {len(largest.names)} {plural(len(largest.names), 'image')} has a pose")
     if run.values.poses is None:
         largest = _as_stated(largest, run.summary.poses)
-    return Block(run, largest, sum(len(group.names) for group in others))
+    return Block(run, largest, tuple(name for group in others for name in group.names))
 
 
 def _as_stated(poses: Poses, stated: PosesSummary) -> Poses:

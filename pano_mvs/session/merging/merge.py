@@ -12,15 +12,25 @@ import pano_mvs
 from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks
 from pano_mvs.algorithms.blocks.merging import MergedBlocks, merge_blocks
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
-from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
+from pano_mvs.results.records import (
+    CloudSummary,
+    FailedUnit,
+    ImageReason,
+    MergedSummary,
+    PairLink,
+    ViewSummary,
+    WorkflowSummary,
+)
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import Poses
 from pano_mvs.session.merging.agreement import (
     camera_doubts,
     is_doubtful,
@@ -143,25 +153,58 @@ def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
     views = files.write_ranges()
     notes = _notes(blocks, alignment)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
-    is_doubted = bool(doubts) or any(is_doubtful(link) for link in alignment.links)
+    rejected = _rejected(blocks, poses)
+    warnings = (*_disagreements(blocks, alignment), *_failures(blocks, rejected))
     return RunSummary(
         workflow=WorkflowSummary(name=_STAGE),
         merged=MergedSummary(blocks=tuple(str(resolved(block.run.out)) for block in blocks), images=_images(blocks)),
         version=pano_mvs.__version__,
-        exit_code=3 if is_doubted or poses.rejected else 0,
-        rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.rejected.items()},
+        exit_code=3 if doubts or rejected or warnings else 0,
+        rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in rejected.items()},
         doubts=doubts,
-        warnings=tuple(
-            f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
-            for link in alignment.links
-            if is_doubtful(link)
-        ),
+        warnings=warnings,
         notes=notes,
-        poses=poses_summary(poses, rejected=poses.rejected, doubts=poses.doubts, links=_links(blocks)),
+        poses=poses_summary(poses, rejected=rejected, doubts=poses.doubts, links=_links(blocks)),
         views=tuple[ViewSummary, ...](views),
         cloud=CloudSummary(points=points or None),
         versions=dict(_latest_versions(blocks)),
     )
+
+
+def _rejected(blocks: Sequence[Block], poses: Poses) -> dict[str, str]:
+    """Return the images without a pose in the result, with the reason, in the order of the capture."""
+    found, registered = dict(poses.rejected), {*poses.names}
+    for block in blocks:
+        why = dict.fromkeys(block.left_out, f"it is in a smaller group of the poses of {block.name}")
+        why |= {unit.item: unit.cause for unit in block.run.summary.failures if _is_image(unit)}
+        found |= {name: reason for name, reason in why.items() if name not in registered and name not in found}
+    return dict(sorted(found.items(), key=lambda item: natural_key(item[0])))
+
+
+def _is_image(unit: FailedUnit) -> bool:
+    return bool(unit.item) and PAIR_SEPARATOR not in unit.item
+
+
+def _disagreements(blocks: Sequence[Block], alignment: BlockAlignment) -> list[str]:
+    return [
+        f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
+        for link in alignment.links
+        if is_doubtful(link)
+    ]
+
+
+def _failures(blocks: Sequence[Block], rejected: Mapping[str, str]) -> list[str]:
+    """Return what failed in each block, apart from images without a pose."""
+    found = []
+    for block in blocks:
+        failed = [unit for unit in block.run.summary.failures if unit.item not in rejected]
+        if failed:
+            first = failed[0]
+            unit = f"{first.stage}:{first.item}" if first.item else first.stage
+            found.append(
+                f"{block.name}: {len(failed)} {plural(len(failed), 'unit')} failed, such as {unit}: {first.cause}"
+            )
+    return found
 
 
 def _images(blocks: Sequence[Block]) -> str:
@@ -184,10 +227,10 @@ def _notes(blocks: Sequence[Block], alignment: BlockAlignment) -> tuple[str, ...
         for link in alignment.links
     ]
     for block in blocks:
-        if block.left_out:
+        if count := len(block.left_out):
             notes.append(
-                f"{block.name}: {block.left_out} {plural(block.left_out, 'camera')} in smaller groups of its poses "
-                f"{plural(block.left_out, 'is', 'are')} not merged"
+                f"{block.name}: {count} {plural(count, 'camera')} in smaller groups of its poses "
+                f"{plural(count, 'is', 'are')} not merged"
             )
     return (*notes, *scale_notes(blocks, alignment))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
-from pano_mvs.results.records import StageOutcome
+from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.merging.block import load_blocks
 from pano_mvs.session.merging.files import MergeFiles
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
@@ -204,6 +206,39 @@ def test_files_that_a_block_did_not_write_are_not_its_results(tmp_path: Path) ->
     _changed(tmp_path / "block_1", left_over={"colmap/sparse/0/images.bin": "digest"})
     with pytest.raises(InputError, match=r"block_1: no poses: the cache of the run was deleted"):
         merge_outputs([tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged")
+
+
+def test_what_failed_in_a_block_is_in_the_merged_results(tmp_path: Path) -> None:
+    """An image that could not be read was missing without a word."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs = [tmp_path / "block_0", tmp_path / "block_1"]
+    lost = FailedUnit(stage="images", item="003b.png", cause="it is damaged")
+    elsewhere = FailedUnit(stage="matches", item="003.png | 011.png", cause="out of memory")
+    _changed(outs[0], failures=(lost, elsewhere))
+    _changed(outs[1], failures=(FailedUnit(stage="features", item="008.png", cause="not a JPEG"),))
+    summary = merge_outputs(outs, tmp_path / "merged").summary
+    assert {name: why.reason for name, why in summary.rejected.items()} == {"003b.png": "it is damaged"}
+    assert summary.poses.rejected == {"003b.png": "it is damaged"}
+    assert summary.warnings == (
+        f"{outs[0]}: 1 unit failed, such as matches:003.png | 011.png: out of memory",
+        f"{outs[1]}: 1 unit failed, such as features:008.png: not a JPEG",
+    )
+    assert summary.exit_code == 3
+
+
+def test_cameras_in_a_smaller_group_of_a_block_are_left_out_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    blocks = load_blocks([tmp_path / "block_0", tmp_path / "block_1"])
+    apart = [replace(blocks[0], left_out=("000b.png", "008.png")), blocks[1]]
+    monkeypatch.setattr("pano_mvs.session.merging.merge.load_blocks", lambda *_: apart)
+    summary = merge_outputs([block.run.out for block in blocks], tmp_path / "merged").summary
+    reason = f"it is in a smaller group of the poses of {tmp_path / 'block_0'}"
+    assert {name: why.reason for name, why in summary.rejected.items()} == {"000b.png": reason}, "008.png is in block_1"
+    assert summary.exit_code == 3
 
 
 def test_a_merge_that_was_interrupted_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
