@@ -105,6 +105,7 @@ def test_the_merged_folder_is_the_output_of_a_run(folder: Path, merged: MergeRes
     assert len(run.poses.names) == 30
     assert len(run.views) == 30
     assert run.summary.verdict is not None
+    assert run.summary.verdict.sentence == "Merged from 3 blocks."
     assert sum("common cameras; positions differ by" in note for note in run.summary.notes) == 3
     links = {(link.first, link.second) for link in run.summary.poses.links}
     assert len(links) == len(run.summary.poses.links) >= 29
