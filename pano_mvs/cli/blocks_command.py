@@ -81,8 +81,9 @@ def run_in_blocks(
                 return code
         if early := [run.name for run, code in zip(runs, codes, strict=True) if _is_early(code)]:
             console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")
-            return max(codes)
-        return max(*codes, _merge(session, runs, console))
+            return max(filter(_is_early, codes))
+        merged = _merge(session, runs, console)
+        return merged if _is_early(merged) else max(*codes, merged)
 
 
 def _is_early(code: int) -> bool:

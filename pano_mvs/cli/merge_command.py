@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.core.text import plural
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.merging.split import Division, split_images
 
@@ -25,7 +26,7 @@ def split_command(images: Path, to: Path, division: Division, *, console: Consol
     for block, out in zip(blocks, outs, strict=True):
         console.print(
             f"{escape(str(block.folder))}: {len(block.names)} images\n"
-            f"  pano-mvs run WORKFLOW --images {escape(str(block.folder))} --out {out}",
+            f"  pano-mvs run WORKFLOW --images {escape(shlex.quote(str(block.folder)))} --out {out}",
             highlight=False,
             soft_wrap=True,
         )
@@ -46,6 +47,10 @@ def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None
         console.print(escape(text), highlight=False, soft_wrap=True)
     for text in summary.warnings:
         console.print(f"warning: {escape(text)}", highlight=False, soft_wrap=True)
+    if count := len(summary.rejected):
+        name, why = next(iter(summary.rejected.items()))
+        text = f"{count} {plural(count, 'image')} without a pose, such as {name}: {why.reason}"
+        console.print(escape(text), highlight=False, soft_wrap=True)
     points = f", cloud of {summary.cloud.points:,} points" if summary.cloud.points else ""
     console.print(
         f"{len(summary.poses.registered)} cameras, {summary.poses.points:,} sparse points, {len(summary.views)} range "

@@ -59,7 +59,7 @@ class RunOutput:
     def poses(self) -> Poses | None:
         """The camera poses."""
         poses = self.values.poses
-        if poses is None and is_folder(self.out / "colmap"):
+        if poses is None and is_folder(self.out / "colmap") and not self._has_old_model():
             groups = read_groups(self.out)
             poses = join_groups(groups) if len(groups) > 1 else groups[0]
         return poses
@@ -68,9 +68,9 @@ class RunOutput:
     def cloud(self) -> PointCloud | None:
         """The fused cloud; of several groups of cameras, `cloud.groups()` has the cloud of each."""
         cloud = self.values.cloud
-        files = [self.out / group_file("cloud.ply", group) for group in range(max(1, len(self.summary.poses.groups)))]
-        if cloud is None and all(is_file(path) for path in files):
-            clouds = [read_ply(path) for path in files]
+        files = [group_file("cloud.ply", group) for group in range(max(1, len(self.summary.poses.groups)))]
+        if cloud is None and all(self.has_file(name) for name in files):
+            clouds = [read_ply(self.out / name) for name in files]
             cloud = PointCloud.of_groups(clouds) if len(clouds) > 1 else clouds[0]
         return cloud
 
@@ -78,6 +78,19 @@ class RunOutput:
     def views(self) -> Views:
         """The views with a range map, by the names of their images."""
         return Views(self)
+
+    def has_file(self, name: str) -> bool:
+        """Return whether a file is in the output folder and not left over from an earlier run.
+
+        Args:
+            name: path relative to the output folder.
+        """
+        return name not in self.summary.left_over and is_file(self.out / name)
+
+    def _has_old_model(self) -> bool:
+        """Return whether the COLMAP model is left over from an earlier run."""
+        models = [any(name.startswith("colmap/") for name in of) for of in (self.summary.left_over, self.summary.files)]
+        return models == [True, False]
 
     def __repr__(self) -> str:
         """Return the folder, the workflow, and how the run ended."""
@@ -187,9 +200,8 @@ class RunView:
 
     def _exported(self, folder: str, suffix: str) -> Path | None:
         """Return the exported file of the view, which has the image's extension in its name if that is necessary."""
-        root = self._run.out / folder
-        candidates = (root / f"{self.name}{suffix}", root / PurePosixPath(self.name).with_suffix(suffix))
-        return next((path for path in candidates if is_file(path)), None)
+        candidates = (f"{folder}/{self.name}{suffix}", f"{folder}/{PurePosixPath(self.name).with_suffix(suffix)}")
+        return next((self._run.out / name for name in candidates if self._run.has_file(name)), None)
 
 
 def load(out: str | Path, *, cache: str | Path | None = None) -> RunOutput:

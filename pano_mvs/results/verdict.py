@@ -76,6 +76,8 @@ def _worst(moods: Collection[str]) -> str:
 
 
 def _sentence(summary: RunSummary) -> str:
+    if summary.merged is not None:
+        return f"Merged from {figure(len(summary.merged.blocks))} blocks."
     run, cached, failed = (sum(getattr(s, key) for s in summary.stages) for key in ("run", "cached", "failed"))
     if not run + cached + failed:
         return "There was nothing to compute."

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.core.errors import InputError, PanoMvsError, UsageError
 from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
@@ -124,9 +124,27 @@ def run(
     return run_session(session, Execution(executor, workers or 0), progress or ignore)
 
 
+def _check_not_merged(out: Path) -> None:
+    """Check that a run does not replace the run.json and the report of merged blocks.
+
+    Raises:
+        UsageError: if the folder holds merged blocks.
+    """
+    try:
+        merged = RunSummary.read(out).merged
+    except InputError:
+        return
+    if merged is not None:
+        raise UsageError(
+            f"--out {out}: holds results that were merged from {len(merged.blocks)} blocks, of which a run would "
+            "replace a part. Give --block-size again, or choose another folder"
+        )
+
+
 def run_session(session: Session, execution: Execution = Execution(), progress: Progress = ignore) -> RunOutput:
     """Run an open session; see `run`."""
     check_output(session)
+    _check_not_merged(session.out)
     set_aside_foreign_files(session.out)
     min_free = min_free_bytes(execution.min_free)
     store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)

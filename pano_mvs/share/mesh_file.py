@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.paths import is_file
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
@@ -58,7 +57,7 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
     """
     notes = []
     for name in (TEXTURED, COLORED):
-        if not is_current(run, name):
+        if not run.has_file(name):
             continue
         try:
             mesh = _textured(run) if name == TEXTURED else _colored(run)
@@ -92,11 +91,6 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
     nearest = cKDTree(mesh.vertices).query(vertices)[1]
     colors = mesh.colors_rgb[nearest] if mesh.colors_rgb is not None else None
     return SharedMesh(vertices.astype(np.float32), faces.astype(np.int32), colors), ""
-
-
-def is_current(run: RunOutput, name: str) -> bool:
-    """Return whether a file is in the output folder and not left over from an earlier run."""
-    return is_file(run.out / name) and name not in run.summary.left_over
 
 
 def _colored(run: RunOutput) -> SharedMesh:

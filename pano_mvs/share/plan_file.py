@@ -15,7 +15,6 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.share.mesh_file import is_current
 from pano_mvs.share.top_view import MAP_PIXELS, MapPlace
 
 PLAN = "floor_plan/floor_plan.json"
@@ -45,7 +44,7 @@ def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap],
         run: the output of a run.
         page_from_world: the frame of the page.
     """
-    if not is_current(run, PLAN):
+    if not run.has_file(PLAN):
         return [], ""
     path = run.out / PLAN
     try:

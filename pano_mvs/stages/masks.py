@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from pano_mvs.api import (
     All,
     Context,
     Each,
+    Near,
     One,
     Panorama,
     Params,
@@ -116,30 +119,28 @@ class MovingParams(Params):
     enabled: bool = Field(default=True, description="false masks nothing")
 
 
-@stage("masks.moving", memory="400MB")
+@stage("masks.moving", memory="400MB", every_image=True)
 def moving(
     image: Each[Panorama],
-    images: All[Panorama],
-    ranges: All[RangeMap],
-    poses: All[Pose],
+    images: Near[Panorama],
+    ranges: Near[RangeMap],
+    poses: Near[Pose],
     params: MovingParams,
     ctx: Context,
 ) -> Panorama:
     """Mask what moves through the scene: people and vehicles that contradict the other views.
 
     Use it after filters.consistency. The stages after it, such as fusion and exports, ignore what it masks. Images
-    without a pose or ranges, and those with fewer than two others around them, stay as they are.
+    without a pose or ranges, and those with fewer than two neighbours, stay as they are.
     """
     ctx.metric("masked", 0.0)
-    name = next((name for name, other in images.items() if other.image == image.image), None)
-    if not params.enabled or name is None or name not in ranges or name not in poses:
+    if not params.enabled or not images or images[0].image != image.image:
         return image
-    near = _nearest(name, {other: poses[other] for other in poses if other in ranges and other in images})
     picture, valid = reduced_to_width(image.load(), image.load_mask())
     found = moving_pixels(
         picture,
-        _sampled(ranges[name], (valid.shape[0], valid.shape[1])),
-        [_other_view(images[other], ranges[other], poses[other], of=poses[name]) for other in near],
+        _sampled(ranges[0], (valid.shape[0], valid.shape[1])),
+        [_other_view(images[idx], ranges[idx], poses[idx], of=poses[0]) for idx in _nearest(poses)],
         valid=valid,
         **arguments_from(moving_pixels, params),
     )
@@ -149,15 +150,13 @@ def moving(
     return image.with_mask(~_resized(found.pixels, image.size_hw), ctx.scratch)
 
 
-def _nearest(name: str, poses: dict[str, Pose]) -> list[str]:
-    """Return the images of the same group around an image, the nearest first."""
-    own = poses[name]
-    distances = {
-        other: float(np.linalg.norm(pose.cam_from_world.center - own.cam_from_world.center))
-        for other, pose in poses.items()
-        if other != name and pose.group == own.group
-    }
-    return sorted(distances, key=lambda other: (distances[other], other))[:MAX_OTHERS]
+def _nearest(poses: Sequence[Pose]) -> list[int]:
+    """Return the positions of the poses of the same group that are nearest to the first one, the nearest first."""
+    own, *others = poses
+    center = own.cam_from_world.center
+    distances = [float(np.linalg.norm(pose.cam_from_world.center - center)) for pose in others]
+    around = [idx for idx, pose in enumerate(others, start=1) if pose.group == own.group]
+    return sorted(around, key=lambda idx: distances[idx - 1])[:MAX_OTHERS]
 
 
 def _other_view(image: Panorama, range_map: RangeMap, pose: Pose, *, of: Pose) -> OtherView:

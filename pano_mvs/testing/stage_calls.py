@@ -117,7 +117,8 @@ class StageCase:
             case Cardinality.NAMES:
                 return Names(names)
             case Cardinality.NEAR:
-                return [items[name] for name in (names[:2] if self.spec.output.axis is Axis.PAIR else names[1:])]
+                first = 0 if self.spec.every_image or self.spec.output.axis is Axis.PAIR else 1
+                return [items[name] for name in names[first : 2 if self.spec.output.axis is Axis.PAIR else None]]
         return items[names[0]]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.core.errors import PanoMvsError, RunStoppedError
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.geometry import similarity_from_points
@@ -19,6 +19,7 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
@@ -37,11 +38,13 @@ class Runs:
         seen: block to the images in its folder, in the order of the runs.
         ends: block to the error with which its run ends.
         codes: block to the exit code of its run, if it is not 0.
+        registered: block to the numbers of its images that have a pose, if it is not all of them.
     """
 
     seen: dict[str, list[str]] = field(default_factory=dict)
     ends: dict[str, BaseException] = field(default_factory=dict)
     codes: dict[str, int] = field(default_factory=dict)
+    registered: dict[str, list[int]] = field(default_factory=dict)
 
     def __call__(self, session: Session, *_: Any) -> RunOutput:
         Store(session.store_root)
@@ -51,7 +54,8 @@ class Runs:
         if block in self.ends:
             raise self.ends[block]
         shutil.rmtree(out, ignore_errors=True)
-        write_block(out, [int(name[:3]) for name in self.seen[block]], some_world(int(block[-1])))
+        chosen = self.registered.get(block) or [int(name[:3]) for name in self.seen[block]]
+        write_block(out, chosen, some_world(int(block[-1])))
         stage = StageOutcome(name="images", use="source.folder", params={"path": str(params.path)})
         code = self.codes.get(block, 0)
         update = {"stages": (stage,), "exit_code": code, "stopped": "too few matches" if code == 4 else ""}
@@ -132,6 +136,30 @@ def test_failed_items_of_a_block_are_in_the_exit_code(pano_mvs: Command, runs: R
     assert run_json(Path("out"))["exit_code"] == 0
 
 
+def test_a_failed_merge_is_not_hidden_by_failed_items(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """Exit code 3 says that there are results: the larger of 2 and 3 said so without any."""
+    runs.codes["block_1"] = 3
+    runs.registered["block_3"] = list(range(20, 26))
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--keep-going")
+    result = pano_mvs(*command)
+    assert "out/blocks/block_3: shares 0 registered cameras" in result.flat
+    assert result.code == 2
+    runs.ends["block_3"] = InputError("no images")
+    assert pano_mvs(*command).code == 2
+
+
+def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS).code == 0
+    written = Path("out/run.json").read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pano_mvs.cli.run.command.run_session", run_session)
+        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.code == 2
+    assert "--out out: holds results that were merged from 3 blocks" in result.flat
+    assert "Give --block-size again" in result.flat
+    assert Path("out/run.json").read_bytes() == written
+
+
 def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
     runs.ends["block_2"] = KeyboardInterrupt()
     result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--keep-going")
@@ -141,17 +169,8 @@ def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path
 
 
 def test_blocks_that_cannot_be_merged_are_named(pano_mvs: Command, runs: Runs, walk: Path) -> None:
-
-    def lonely(session: Session, *rest: Any) -> RunOutput:
-        output = runs(session, *rest)
-        if session.out.name == "block_3":
-            shutil.rmtree(session.out)
-            write_block(session.out, list(range(20, 26)), some_world(3))
-        return output
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pano_mvs.cli.run.command.run_session", lonely)
-        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    runs.registered["block_3"] = list(range(20, 26))
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
     assert result.code == 2
     assert "out/blocks/block_3: shares 0 registered cameras" in result.flat
     assert "All blocks have run; their results are in out/blocks" in result.flat

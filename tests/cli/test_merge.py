@@ -11,6 +11,7 @@ from pano_mvs.geometry import ray_grid, similarity_from_points
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.results.records import FailedUnit
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.room import capture_poses, default_room, range_along, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
@@ -27,6 +28,17 @@ def test_merge_prints_the_agreement_and_what_it_wrote(pano_mvs: Command, tmp_pat
     assert "20 cameras," in result.text
     assert "20 range maps, cloud of 3,000 points" in " ".join(words)
     assert str(tmp_path / "both" / "report.html") in "".join(words)
+
+
+def test_merge_names_an_image_that_it_lacks(pano_mvs: Command, tmp_path: Path) -> None:
+    write_block(tmp_path / "one", list(range(12)), some_world(1))
+    write_block(tmp_path / "two", list(range(7, 20)), some_world(2))
+    lost = FailedUnit(stage="images", item="020.png", cause="it is damaged")
+    RunSummary.read(tmp_path / "two").model_copy(update={"failures": (lost,)}).write(tmp_path / "two")
+    result = pano_mvs("merge", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "both")
+    assert result.code == 3
+    assert "1 image without a pose, such as 020.png: it is damaged" in result.flat
+    assert "1 of 21 panoramas has no pose" in (tmp_path / "both/report.html").read_text(encoding="utf-8")
 
 
 def test_merge_of_blocks_without_overlap_ends_with_the_reason(pano_mvs: Command, tmp_path: Path) -> None:
@@ -85,11 +97,13 @@ def test_split_prints_the_commands_that_follow(pano_mvs: Command, tmp_path: Path
     (tmp_path / "walk").mkdir()
     for number in range(20):
         (tmp_path / f"walk/{number}.png").write_bytes(b"x")
-    result = pano_mvs("split", tmp_path / "walk", "--out", tmp_path / "blocks", "--size", "12", "--overlap", "4")
+    folder = tmp_path / "my blocks"
+    result = pano_mvs("split", tmp_path / "walk", "--out", folder, "--size", "12", "--overlap", "4")
     assert result.code == 0, result.text
+    assert f"--images '{folder}/block_2' --out out/block_2" in result.text
     assert "--out out/block_2" in result.text
     assert "then: pano-mvs merge out/block_1 out/block_2 --out out/merged" in " ".join(result.text.split())
-    assert (tmp_path / "blocks/block_2/19.png").read_bytes() == b"x"
+    assert (folder / "block_2/19.png").read_bytes() == b"x"
 
 
 @pytest.mark.slow

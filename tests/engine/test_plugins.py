@@ -221,6 +221,13 @@ def test_an_error_in_a_plugin_that_is_named_by_a_relative_path_has_its_line(
         Registry().add_file(Path("plug.py"))
 
 
+def test_a_stage_for_every_image_needs_neighbours(toy: Toy) -> None:
+    stage = '\n\n@stage("toy.lonely", every_image=True)\ndef lonely(x: Each[Number]) -> Number: ...\n'
+    toy.edit("plug.py", lambda text: text + stage)
+    with pytest.raises(PluginError, match=r"'toy.lonely' .* every_image needs ports annotated Each and Near"):
+        Registry().add_file(toy.folder / "plug.py")
+
+
 def test_what_a_plugin_prints_when_it_is_loaded_is_no_output_of_the_command(
     mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

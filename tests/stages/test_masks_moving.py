@@ -45,7 +45,9 @@ class Capture:
     def masked(self, name: str, folder: Path, **settings: bool) -> NDArray[np.bool_]:
         context = Context(np.random.default_rng(0), folder, 1)
         params = MovingParams(**settings)
-        found = moving(self.images[name], self.images, self.ranges, self.poses, params, context)
+        near = [other for other in dict.fromkeys((name, *CENTERS)) if other in self.ranges and other in self.poses]
+        images, ranges, poses = ([of[other] for other in near] for of in (self.images, self.ranges, self.poses))
+        found = moving(self.images[name], images, ranges, poses, params, context)  # type: ignore[arg-type]
         return ~found.load_mask()
 
 

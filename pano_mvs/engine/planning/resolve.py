@@ -148,7 +148,7 @@ class Resolver:
         return {name: names[name] for name in names if name in self.only}
 
     def _all_names(self) -> Mapping[str, tuple[str, ...]] | None:
-        if INDEX_PORT in self.edges:
+        if INDEX_PORT in self.edges and not self.entry.spec.every_image:
             return self._units_of_index(self.edges[INDEX_PORT])
         if self.axis is Axis.ONE:
             return {WHOLE: ()}
@@ -160,6 +160,14 @@ class Resolver:
         for number, edge in enumerate(leading or each):
             found = self._members(edge)
             names = found if number == 0 else {name: names[name] for name in names if name in found}
+        return self._with_neighbours(names) if INDEX_PORT in self.edges else names
+
+    def _with_neighbours(self, names: dict[str, tuple[str, ...]]) -> Mapping[str, tuple[str, ...]] | None:
+        """Return units of a stage for every image, after `near` has got each image in the index and its neighbours."""
+        views = self._units_of_index(self.edges[INDEX_PORT])
+        if views is None or self.resolution.blocked:
+            return views
+        self.near = {name: (name, *self.near[name]) if name in views else () for name in names}
         return names
 
     def _members(self, edge: Edge) -> dict[str, tuple[str, ...]]:
@@ -237,7 +245,7 @@ class Resolver:
         if edge.port.cardinality is Cardinality.NEAR:
             found = {item: items[item] for item in wanted if item in items}
             missing = next((item for item in self.near[name] if item not in found), "")
-            usable = not missing if self.axis is Axis.PAIR else bool(found)
+            usable = not missing if self.axis is Axis.PAIR else bool(found) or self.entry.spec.every_image
             return (found, "", False) if usable else (None, self._why(edge, state, missing), False)
         if wanted[0] in items:
             return items[wanted[0]], "", False

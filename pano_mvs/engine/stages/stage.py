@@ -66,6 +66,7 @@ class StageSpec:
         extras: name of each argument that is not a port, and its role.
         memory_bytes: memory that one unit needs; 0 if not declared.
         memory_needed: returns the memory that a unit needs, if it depends on settings and inputs.
+        every_image: whether the stage has a unit for images without neighbours as well; see `stage`.
     """
 
     name: str
@@ -80,6 +81,7 @@ class StageSpec:
     extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
     memory_bytes: int = 0
     memory_needed: MemoryNeeded | None = None
+    every_image: bool = False
 
     @property
     def doc(self) -> str:
@@ -116,7 +118,9 @@ class _Signature:
     extras: Mapping[str, Literal["params", "ctx", "item"]]
 
 
-def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) -> Callable[[Function], Function]:
+def stage(
+    name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0, every_image: bool = False
+) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
     The function takes ports annotated `One/Each/Near/All[Kind]`, `params` annotated with a `Params` model (optional),
@@ -125,13 +129,20 @@ def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) 
     unit, pass a function `(params, inputs) -> bytes`, which receives the same values as the stage. It is called in the
     main process, so it must be fast.
 
+    A stage with Near ports has a unit for each view of the index. With `every_image`, it has one for each item of its
+    Each ports instead, so that a stage that returns images loses none. Near ports then begin with the image's own
+    items, if it has them at all Near ports, and are empty for images that are not in the index.
+
     Raises:
         PluginError: if the function does not have the signature of a stage.
     """
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        setattr(function, _ATTRIBUTE, _spec(name, function, signature, version=version, memory=memory))
+        spec = _spec(name, function, signature, version=version, memory=memory)
+        if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
+            raise PluginError(f"stage {name!r} ({spec.origin}): every_image needs ports annotated Each and Near")
+        setattr(function, _ATTRIBUTE, replace(spec, every_image=every_image))
         return function
 
     return decorate

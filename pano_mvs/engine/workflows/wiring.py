@@ -185,7 +185,7 @@ class _Wirer:
         if entry.spec.list_items is not None:
             return Axis.IMAGE
         output = entry.spec.output.axis
-        if INDEX_PORT in edges:
+        if INDEX_PORT in edges and not entry.spec.every_image:
             return Axis.PAIR if output is Axis.PAIR else Axis.VIEW
         fed = [
             Axis.IMAGE if edge.exploded else axes.get(edge.producer, Axis.ONE)

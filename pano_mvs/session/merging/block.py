@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import resolved
 from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.thinning import chunks
@@ -25,12 +25,12 @@ class Block:
     Attributes:
         run: its output.
         poses: of the largest group.
-        left_out: number of cameras in other groups.
+        left_out: names of the cameras in other groups.
     """
 
     run: RunOutput
     poses: Poses
-    left_out: int
+    left_out: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -58,11 +58,15 @@ class Block:
             )
         return sizes
 
+    @property
+    def has_cloud(self) -> bool:
+        """Whether the run has a cloud, in a file or in the cache."""
+        return self.run.has_file("cloud.ply") or self.run.values.cloud is not None
+
     def cloud_parts(self) -> Iterator[PointCloud]:
         """Yield parts of the cloud of the largest group: cloud.ply, or else the cloud in the cache; nothing without."""
-        path = self.run.out / "cloud.ply"
-        if is_file(path):
-            yield from open_ply_points(path).cloud_chunks()
+        if self.run.has_file("cloud.ply"):
+            yield from open_ply_points(self.run.out / "cloud.ply").cloud_chunks()
         elif self.run.values.cloud is not None:
             cloud = self.run.values.cloud.groups()[0]
             for part in chunks(len(cloud)):
@@ -118,7 +122,7 @@ def _loaded(out: Path, cache: Path | None) -> Block:
         raise InputError(f"{out}: only {len(largest.names)} {plural(len(largest.names), 'image')} has a pose")
     if run.values.poses is None:
         largest = _as_stated(largest, run.summary.poses)
-    return Block(run, largest, sum(len(group.names) for group in others))
+    return Block(run, largest, tuple(name for group in others for name in group.names))
 
 
 def _as_stated(poses: Poses, stated: PosesSummary) -> Poses:

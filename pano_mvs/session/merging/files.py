@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,6 +22,7 @@ from pano_mvs.io.nerfstudio.transforms import transforms_document
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.run_output import RunView
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.upright import world_up, z_up_from_world
@@ -37,15 +38,20 @@ class MergeFiles:
         blocks: the blocks.
         world_from_block: the similarity of each.
         merged: the merged cameras.
+        written: files that depend on the images and the stages of the blocks, relative to the folder.
     """
 
     out: Path
     blocks: Sequence[Block]
     world_from_block: Sequence[Similarity3]
     merged: MergedBlocks
+    written: set[str] = field(default_factory=set)
 
-    def write_model(self) -> None:
+    def write_model(self, *, has_cloud: bool) -> None:
         """Write the COLMAP model colmap/sparse/0, transforms.json and poses.json.
+
+        Args:
+            has_cloud: whether cloud.ply was written.
 
         Raises:
             InputError: if the size of an image is unknown.
@@ -68,7 +74,7 @@ class MergeFiles:
             depth_unit=1.0,
             about={"file_from_world": turn.tolist()},
             file_from_world=turn,
-            seed="cloud.ply" if is_file(self.out / "cloud.ply") else "",
+            seed="cloud.ply" if has_cloud else "",
         )
         write_text(self.out / "transforms.json", json.dumps(document, indent=1))
         views = [
@@ -79,11 +85,10 @@ class MergeFiles:
 
     def write_cloud(self) -> int:
         """Write cloud.ply, in which each point is nearest to a camera of its own block; return the number of points."""
-        if not any(is_file(block.run.out / "cloud.ply") or block.run.values.cloud is not None for block in self.blocks):
+        if not any(block.has_cloud for block in self.blocks):
             return 0
         turn = z_up_from_world(world_up(self.merged.poses))
-        path = self.out / "cloud.ply"
-        with replacing(path) as temporary:
+        with replacing(self.out / self._listed("cloud.ply")) as temporary:
             return write_ply_parts(temporary, self._cloud_parts(), quality=True, uncertainty=True, file_from_world=turn)
 
     def write_ranges(self) -> list[ViewSummary]:
@@ -105,17 +110,15 @@ class MergeFiles:
         """Write the range map, confidence and uncertainty of a view; return whether it has a range map."""
         if view.range_map is None:
             return False
-        targets = {
-            folder: self.out / folder / f"{stem}{suffix}"
-            for folder, suffix in (("range", ".tiff"), ("confidence", ".png"), ("uncertainty", ".tiff"))
-        }
-        for path in targets.values():
-            path.parent.mkdir(parents=True, exist_ok=True)
-        write_range_tiff(targets["range"], (view.range_map * np.float32(scale)).astype(np.float32))
+        range_file, confidence_file, uncertainty_file = map_files(stem)
+        for name in map_files(stem):
+            (self.out / name).parent.mkdir(parents=True, exist_ok=True)
+        ranges = (view.range_map * np.float32(scale)).astype(np.float32)
+        write_range_tiff(self.out / self._listed(range_file), ranges)
         if view.confidence is not None:
-            write_confidence_png(targets["confidence"], np.ascontiguousarray(view.confidence))
+            write_confidence_png(self.out / self._listed(confidence_file), np.ascontiguousarray(view.confidence))
         if view.uncertainty is not None:
-            write_range_tiff(targets["uncertainty"], np.ascontiguousarray(view.uncertainty))
+            write_range_tiff(self.out / self._listed(uncertainty_file), np.ascontiguousarray(view.uncertainty))
         return True
 
     def _preview(self, view: RunView, stem: str) -> str:
@@ -123,7 +126,21 @@ class MergeFiles:
             return ""
         name = f"preview/{stem}{view.preview.suffix}"
         (self.out / name).parent.mkdir(parents=True, exist_ok=True)
-        copy_file(view.preview, self.out / name)
+        copy_file(view.preview, self.out / self._listed(name))
+        return name
+
+    def remove_stale(self, earlier: RunSummary) -> None:
+        """Delete files of an earlier merge into the folder that this one has not written: they are in another world."""
+        stems = item_stems(earlier.poses.registered)
+        maps = (name for view in earlier.views if view.name in stems for name in map_files(stems[view.name]))
+        old = {"cloud.ply", *maps, *(view.preview for view in earlier.views if view.preview)}
+        for name in old - self.written:
+            if resolved((self.out / name).parent).is_relative_to(resolved(self.out)):
+                (self.out / name).unlink(missing_ok=True)
+
+    def _listed(self, name: str) -> str:
+        """Return the name of a file that is about to be written."""
+        self.written.add(name)
         return name
 
     def _cloud_parts(self) -> Iterator[PointCloud]:
@@ -139,6 +156,11 @@ class MergeFiles:
         if folder is None or not is_file(folder / name):
             return name
         return PurePosixPath(Path(os.path.relpath(resolved(folder / name), resolved(self.out)))).as_posix()
+
+
+def map_files(stem: str) -> tuple[str, str, str]:
+    """Return the files of the range map, the confidence and the uncertainty of an image."""
+    return f"range/{stem}.tiff", f"confidence/{stem}.png", f"uncertainty/{stem}.tiff"
 
 
 def _frame(path: str, size_hw: tuple[int, int]) -> NerfstudioFrame:

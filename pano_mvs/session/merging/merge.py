@@ -12,16 +12,25 @@ import pano_mvs
 from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks
 from pano_mvs.algorithms.blocks.merging import MergedBlocks, merge_blocks
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.core.text import plural
-from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.geometry import Similarity3
+from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
-from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
+from pano_mvs.results.records import (
+    CloudSummary,
+    FailedUnit,
+    ImageReason,
+    MergedSummary,
+    PairLink,
+    ViewSummary,
+    WorkflowSummary,
+)
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import Poses
 from pano_mvs.session.merging.agreement import (
     camera_doubts,
     is_doubtful,
@@ -38,6 +47,10 @@ BLOCKS = "blocks"
 """Folder in the output folder in which `pano-mvs run --block-size` computes the blocks."""
 
 _STAGE = "merge"
+_MERGED_NAMES = {
+    *(OUTPUT_MARK, LOCK_NAME, BLOCKS, "cloud.ply", "colmap", "transforms.json", "poses.json"),
+    *("range", "confidence", "uncertainty", "preview"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +91,7 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     blocks = load_blocks(outs, cache)
     if resolved(to) in {resolved(out) for out in outs}:
         raise UsageError(f"--out {to}: this is one of the blocks. Choose another folder")
-    require_free(to)
+    earlier = require_free(to)
     reference = max(
         range(len(blocks)), key=lambda number: (blocks[number].poses.metric, len(blocks[number].poses.names), -number)
     )
@@ -93,7 +106,9 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     to.mkdir(parents=True, exist_ok=True)
     (to / OUTPUT_MARK).touch()
     with output_lock(to):
-        summary = _written(to, blocks, alignment, merged=merged, similarities=similarities)
+        files = MergeFiles(to, blocks, similarities, merged)
+        summary = _written(files, alignment)
+        files.remove_stale(earlier)
         summary = summary.model_copy(
             update={
                 "started": started.isoformat(timespec="seconds"),
@@ -107,62 +122,89 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     return MergeResult(summary, tuple(blocks), alignment, merged)
 
 
-def require_free(to: Path) -> None:
-    """Check that merged results may be written to a folder.
+def require_free(to: Path) -> RunSummary:
+    """Check that merged results may be written to a folder, and return what an earlier merge states about them.
 
     Raises:
         UsageError: if it is not a folder, or holds anything but the result of an earlier merge and its blocks.
     """
     if not exists(to):
-        return
+        return RunSummary()
     if not is_folder(to):
         raise UsageError(f"--out {to}: this is not a folder. Choose another one")
-    if all(path.name in {OUTPUT_MARK, BLOCKS} for path in children(to)):
-        return
+    names = {path.name for path in children(to) if not path.name.startswith(".tmp-")}
+    # Without run.json, these are of a merge that was interrupted.
+    if names <= {OUTPUT_MARK, LOCK_NAME, BLOCKS} or (OUTPUT_MARK in names and names <= _MERGED_NAMES):
+        return RunSummary()
     try:
         earlier = RunSummary.read(to)
-        is_merged = earlier.merged is not None or earlier.workflow.name == _STAGE
     except InputError:
-        is_merged = False
-    if not is_merged:
+        earlier = RunSummary()
+    if earlier.merged is None and earlier.workflow.name != _STAGE:
         raise UsageError(f"--out {to}: the folder holds something else. Choose a new or an empty one")
+    return earlier
 
 
-def _written(
-    to: Path,
-    blocks: Sequence[Block],
-    alignment: BlockAlignment,
-    *,
-    merged: MergedBlocks,
-    similarities: Sequence[Similarity3],
-) -> RunSummary:
+def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
     """Write all files except run.json and the report, and return the summary."""
-    files = MergeFiles(to, blocks, similarities, merged)
+    blocks, poses = files.blocks, files.merged.poses
     points = files.write_cloud()
-    files.write_model()
+    files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    poses = merged.poses
     notes = _notes(blocks, alignment)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
-    is_doubted = bool(doubts) or any(is_doubtful(link) for link in alignment.links)
+    rejected = _rejected(blocks, poses)
+    warnings = (*_disagreements(blocks, alignment), *_failures(blocks, rejected))
     return RunSummary(
         workflow=WorkflowSummary(name=_STAGE),
         merged=MergedSummary(blocks=tuple(str(resolved(block.run.out)) for block in blocks), images=_images(blocks)),
         version=pano_mvs.__version__,
-        exit_code=3 if is_doubted or poses.rejected else 0,
-        rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.rejected.items()},
+        exit_code=3 if doubts or rejected or warnings else 0,
+        rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in rejected.items()},
         doubts=doubts,
-        warnings=tuple(
-            f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
-            for link in alignment.links
-            if is_doubtful(link)
-        ),
+        warnings=warnings,
         notes=notes,
-        poses=poses_summary(poses, rejected=poses.rejected, doubts=poses.doubts, links=_links(blocks)),
+        poses=poses_summary(poses, rejected=rejected, doubts=poses.doubts, links=_links(blocks)),
         views=tuple[ViewSummary, ...](views),
         cloud=CloudSummary(points=points or None),
         versions=dict(_latest_versions(blocks)),
     )
+
+
+def _rejected(blocks: Sequence[Block], poses: Poses) -> dict[str, str]:
+    """Return the images without a pose in the result, with the reason, in the order of the capture."""
+    found, registered = dict(poses.rejected), {*poses.names}
+    for block in blocks:
+        why = dict.fromkeys(block.left_out, f"it is in a smaller group of the poses of {block.name}")
+        why |= {unit.item: unit.cause for unit in block.run.summary.failures if _is_image(unit)}
+        found |= {name: reason for name, reason in why.items() if name not in registered and name not in found}
+    return dict(sorted(found.items(), key=lambda item: natural_key(item[0])))
+
+
+def _is_image(unit: FailedUnit) -> bool:
+    return bool(unit.item) and PAIR_SEPARATOR not in unit.item
+
+
+def _disagreements(blocks: Sequence[Block], alignment: BlockAlignment) -> list[str]:
+    return [
+        f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
+        for link in alignment.links
+        if is_doubtful(link)
+    ]
+
+
+def _failures(blocks: Sequence[Block], rejected: Mapping[str, str]) -> list[str]:
+    """Return what failed in each block, apart from images without a pose."""
+    found = []
+    for block in blocks:
+        failed = [unit for unit in block.run.summary.failures if unit.item not in rejected]
+        if failed:
+            first = failed[0]
+            unit = f"{first.stage}:{first.item}" if first.item else first.stage
+            found.append(
+                f"{block.name}: {len(failed)} {plural(len(failed), 'unit')} failed, such as {unit}: {first.cause}"
+            )
+    return found
 
 
 def _images(blocks: Sequence[Block]) -> str:
@@ -185,10 +227,10 @@ def _notes(blocks: Sequence[Block], alignment: BlockAlignment) -> tuple[str, ...
         for link in alignment.links
     ]
     for block in blocks:
-        if block.left_out:
+        if count := len(block.left_out):
             notes.append(
-                f"{block.name}: {block.left_out} {plural(block.left_out, 'camera')} in smaller groups of its poses "
-                f"{plural(block.left_out, 'is', 'are')} not merged"
+                f"{block.name}: {count} {plural(count, 'camera')} in smaller groups of its poses "
+                f"{plural(count, 'is', 'are')} not merged"
             )
     return (*notes, *scale_notes(blocks, alignment))
 

@@ -47,6 +47,7 @@ class Resolved:
             "plus: {use: toy.plus, in: {x: scaled}}",
             "again: {use: toy.scale, in: {x: shifted}}",
             "seen: {use: toy.view, in: {mean: mean, x: shifted}}",
+            "around: {use: toy.around, in: {x: images, near: scaled}}",
         )
         toy.edit("wf.yaml", lambda text: text + "".join(f"  {line}\n" for line in more))
         self.toy = toy
@@ -143,6 +144,23 @@ def test_a_view_does_with_the_neighbours_that_there_are(resolved: Resolved) -> N
     lonely, rest = resolved("mean", views=index, scaled=images("a", "b", "c", "d", "e"))
     assert list(lonely) == ["a", "b", "d"]
     assert rest.blocked == {"c": "needs scaled, which has no result"}
+
+
+def test_a_stage_for_every_image_does_without_neighbours(resolved: Resolved) -> None:
+    index = whole(resolved.store.put_value(Views({"a": ("b", "c"), "c": ("a", "b")})))
+    states = {"images": images("a", "b", "c", "d"), "views": index}
+    units, rest = resolved("around", None, **states, scaled=images("a", "b", "c", "d", failed="c"))
+    assert rest.blocked == {}
+    assert units["a"].inputs == {"x": ref("a"), "near": {"a": ref("a"), "b": ref("b")}}
+    assert units["b"].inputs == {"x": ref("b"), "near": {}}, "it is not in the index"
+    assert units["c"].inputs == {"x": ref("c"), "near": {"a": ref("a"), "b": ref("b")}}, "its own has failed"
+    assert units["d"].inputs == {"x": ref("d"), "near": {}}
+    assert units["a"].members == ("a",)
+    assert resolved.session.graph.axes["around"] is Axis.IMAGE
+    assert resolved("around", None, **states, scaled=images("a", "b", "c", "d", pending="c"))[1].waiting == ["a", "c"]
+    assert resolved("around", None, **{**states, "views": OPEN}, scaled=images("a"))[1].open
+    failed = {**states, "views": whole(None, failed=True)}
+    assert resolved("around", None, **failed, scaled=images("a"))[1].blocked == {WHOLE: "needs views, which failed"}
 
 
 @pytest.mark.parametrize("stage", ["difference", "mean"])

@@ -9,6 +9,7 @@ from pano_mvs.core.errors import InputError, RunStoppedError, StoreError, UsageE
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
+from tests.engine.workflows.test_wiring import MORE
 
 ALL_UNITS = {
     "images": 5,
@@ -42,6 +43,27 @@ def test_values_flow_through_every_cardinality(toy: Toy) -> None:
     assert files["mean/3.txt"] == b"90.0"
     assert b"(('1.txt', '2.txt'), 30.0)" in files["all.txt"]
     assert b"'1.txt': -60.0" in files["all.txt"]
+
+
+def test_a_stage_for_every_image_loses_none_of_them(toy: Toy) -> None:
+    """Images without neighbours, and those whose own item failed, pass through; a unit depends on its neighbours."""
+    toy.edit("plug.py", lambda text: text + MORE)
+    line = "  around:     {use: toy.around, in: {x: images, near: scaled}}\n"
+    toy.edit(
+        "wf.yaml", lambda text: text.replace("by: 3}", "by: 3, on_error: skip}").replace("  mean: ", f"{line}  mean: ")
+    )
+    toy.edit(
+        "wf.yaml", lambda text: text.replace("in: {own: scaled, around: scaled}", "in: {own: around, around: around}")
+    )
+    toy.number("3.txt", "13")
+    result = toy.run()
+    assert ran(result)["around"] == ran(result)["mean"] == 5
+    files = toy.deliverables()
+    around = [10 + 9, 20 + 9, 13 + 6 + 12, 40 + 27, 50 + 27]  # a tenth of own and neighbours; 3.txt has no own
+    assert float(files["mean/1.txt"]) == (around[0] + around[1]) / 2
+    assert float(files["mean/3.txt"]) == (around[1] + around[2] + around[3]) / 3
+    toy.number("5.txt", "51")
+    assert ran(toy.run())["around"] == 2
 
 
 def test_touching_one_item_runs_exactly_what_depends_on_it(toy: Toy) -> None:

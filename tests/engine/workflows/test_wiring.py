@@ -67,6 +67,12 @@ def view(mean: Each[Mean], x: Each[Number]) -> Mean:
     return mean
 
 
+@stage("toy.around", every_image=True)
+def around(x: Each[Number], near: Near[Number]) -> Number:
+    """The number, plus a tenth of the sum of its own and those of its neighbours."""
+    return Number(x.value + sum(other.value for other in near) / 10)
+
+
 @stage("toy.after")
 def after(files: One[Files]) -> Files:
     """Whatever has been written."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,11 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
-from pano_mvs.results.records import StageOutcome
+from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.merging.block import load_blocks
+from pano_mvs.session.merging.files import MergeFiles
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
 from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
@@ -101,6 +105,7 @@ def test_the_merged_folder_is_the_output_of_a_run(folder: Path, merged: MergeRes
     assert len(run.poses.names) == 30
     assert len(run.views) == 30
     assert run.summary.verdict is not None
+    assert run.summary.verdict.sentence == "Merged from 3 blocks."
     assert sum("common cameras; positions differ by" in note for note in run.summary.notes) == 3
     links = {(link.first, link.second) for link in run.summary.poses.links}
     assert len(links) == len(run.summary.poses.links) >= 29
@@ -163,6 +168,100 @@ def test_folders_that_cannot_be_used_are_named(folder: Path, tmp_path: Path) -> 
         merge_outputs([block, folder / "block_1"], tmp_path / "mine")
     with pytest.raises(InputError, match=r"run\.json cannot be read"):
         merge_outputs([block, tmp_path / "mine"], tmp_path / "merged")
+
+
+def _changed(out: Path, **fields: object) -> None:
+    RunSummary.read(out).model_copy(update=fields).write(out)
+
+
+def test_files_of_an_earlier_merge_do_not_stay_beside_those_of_another_world(tmp_path: Path) -> None:
+    """A range map of an image that is gone, and a cloud that no block has, stayed in the merged folder."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs, merged = [tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged"
+    merge_outputs(outs, merged)
+    (merged / "range/mine.tiff").write_bytes(b"x")
+    shutil.rmtree(outs[1])
+    write_block(outs[1], list(range(7, 19)), some_world(5))
+    for out in outs:
+        _changed(out, left_over={"cloud.ply": "digest"})
+    result = merge_outputs(outs, merged)
+    assert result.summary.cloud.points is None
+    assert not (merged / "cloud.ply").exists()
+    assert "ply_file_path" not in json.loads((merged / "transforms.json").read_text())
+    left = {f"{number:03d}.tiff" for number in range(19)}
+    assert {path.name for path in (merged / "range").iterdir()} == left | {"mine.tiff"}
+    assert len(list((merged / "confidence").iterdir())) == 19
+
+
+def test_files_that_a_block_did_not_write_are_not_its_results(tmp_path: Path) -> None:
+    """After `--until poses` with other settings, the cloud and the model of the earlier run are in another world."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    _changed(tmp_path / "block_1", left_over={"cloud.ply": "digest", "range/019.tiff": "digest"})
+    run = load(tmp_path / "block_1")
+    assert run.poses is not None
+    assert run.cloud is None
+    assert run.views["019.png"].range_map is None
+    assert run.views["018.png"].range_map is not None
+    _changed(tmp_path / "block_1", left_over={"colmap/sparse/0/images.bin": "digest"})
+    with pytest.raises(InputError, match=r"block_1: no poses: the cache of the run was deleted"):
+        merge_outputs([tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged")
+
+
+def test_what_failed_in_a_block_is_in_the_merged_results(tmp_path: Path) -> None:
+    """An image that could not be read was missing without a word."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs = [tmp_path / "block_0", tmp_path / "block_1"]
+    lost = FailedUnit(stage="images", item="003b.png", cause="it is damaged")
+    elsewhere = FailedUnit(stage="matches", item="003.png | 011.png", cause="out of memory")
+    _changed(outs[0], failures=(lost, elsewhere))
+    _changed(outs[1], failures=(FailedUnit(stage="features", item="008.png", cause="not a JPEG"),))
+    summary = merge_outputs(outs, tmp_path / "merged").summary
+    assert {name: why.reason for name, why in summary.rejected.items()} == {"003b.png": "it is damaged"}
+    assert summary.poses.rejected == {"003b.png": "it is damaged"}
+    assert summary.warnings == (
+        f"{outs[0]}: 1 unit failed, such as matches:003.png | 011.png: out of memory",
+        f"{outs[1]}: 1 unit failed, such as features:008.png: not a JPEG",
+    )
+    assert summary.exit_code == 3
+
+
+def test_cameras_in_a_smaller_group_of_a_block_are_left_out_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    blocks = load_blocks([tmp_path / "block_0", tmp_path / "block_1"])
+    apart = [replace(blocks[0], left_out=("000b.png", "008.png")), blocks[1]]
+    monkeypatch.setattr("pano_mvs.session.merging.merge.load_blocks", lambda *_: apart)
+    summary = merge_outputs([block.run.out for block in blocks], tmp_path / "merged").summary
+    reason = f"it is in a smaller group of the poses of {tmp_path / 'block_0'}"
+    assert {name: why.reason for name, why in summary.rejected.items()} == {"000b.png": reason}, "008.png is in block_1"
+    assert summary.exit_code == 3
+
+
+def test_a_merge_that_was_interrupted_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cloud that it had written looked like something else in the folder."""
+    for number, chosen in enumerate((range(12), range(7, 20))):
+        write_block(tmp_path / f"block_{number}", list(chosen), some_world(number))
+    outs, merged = [tmp_path / "block_0", tmp_path / "block_1"], tmp_path / "merged"
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MergeFiles, "write_ranges", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            merge_outputs(outs, merged)
+    assert (merged / "cloud.ply").exists()
+    merge_outputs(outs, merged)
+    assert len(load(merged).views) == 20
+    (merged / "run.json").unlink()
+    (merged / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="holds something else"):
+        merge_outputs(outs, merged)
 
 
 def test_the_images_are_found_through_the_links_of_the_blocks(tmp_path: Path) -> None:

@@ -43,12 +43,14 @@ class Pairs:
         geometries: (i, j), i < j, to the geometries of the pair, the heaviest first.
         estimator: how translation scale factors are estimated from the ratios of single features.
         kappa: the paper's κ.
+        compared: pairs (i, j), i < j, whose images a matcher has compared, with or without success; None: all.
     """
 
     features: Mapping[str, Features]
     geometries: Mapping[Edge, tuple[Geometry, ...]]
     estimator: ScaleEstimator = "cauchy"
     kappa: float = 0.01
+    compared: frozenset[Edge] | None = None
     names: tuple[str, ...] = field(init=False)
     bearings: tuple[FloatArray, ...] = field(init=False)
     partners: tuple[tuple[int, ...], ...] = field(init=False)
@@ -98,7 +100,9 @@ def pairs_of(
         (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
         for (a, b), view in consistent_edges(names, two_views).items()
     }
-    return Pairs(features, geometries, estimator, kappa)
+    position = {name: idx for idx, name in enumerate(names)}
+    edges = (sorted((position[first], position[second])) for first, second in two_views)
+    return Pairs(features, geometries, estimator, kappa, frozenset((first, second) for first, second in edges))
 
 
 @dataclass(eq=False)

@@ -40,7 +40,8 @@ class JointEvidence:
     Attributes:
         agreeing_sr: solid angle in which both parts see a surface at the same place.
         contradicting_sr: solid angle in which one part looks through a surface of the other one.
-        density: matches per solid angle that agrees, relative to those of cameras of one part.
+        density: matches per solid angle that agrees, relative to those of cameras of one part; NaN if no image of one
+            part was compared with one of the other.
     """
 
     agreeing_sr: float
@@ -63,12 +64,17 @@ class JointEvidence:
         return self.agreeing_sr > _MIN_AGREEING_SR and self.density >= _MIN_DENSITY and not self.contradicts
 
 
-def joint_doubts(model: PlacedModel, confirmation: Confirmation) -> dict[int, str]:
+def joint_doubts(model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> dict[int, str]:
     """Return the images of parts that the images contradict or do not confirm, with the reason.
 
     Parts are compared if each of them has two cameras or more. If two parts contradict each other, all images of the
     model are doubtful, because any joint between them may be wrong. If the images do not confirm the only joint between
     two sides of the model, or most pairs there have two geometries, the smaller side is doubtful.
+
+    Args:
+        model: the cameras and their pairs.
+        confirmation: of the same capture.
+        given: whether the poses come from elsewhere and not from these pairs: few common points then cause no doubt.
     """
     parts = linked_parts(model)
     doubts: dict[int, str] = {}
@@ -81,7 +87,7 @@ def joint_doubts(model: PlacedModel, confirmation: Confirmation) -> dict[int, st
                 "connect them: take panoramas in between"
             )
             return dict.fromkeys(sorted(model.cameras), reason)
-        if _is_certain(model, first, second, evidence=evidence):
+        if given or _is_certain(model, first, second, evidence=evidence):
             continue
         side = _smaller_side(model, first, second)
         doubts |= dict.fromkeys(
@@ -176,15 +182,18 @@ def joint_evidence(
             ranges[image] = _own_range(confirmation, cameras, image, partners=partners)
             matches = np.mean([_matches_of(model, image, partner) for partner in partners])
             own_density.append(matches / max(_solid_angle(np.isfinite(ranges[image])), _MIN_AGREEING_SR))
-    agreeing = contradicting = matches_between = 0.0
+    agreeing = contradicting = common = matches_between = 0.0
     pairs = [pair for one in sides[0] for other in sides[1] for pair in ((one, other), (other, one))]
     for a, b in pairs:
         agrees, contradicts = _compared(ranges[a], ranges[b], cameras[b] @ cameras[a].inverse())
         agreeing += _solid_angle(agrees) / len(pairs)
         contradicting += _solid_angle(contradicts) / len(pairs)
-        matches_between += _matches_of(model, a, b) / len(pairs)
-    density = matches_between / max(agreeing, 1e-9) / max(float(np.median(own_density)), 1e-9)
-    return JointEvidence(agreeing, contradicting, density)
+        if _was_compared(model, a, b):
+            common += _solid_angle(agrees) / len(pairs)
+            matches_between += _matches_of(model, a, b) / len(pairs)
+    is_known = any(_was_compared(model, a, b) for a, b in pairs)
+    density = matches_between / max(common, 1e-9) / max(float(np.median(own_density)), 1e-9)
+    return JointEvidence(agreeing, contradicting, density if is_known else np.nan)
 
 
 def _compared(
@@ -234,6 +243,12 @@ def _matches_of(model: PlacedModel, one: int, other: int) -> int:
     """Return the number of matches of two images with which their cameras agree."""
     edge = min(one, other), max(one, other)
     return len(model.pairs.geometries[edge][model.chosen[edge]].view) if edge in model.chosen else 0
+
+
+def _was_compared(model: PlacedModel, one: int, other: int) -> bool:
+    """Return whether a matcher has compared two images: others have no matches for lack of trying."""
+    compared = model.pairs.compared
+    return compared is None or (min(one, other), max(one, other)) in compared
 
 
 def _number_of_matches(model: PlacedModel, first: Collection[int], second: Collection[int]) -> int:

@@ -50,7 +50,7 @@ def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
             geometries[edge] = _weighed(edge, found, confirmation)
         else:
             geometries[edge] = tuple(replace(one, weight=_UNDECIDED * one.weight) for one in found)
-    return Pairs(pairs.features, geometries, pairs.estimator, pairs.kappa)
+    return Pairs(pairs.features, geometries, pairs.estimator, pairs.kappa, pairs.compared)
 
 
 def is_ambiguous(found: tuple[Geometry, ...]) -> bool:

@@ -42,7 +42,8 @@ def verify_poses(
         load: returns the panorama and the mask of an image by its name.
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
-        correct: False only reports.
+        correct: False only reports. The poses then count as measured otherwise than by the pairs: joints of parts that
+            few points connect are not doubted for that alone.
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again if a camera was
@@ -76,7 +77,7 @@ def _verified(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation)
+    return with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation, given=not correct)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -115,10 +116,17 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
     )
 
 
-def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation) -> Poses:
-    """Return poses of one group with the doubts about the joints of its parts, beside those that it has."""
+def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> Poses:
+    """Return poses of one group with the doubts about the joints of its parts, beside those that it has.
+
+    Args:
+        poses: the poses.
+        model: the same with their pairs.
+        confirmation: of the same capture.
+        given: see `joint_doubts`.
+    """
     doubts = dict(poses.doubts)
-    for image, reason in joint_doubts(model, confirmation).items():
+    for image, reason in joint_doubts(model, confirmation, given=given).items():
         name = model.pairs.names[image]
         doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
     return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})
