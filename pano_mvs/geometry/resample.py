@@ -66,12 +66,14 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
     weight_x, weight_y = x - column, y - row
     if panorama.ndim == 3:
         weight_x, weight_y = weight_x[..., None], weight_y[..., None]
+    flat, first = padded.reshape(-1, *panorama.shape[2:]), row * padded.shape[1] + column
+    finite = padded.dtype.kind != "f" or bool(np.isfinite(padded).all())
     result = np.zeros(np.broadcast_shapes(weight_x.shape, (*pixels.shape[:-1], *panorama.shape[2:])))
     for d_row, w_row in ((0, 1 - weight_y), (1, weight_y)):
         for d_column, w_column in ((0, 1 - weight_x), (1, weight_x)):
             weight = w_row * w_column
-            value = padded[row + d_row, column + d_column]
-            result += np.where(weight > 0, weight * value, 0.0)
+            value = weight * np.take(flat, first + (d_row * padded.shape[1] + d_column), axis=0)
+            result += value if finite else np.where(weight > 0, value, 0.0)
     return result
 
 

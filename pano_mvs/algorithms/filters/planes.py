@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.algorithms.filters.data_term import require_guide
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
@@ -109,24 +110,27 @@ def lay_planes(
             min_confidence=min_confidence,
         )
     )
-    valid = [fit for fit in fits if fit.is_valid(rays, min_share)]
-    clear = [fit.plane / np.linalg.norm(fit.plane) for fit in valid if fit.share >= _CLEAR_SHARE]
-    inverse = 1 / range_map.range.astype(np.float64)
+    valid = [fit.is_valid(rays, min_share) for fit in fits]
+    clear = [
+        fit.plane / np.linalg.norm(fit.plane)
+        for fit, is_valid in zip(fits, valid, strict=True)
+        if is_valid and fit.share >= _CLEAR_SHARE
+    ]
     open_sky = large_holes(range_map.valid, max_hole_deg)
     ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
-    for fit in fits:
+    for fit, is_valid in zip(fits, valid, strict=True):
         chosen = fit
         if fit.share < parallel_share:
             chosen = _parallel_fit(fit, clear, max_relative_error=max_relative_error)
-        if not chosen.is_valid(rays, min_share):
+        if not (is_valid if chosen is fit else chosen.is_valid(rays, min_share)):
             continue
-        laid = np.zeros_like(inverse)
-        laid[fit.surface] = rays[fit.surface] @ chosen.plane
+        surface = fit.surface & ~open_sky
+        laid = rays[surface] @ chosen.plane
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.abs(inverse / laid - 1)
-        off = fit.surface & ~open_sky & ~(error <= max_relative_error)
-        ranges[off] = 1 / laid[off]
-        confidence[off & ~(error <= _SAME_SURFACE * max_relative_error)] = FILLED_CONFIDENCE[1]
+            error = np.abs(1 / range_map.range[surface].astype(np.float64) / laid - 1)
+            ranges[surface] = np.where(error <= max_relative_error, ranges[surface], 1 / laid)
+        far_off = ~(error <= _SAME_SURFACE * max_relative_error)
+        confidence[surface] = np.where(far_off, np.uint8(FILLED_CONFIDENCE[1]), confidence[surface])
     return with_ranges(range_map, ranges, confidence)
 
 
@@ -219,7 +223,7 @@ def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[n
     padded = pad_panorama(guide, 4 * radius).astype(np.float32)
     smooth = cv2.GaussianBlur(padded, (0, 0), 0.6 * radius)
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    spread = (cv2.dilate(smooth, window) - cv2.erode(smooth, window)).max(axis=-1)
+    spread = largest_channel(cv2.dilate(smooth, window) - cv2.erode(smooth, window))
     inner = slice(4 * radius, -4 * radius)
     bare: Mask = spread[inner, inner] < contrast
     luma = smooth[inner, inner].mean(axis=-1) + _DARKEST

@@ -23,6 +23,7 @@ def with_ranges(
         confidence = np.where(range_map.sky, np.uint8(0), confidence)
     normals = range_map.normals_in_cam
     if normals is not None:
-        normals = np.where((ranges == range_map.range)[..., None], normals, np.float16(np.nan))
+        normals = normals.copy()
+        normals[ranges != range_map.range] = np.nan
     uncertainty = replaced_uncertainty(range_map, ranges, confidence)
     return RangeMap(ranges, confidence, normals, uncertainty, range_map.sky)

@@ -101,10 +101,12 @@ def replaced_uncertainty(
     if before.uncertainty is None:
         return None
     valid = np.isfinite(ranges)
-    kept = valid & (ranges == before.range)
+    changed = valid & (ranges != before.range)
     with np.errstate(invalid="ignore"):
-        moved = np.hypot(before.uncertainty.astype(np.float32), ranges / before.range - 1)
+        share = ranges[changed] / before.range[changed] - 1
+        moved = np.hypot(before.uncertainty[changed].astype(np.float32), share)
     moved = np.clip(moved, _LEAST, _MOST)
-    confirmed = valid & (confidence >= CONSISTENT_CONFIDENCE[0]) & np.isfinite(moved)
-    other = np.where(confirmed, moved, np.float32(UNCONFIRMED_UNCERTAINTY)).astype(np.float16)
-    return np.where(kept, before.uncertainty, np.where(valid, other, np.float16(np.nan)))
+    confirmed = (confidence[changed] >= CONSISTENT_CONFIDENCE[0]) & np.isfinite(moved)
+    found = np.where(valid, before.uncertainty, np.float16(np.nan))
+    found[changed] = np.where(confirmed, moved, np.float32(UNCONFIRMED_UNCERTAINTY)).astype(np.float16)
+    return found

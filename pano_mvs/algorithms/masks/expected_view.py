@@ -54,7 +54,7 @@ class Expected:
         ground: whether that is the ground.
         difference: by how many grey levels the panorama's colour differs from all that the views show there and around
             it, NaN unless two of them see the surface.
-        ratio: (H, W, 3) the panorama's colours divided by their median.
+        ratio: (H, W, 3) the panorama's colours on the ground divided by the median of theirs; NaN elsewhere.
         height: the camera's height above the ground, in scene units; NaN if it is not known.
     """
 
@@ -92,13 +92,15 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     ground = ~(ranges < (1 - 2 * _SAME) * on_ground) & np.isfinite(on_ground)
     ranges = _enlarged(np.where(ground, on_ground, ranges), size_hw)
     ground = _enlarged(ground.astype(np.float32), size_hw) > 0.5
-    colors = [_colors_around(other.picture) for other in others]
-    difference, ratio = _differences(picture, ranges, others, around=colors)
+    colors, own = [_colors_around(other.picture) for other in others], _smooth(picture)
+    difference, expected = _differences(own, ranges, others, around=colors, colors_at=ground)
+    ratio = (own + _DARK_LEVEL) / (expected + _DARK_LEVEL)
     # Such as a chair beside the camera that others hardly see.
     nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
     if nearer.any():
-        own = _differences(picture, np.where(nearer, known, np.float32(np.nan)), others, around=colors)[0]
-        difference = np.fmin(difference, own)
+        measured = np.where(nearer, known, np.float32(np.nan))
+        at_these = _differences(own, measured, others, around=colors, colors_at=np.zeros_like(nearer))[0]
+        difference = np.fmin(difference, at_these)
     height = float("nan") if plane is None else float(plane[3])
     return Expected(ranges, ground, difference, ratio, height)
 
@@ -147,15 +149,13 @@ def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:
     """Return the nearest ranges (h, w) that another view's points have from the reference; NaN where there are none."""
     ranges = np.where(other.range_map.confidence >= WEAK_CONFIDENCE[0], other.range_map.range, np.float32(np.nan))
     known = np.isfinite(ranges)
-    points = ray_grid((ranges.shape[0], ranges.shape[1]))[known] * ranges[known, None]
-    points = (points - other.pose.translation) @ other.pose.rotation
-    distances = np.linalg.norm(points, axis=1)
-    nearest = np.full(grid_hw, np.inf, np.float32)
-    if len(points):
-        pixels = np.floor(pixel_from_ray(points / np.maximum(distances, 1e-9)[:, None], grid_hw)).astype(np.intp)
-        at = (np.minimum(pixels[:, 1], grid_hw[0] - 1), pixels[:, 0] % grid_hw[1])
-        np.minimum.at(nearest, at, distances.astype(np.float32))
-    found = np.where(np.isfinite(nearest), nearest, np.float32(0))
+    points = ray_grid((ranges.shape[0], ranges.shape[1]))[known].T * ranges[known]
+    points = other.pose.rotation.T @ (points - other.pose.translation[:, None])
+    distances = np.sqrt(points[0] ** 2 + points[1] ** 2 + points[2] ** 2)
+    nearest = np.full(grid_hw[0] * grid_hw[1], np.inf, np.float32)
+    x, y = np.floor(pixel_from_ray(points.T, grid_hw)).astype(np.intp).T
+    np.minimum.at(nearest, np.minimum(y, grid_hw[0] - 1) * grid_hw[1] + x % grid_hw[1], distances.astype(np.float32))
+    found = np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(grid_hw)
     return _with_holes_filled(found)
 
 
@@ -186,32 +186,47 @@ def _enlarged(values: Plane, size_hw: tuple[int, int]) -> Plane:
 
 
 def _differences(
-    picture: Picture, ranges: Plane, others: Sequence[OtherView], *, around: Sequence[tuple[Plane, Plane, Plane]]
+    own: Plane, ranges: Plane, others: Sequence[OtherView], *, around: Sequence[Plane], colors_at: Mask
 ) -> tuple[Plane, Plane]:
-    """Return the differences of colour, (H, W), and the ratios of the colours, (H, W, 3), see `Expected`.
+    """Return the differences of colour and the expected colours of pixels; NaN where fewer than two, or no, views see.
 
-    `around` holds `_colors_around` of each view.
+    Args:
+        own: (H, W, 3) colours of the reference, see `_smooth`.
+        ranges: (H, W), NaN if not known.
+        others: the other views.
+        around: `_colors_around` of each.
+        colors_at: (H, W), where expected colours are wanted.
+
+    Returns:
+        (H, W) grey levels, and (H, W, 3).
     """
-    own = _smooth(picture)
-    points = ray_grid((ranges.shape[0], ranges.shape[1])) * np.nan_to_num(ranges, nan=1.0)[..., None]
-    differences, colors = [], []
-    for other, of_other in zip(others, around, strict=True):
-        lowest, middle, highest = _seen_colors(other, points, np.isfinite(ranges), around=of_other)
-        visible = np.isfinite(middle[..., 0])
-        gain = np.ones(3, np.float32)
+    known = np.isfinite(ranges)
+    points = ray_grid((ranges.shape[0], ranges.shape[1]))[known].T * ranges[known]
+    wanted, shown = colors_at[known], np.ascontiguousarray(own[known].T)
+    differences = np.full((len(others), len(wanted)), np.nan, np.float32)
+    colors = np.full((len(others), 3, int(wanted.sum())), np.nan, np.float32)
+    for idx, (other, of_other) in enumerate(zip(others, around, strict=True)):
+        at, visible = _seen_pixels(other, points)
+        here = shown[:, visible]
+        lowest, middle, highest = of_other[:, :, at[visible]]
+        gain = np.ones((3, 1), np.float32)
         if visible.sum() > 100:
-            gain = np.median((own[visible] + _DARK_LEVEL) / (middle[visible] + _DARK_LEVEL), axis=0)
-        apart = np.maximum(lowest * gain - own, own - highest * gain).max(axis=-1)
-        differences.append(np.where(visible, np.maximum(apart, 0), np.nan))
-        colors.append(middle * gain)
-    stack = np.sort(np.array(differences, np.float32), axis=0)  # NaN last
-    count = np.isfinite(stack).sum(axis=0)
+            gain = np.median((here + _DARK_LEVEL) / (middle + _DARK_LEVEL), axis=1, keepdims=True)
+        apart = np.maximum(lowest * gain - here, here - highest * gain)
+        # Three planes: the largest over a short last axis takes many times as long.
+        differences[idx, visible] = np.maximum(np.maximum(np.maximum(*apart[:2]), apart[2]), 0)
+        seen = np.full((3, len(wanted)), np.nan, np.float32)
+        seen[:, visible] = middle * gain
+        colors[idx] = seen[:, wanted]
+    differences.sort(axis=0)  # NaN last
+    count = np.isfinite(differences).sum(axis=0)
     # With four views or more, one may differ from the others by chance.
     which = np.where(count >= 4, 1, 0)
-    difference = np.where(count >= 2, np.take_along_axis(stack, which[None], axis=0)[0], np.nan)
-    with np.errstate(invalid="ignore"):
-        expected = _nan_median(np.array(colors, np.float32))
-    return difference.astype(np.float32), ((own + _DARK_LEVEL) / (expected + _DARK_LEVEL)).astype(np.float32)
+    least = np.take_along_axis(differences, which[None], axis=0)[0]
+    difference, expected = np.full(known.shape, np.nan, np.float32), np.full(own.shape, np.nan, np.float32)
+    difference[known] = np.where(count >= 2, least, np.float32(np.nan))
+    expected[known & colors_at] = _nan_median(colors).T
+    return difference, expected
 
 
 def _nan_median(values: Plane) -> Plane:
@@ -221,31 +236,28 @@ def _nan_median(values: Plane) -> Plane:
     return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
 
 
-def _seen_colors(
-    other: OtherView, points: FloatArray, known: Mask, *, around: tuple[Plane, Plane, Plane]
-) -> tuple[Plane, Plane, Plane]:
-    """Return the darkest, the mean and the lightest colours (H, W, 3) of points in another view; NaN if hidden."""
-    in_view = points @ other.pose.rotation.T + other.pose.translation
-    distances = np.linalg.norm(in_view, axis=-1)
-    rays = in_view / np.maximum(distances, 1e-9)[..., None]
-    size_hw = (other.picture.shape[0], other.picture.shape[1])
-    x, y = np.floor(pixel_from_ray(rays, size_hw)).astype(np.intp).transpose(2, 0, 1)
-    at = (np.minimum(y, size_hw[0] - 1), x % size_hw[1])
-    seen = _enlarged(other.range_map.range, size_hw)[at]
+def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp], Mask]:
+    """Return the pixels (N,) of another view, as flat indices, in which points (3, N) arrive, and which it sees."""
+    in_view = other.pose.rotation @ points + other.pose.translation[:, None]
+    distances = np.sqrt(in_view[0] ** 2 + in_view[1] ** 2 + in_view[2] ** 2)
+    height, width = other.picture.shape[:2]
+    x, y = np.floor(pixel_from_ray(in_view.T, (height, width))).astype(np.intp).T
+    at = np.minimum(y, height - 1) * width + x % width
+    seen = _enlarged(other.range_map.range, (height, width)).ravel()[at]
     with np.errstate(invalid="ignore"):
-        visible = known & other.valid[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
-    lowest, middle, highest = (np.where(visible[..., None], colors[at], np.float32(np.nan)) for colors in around)
-    return lowest, middle, highest
+        visible = other.valid.ravel()[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
+    return at, visible
 
 
-def _colors_around(picture: Picture) -> tuple[Plane, Plane, Plane]:
-    """Return the darkest, the mean and the lightest colours around each pixel, (H, W, 3)."""
+def _colors_around(picture: Picture) -> Plane:
+    """Return the darkest, the mean and the lightest colours around each pixel, (3, 3, H W): which, colour and pixel."""
     smooth = _smooth(picture)
     around = max(1, round(_AROUND_DEG * len(picture) / 180))
     padded = pad_panorama(smooth, around)
     window = np.ones((2 * around + 1,) * 2, np.uint8)
     inner = (slice(around, -around),) * 2
-    return cv2.erode(padded, window)[inner], smooth, cv2.dilate(padded, window)[inner]
+    colors = np.stack([cv2.erode(padded, window)[inner], smooth, cv2.dilate(padded, window)[inner]])
+    return np.ascontiguousarray(colors.reshape(3, -1, 3).transpose(0, 2, 1))
 
 
 def _smooth(picture: Picture) -> Plane:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.geometry import pad_panorama, ray_grid, rotate_panorama
 
 Picture = NDArray[np.uint8]
@@ -84,7 +85,7 @@ def color_difference(pictures: Sequence[Picture], gains: NDArray[np.float64]) ->
         cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1] * gain.astype(np.float32)
         for picture, gain in zip(pictures, gains, strict=True)
     ]
-    apart = [np.abs(smooth[i] - smooth[j]).max(axis=-1) for i, j in evenly_spread_pairs(len(pictures))]
+    apart = [largest_channel(np.abs(smooth[i] - smooth[j])) for i, j in evenly_spread_pairs(len(pictures))]
     return np.asarray(np.quantile(apart, 1 - _DISAGREEING, axis=0), np.float32)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import numpy as np
@@ -135,12 +136,15 @@ def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask
     return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= _MIN_CERTAIN_SHARE))]
 
 
+@cache
 def _off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
     return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
 
 
 def _extends_mask(area: Mask, masked: Mask) -> bool:
     """Return whether an area lies within the operator's reach and extends what is masked there."""
+    if not masked.any():
+        return False
     weights = pixel_weights(area.shape)
     within = area & (_off_nadir_deg((area.shape[0], area.shape[1])) < _REACH_DEG)
     if weights[within].sum() < 0.9 * weights[area].sum():

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.algorithms.filters.sphere.box import box_sum
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.sky_colors import SkyColors, sharpened_sky, sky_colors
@@ -159,7 +160,7 @@ def _contrast(picture: Picture) -> NDArray[np.int16]:
     window = np.ones((3, 3), np.uint8)
     padded = np.ascontiguousarray(pad_panorama(picture, 1))
     contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-    return np.asarray(contrast[1:-1, 1:-1].max(axis=-1), np.int16)
+    return np.asarray(largest_channel(contrast[1:-1, 1:-1]), np.int16)
 
 
 def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
@@ -281,7 +282,7 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
         inside, weights = labels >= 0, pixel_weights(sky.shape)
         sizes = np.bincount(labels[inside], weights[inside], labels.size)
         agreeing = np.bincount(labels[inside & agrees], weights[inside & agrees], labels.size)
-        away = np.abs(view.picture - colors.mean).max(axis=-1)
+        away = largest_channel(np.abs(view.picture - colors.mean))
         exact = np.bincount(labels[inside], (weights * away)[inside], labels.size) <= _EXACT_LEVELS * sizes
         taken = (sizes <= most) | (exact & (sizes <= _MAX_EXACT_SHARE / _MAX_PART_SHARE * most))
         for label in np.flatnonzero(~taken & (agreeing >= _MIN_AGREEING * sizes)):
@@ -296,7 +297,7 @@ def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
     for _ in range(_CREEP_PX):
         count = box_sum(sky.astype(np.float64), 2)
         local = box_sum(picture.astype(np.float64) * sky[..., None], 2) / np.maximum(count, 1)[..., None]
-        further = agrees & ~sky & (count > 0) & (np.abs(picture - local).max(axis=-1) <= _CREEP_LEVELS)
+        further = agrees & ~sky & (count > 0) & (largest_channel(np.abs(picture - local)) <= _CREEP_LEVELS)
         if not further.any():
             break
         sky = sky | further

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.algorithms.filters.sphere.box import box_sum
 from pano_mvs.algorithms.masks.areas import dilated
 from pano_mvs.geometry import pad_panorama, ray_grid
@@ -35,7 +36,7 @@ class SkyColors:
 
     def match(self, picture: Picture) -> Mask:
         """Return the pixels of a picture of the same size, (H, W), that have the colours of the sky."""
-        return np.asarray(np.abs(picture - self.mean).max(axis=-1) <= self.tolerance)
+        return np.asarray(largest_channel(np.abs(picture - self.mean)) <= self.tolerance)
 
 
 def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
@@ -55,7 +56,7 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
         share = np.clip(count / _MIN_SEEDS, 0, 1)
         local = box_sum(levels * seeds[..., None], radius) / np.maximum(count, 1)[..., None]
         mean = share[..., None] * local + (1 - share)[..., None] * mean
-        squares = box_sum((((levels - mean) ** 2).max(axis=-1)) * seeds, radius) / np.maximum(count, 1)
+        squares = box_sum(largest_channel((levels - mean) ** 2) * seeds, radius) / np.maximum(count, 1)
         spread = share * np.sqrt(squares) + (1 - share) * spread
     tolerance = np.minimum(_TOLERANCE + _SPREAD * spread, _MAX_TOLERANCE)
     return SkyColors(mean.astype(np.float32), tolerance.astype(np.float32))
@@ -76,7 +77,7 @@ def sharpened_sky(sky: Mask, colors: SkyColors, picture: Picture) -> Mask:
     wide = _resized(sky.astype(np.float32), (height, width)) >= 0.5
     mean = _resized(colors.mean, (height, width))
     band = dilated(wide, _BAND_PX * scale) & dilated(~wide, _BAND_PX * scale)
-    away = np.abs(picture - mean).max(axis=-1)
+    away = largest_channel(np.abs(picture - mean))
     weights = (~wide | band) * np.maximum(away - _TOLERANCE, 0) ** 2
     beside, total = _box(picture * weights[..., None], _BESIDE_PX * scale), _box(weights, _BESIDE_PX * scale)
     beside /= np.maximum(total, 1e-6)[..., None]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.frame_agreement import FrameAgreement, color_difference, frame_agreement
 from pano_mvs.core.errors import UsageError
@@ -154,7 +155,7 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     A part belongs to them if most of its border lies on them, or on edges that most views show at the same place, such
     as the outline of a hand before a moving world. A plain floor has no such outline.
     """
-    brightness = np.median([picture.max(axis=-1) for picture in pictures], axis=0)
+    brightness = np.median([largest_channel(picture) for picture in pictures], axis=0)
     alike = color_difference(pictures, _gains(pictures, core)) <= _MAX_DIFFERENCE + _MAX_CHANGE * brightness
     closed = ~dilated(~dilated(core, _CLOSING_PX), _CLOSING_PX) | core
     outline = closed | _lasting_edges(pictures)
@@ -185,7 +186,7 @@ def _lasting_edges(pictures: Sequence[Picture]) -> Mask:
     for picture in pictures:
         padded = np.ascontiguousarray(pad_panorama(picture, 1))
         contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-        contrasts.append(contrast[1:-1, 1:-1].max(axis=-1))
+        contrasts.append(largest_channel(contrast[1:-1, 1:-1]))
     return np.asarray(np.quantile(contrasts, 0.4, axis=0) >= _MIN_EDGE)
 
 

@@ -139,11 +139,11 @@ def refine_range(
 
     threads = numba.get_num_threads()
     weights = ViewWeights(len(sources), (height, width))
-    for _ in range(rounds):
+    for left in reversed(range(rounds)):
         for_bands(lay, height, threads=threads)
         for_bands(match, height, threads=threads)
         inverse[~seen] = np.nan
-        if view_weights:
+        if view_weights and left:
             weights.update()
     for_bands(lay, height, threads=threads)
     return _range_map_from_planes(planes, range_map, seen)

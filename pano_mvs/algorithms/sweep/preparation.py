@@ -122,10 +122,11 @@ def pixels_with_valid_window(mask: NDArray[np.bool_], radius: int) -> NDArray[np
     reach = column_offsets((height, width), radius, spherical=True)[:, -1]
     around = np.pad(reach, radius, mode="symmetric")  # the widest window of all those that look into a row
     reach = np.max([around[shift : shift + height] for shift in range(2 * radius + 1)], axis=0)
-    wide = np.zeros_like(mask)
+    wide, some_masked = np.zeros_like(mask), ~mask.all(axis=1)
     for columns in np.unique(reach):
-        rows = reach == columns
-        wide[rows] = _spread_columns(~mask[rows], int(columns))
+        rows = (reach == columns) & some_masked
+        if rows.any():
+            wide[rows] = _spread_columns(~mask[rows], int(columns))
     padded = pad_panorama(wide, min(radius, height))
     blocked = np.zeros_like(mask)
     for shift in range(2 * radius + 1):
@@ -142,7 +143,7 @@ def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
 
 def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """Return where at least one source is valid at the plane that won, (H, W)."""
-    if work.source_valid is None:
+    if work.source_valid is None or any(valid.all() for valid in work.source_valid):
         return np.ones(winners.plane.shape, np.bool_)
     height, width = winners.plane.shape
     seen = np.zeros((height, width), np.bool_)
@@ -151,8 +152,10 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
         y, x = np.mgrid[first : min(rows.stop, height), 0:width] + 0.5
         rays = ray_from_pixel(np.stack([x, y], axis=-1), (height, width))
         points = rays * work.ranges[winners.plane[rows]][..., None]
+        unseen = np.ones(points.shape[:2], np.bool_)
         for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
-            seen[rows] |= valid_where_seen(valid, pose.apply(points))
+            unseen[unseen] = ~valid_where_seen(valid, pose.apply(points[unseen]))
+        seen[rows] = ~unseen
     return seen
 
 

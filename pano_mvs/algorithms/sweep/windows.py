@@ -43,7 +43,11 @@ def neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) 
     height, width = picture.shape
     pad = abs(rows)
     shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
-    return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
+    found = np.empty_like(shifted)
+    for step in np.unique(columns):  # few steps: rows of one are moved at once
+        here = columns == step
+        found[here] = np.roll(shifted[here], -step, axis=1)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
-from pano_mvs.algorithms.sweep.numba.kernels_lookup import warp_band
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import vote_row, warp_band
 from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.numba.kernels_records import Lookup, Sources
 from pano_mvs.algorithms.sweep.numba.kernels_sad import add_differences, interleave_rows
-from pano_mvs.algorithms.sweep.numba.packing import pack_colors, pack_plane, pack_sources
+from pano_mvs.algorithms.sweep.numba.packing import pack_colors, pack_plane, pack_sources, pack_votes
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
-from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
 from tests.oracles import sweep as oracle
 
 SIZE = 16, 32
@@ -54,7 +56,8 @@ def _warped(
     against = np.zeros((0, width), np.uint32) if against is None else against
     pixel_costs = np.zeros((rows + 2 * halo, width + 2 * pad), np.uint16)
     shapes, poses = np.array([source.shape[:2]]), np.column_stack([ROTATION, translation])[None]
-    sources = Sources(poses, packed, colors, starts, shapes, valid, np.zeros(1, np.int64), vector)
+    masked = np.array([[0, valid.size]])  # none is, but all are asked
+    sources = Sources(poses, packed, colors, starts, shapes, valid, np.zeros(1, np.int64), masked, vector)
     found = Lookup(knots, warped, votes, against, pixel_costs)
     warp_band(first - halo, height, sin_cos, sources, 0, 1.3, pad, found)
     assert votes.all()
@@ -76,6 +79,34 @@ def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(
         expected = np.pad(pad_panorama(exact[..., color], 3)[:, 3:-3], ((0, 0), (4, 4)), mode="wrap")
         # Half a level is rounding; the rest is what 1e-4 px of float32 projection makes of white noise.
         assert np.abs(warped[color] - expected).max() < 0.6
+
+
+@pytest.mark.kernel("sweep.numba.kernels_lookup")
+def test_rows_vote_as_their_patches_do_wherever_the_mask_is() -> None:
+    """Rows that are looked up above or below the masked rows are not looked up one by one."""
+    masks = [np.ones(SIZE, np.bool_) for _ in range(3)]
+    masks[1][9:11, 4:20] = False
+    masks[2][0, 0] = masks[2][15, 31] = False
+    valid, starts, masked = pack_votes(_masked_input(tuple(masks)))
+    stride = SIZE[1] + 2
+    patches = [(valid[start : start + 17 * stride] == 0).reshape(17, stride) for start in starts]
+    assert masked[0, 0] == masked[0, 1] == 0
+    assert not patches[0].any()
+    assert np.argwhere(patches[1])[[0, -1]].tolist() == [[9, 4], [11, 20]]
+    for source in range(3):
+        for row in range(17):
+            index = np.arange(row * stride, row * stride + SIZE[1] + 1, dtype=np.int32)
+            votes = np.full((2, len(index)), 7, np.uint8)
+            vote_row(valid, starts[source], *masked[source], index, votes, 1)
+            expected = 7 if source == 0 else ~patches[source][row, :-1]
+            np.testing.assert_array_equal(votes[1], np.broadcast_to(expected, len(index)))
+            assert (votes[0] == 7).all()
+
+
+def _masked_input(masks: tuple[NDArray[np.bool_], ...]) -> SweepInput:
+    grey, settings = _picture(1, (*SIZE, 1)), SweepSettings()
+    poses = tuple(Rigid3(ROTATION, np.ones(3)) for _ in masks)
+    return SweepInput(grey, (grey,) * len(masks), poses, masks, np.array([1.0, 2.0, 3.0]), settings)
 
 
 @pytest.mark.parametrize("translation", TRANSLATIONS)

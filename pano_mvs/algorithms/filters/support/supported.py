@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
@@ -48,7 +49,7 @@ def supported_pixels(range_map: RangeMap, guide: NDArray[np.uint8], *, min_confi
         for column in range(2 * _RADIUS + 1):
             with np.errstate(invalid="ignore"):
                 same = np.abs(ranges[rows + row, columns + column] - own) < _SAME_RANGE * own
-            same &= np.abs(colors[rows + row, columns + column] - color).max(axis=1, initial=0) < _SAME_COLOR
+            same &= largest_channel(np.abs(colors[rows + row, columns + column] - color)) < _SAME_COLOR
             supported[rows[same], columns[same]] = True
     return supported
 
@@ -57,5 +58,5 @@ def has_texture(guide: NDArray[np.uint8]) -> Mask:
     """Return the pixels, (H, W), around which a colour has contrast."""
     window = np.ones((2 * _RADIUS + 1, 2 * _RADIUS + 1), np.uint8)
     padded = pad_panorama(guide, _RADIUS)
-    contrast = cv2.subtract(cv2.dilate(padded, window), cv2.erode(padded, window)).max(axis=-1)
+    contrast = largest_channel(cv2.subtract(cv2.dilate(padded, window), cv2.erode(padded, window)))
     return np.asarray(contrast[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] >= _MIN_CONTRAST)

@@ -92,6 +92,7 @@ def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift:
     pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
     packed, colors, vector = sources.packed, sources.colors, sources.vector
     valid, valid_start = sources.valid, sources.valid_starts[source]
+    first_masked, after_masked = sources.masked[source]
     warped, votes, pad = found.warped, found.votes, sweep.windows.pad
     positions, table, per_plane = guide
     sin_cos_azimuth = sweep.sin_cos_azimuth
@@ -112,7 +113,7 @@ def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift:
         project_guided_row(sin_cos_azimuth, matrix, offset, translation, inverse, shape, x_px, y_px)
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
         sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
-        vote_row(valid, valid_start, index, votes, j)
+        vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -140,7 +141,7 @@ def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any
         for s in range(sources):
             warp_guided_band(first - halo, sweep, s, guide, k - count // 2, found)
             source_cost(first, sweep, warped, pixel_costs, scratch, means[s])
-            if not all_vote:
+            if sweep.sources.masked[s, 0] < sweep.sources.masked[s, 1]:
                 silence(votes, halo, means[s])
         for j in range(rows):
             combine_row(means, j, sweep.combination, first + j, all_vote, combined)

@@ -56,7 +56,7 @@ def sweep_arguments(work: SweepInput) -> Sweep:
 
 def _sources(work: SweepInput) -> Sources:
     packed, colors, starts = pack_sources(work.sources, vector=HAS_VECTOR)
-    valid, valid_starts = pack_votes(work)
+    valid, valid_starts, masked = pack_votes(work)
     return Sources(
         poses=np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in work.source_from_reference]),
         packed=packed,
@@ -65,6 +65,7 @@ def _sources(work: SweepInput) -> Sources:
         shapes=np.array([source.shape[:2] for source in work.sources]),
         valid=valid,
         valid_starts=valid_starts,
+        masked=masked,
         vector=HAS_VECTOR,
     )
 

@@ -65,7 +65,7 @@ def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, pl
                     average_differences(pixel_costs, reach, box_radius, pad, scratch, costs[s])
             else:
                 source_cost(first, sweep, warped, pixel_costs, scratch, costs[s])
-            if not all_vote:
+            if sources.masked[s, 0] < sources.masked[s, 1]:
                 silence(votes, halo, costs[s])
         held = d % PLANES_AT_ONCE
         for j in range(rows):

@@ -9,8 +9,6 @@ from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U
 
 _F = np.float32
 _U = np.uint64
-# Windows of at most this many columns on either side are added up column by column.
-_FEW = 6
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -58,21 +56,25 @@ def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: in
 @njit(cache=True, error_model="numpy", nogil=True)
 def average_row(column_sums: I32, reach: int, pad: int, share: np.float32, scratch: I32, means: F32) -> None:
     """Write sums of 2 reach + 1 neighbouring columns, times `share`; see `box_rows`."""
-    left, middle, right = _U(pad - reach), _U(pad), _U(pad + reach)
-    if reach == 1:
+    sums, first = column_sums, _U(pad - reach)
+    second, third, fourth, fifth = first + _U(1), first + _U(2), first + _U(3), first + _U(4)
+    if reach == 1:  # sums can be vectorised, and running sums cannot
         for i in range(_U(means.shape[0])):
-            total = np.int32(np.int32(column_sums[left + i] + column_sums[middle + i]) + column_sums[right + i])
-            means[i] = _F(total) * share
+            means[i] = _F(np.int32(sums[first + i] + sums[second + i] + sums[third + i])) * share
         return
-    if reach <= _FEW:  # sums can be vectorised, and running sums cannot
-        scratch[:] = 0
-        for k in range(2 * reach + 1):
-            start = _U(pad - reach + k)
-            for i in range(_U(means.shape[0])):
-                scratch[i] = np.int32(scratch[i] + column_sums[start + i])
+    if reach == 2:
         for i in range(_U(means.shape[0])):
-            means[i] = _F(scratch[i]) * share
+            inner = np.int32(sums[second + i] + sums[third + i] + sums[fourth + i])
+            means[i] = _F(np.int32(sums[first + i] + inner + sums[fifth + i])) * share
         return
+    if reach == 3:
+        sixth, seventh = first + _U(5), first + _U(6)
+        for i in range(_U(means.shape[0])):
+            inner = np.int32(sums[third + i] + sums[fourth + i] + sums[fifth + i])
+            inner = np.int32(inner + sums[second + i] + sums[sixth + i])
+            means[i] = _F(np.int32(sums[first + i] + inner + sums[seventh + i])) * share
+        return
+    left, right = first, _U(pad + reach)
     running = np.int32(0)
     for i in range(_U(column_sums.shape[0])):
         running = np.int32(running + column_sums[i])
@@ -96,6 +98,14 @@ def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I
     """
     rows = means.shape[0]
     padded = _U(pixel_costs.shape[1])
+    if radius == 1:
+        for y in range(rows):
+            above, here, below = _U(y), _U(y + 1), _U(y + 2)
+            for i in range(padded):
+                outer = np.int32(np.int32(pixel_costs[above, i]) + np.int32(pixel_costs[below, i]))
+                column_sums[i] = np.int32(outer + np.int32(pixel_costs[here, i]))
+            average_row(column_sums, reach[y], pad, _F(1.0 / (3 * (2 * reach[y] + 1))), prefix, means[y])
+        return
     column_sums[:] = 0
     for j in range(2 * radius):
         for i in range(padded):

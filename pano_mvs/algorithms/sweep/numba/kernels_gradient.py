@@ -10,7 +10,9 @@ from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 
+_I = np.int16
 _U = np.uint64
+_LARGEST_LEVEL, _LARGEST_GRADIENT = _I(MAX_COLOR_COST // 3), _I(MAX_GRADIENT_COST // 3)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -84,12 +86,25 @@ def census_gradient_row(
         total: (W,) uint16, written.
     """
     count_census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree)
-    gradient = np.zeros(total.shape[0], np.uint16)
-    total[:] = 0
-    difference_row(reference, reference_row, warped, warped_row, pad, total)
     reach = offsets[offsets.shape[0] // 2 + 1]
-    gradient_row(reference, reference_row, warped, warped_row, reach, pad, gradient)
-    largest_level, largest_gradient = np.int32(MAX_COLOR_COST // 3), np.int32(MAX_GRADIENT_COST // 3)
-    for i in range(_U(total.shape[0])):
-        grey = min(np.int32(total[i]), largest_level) + min(np.int32(gradient[i]), largest_gradient)
-        total[i] = np.uint16(np.int32(census_weight) * np.int32(disagree[i]) + np.int32(GREY_WEIGHT) * grey)
+    r, r_up, r_down = _U(reference_row), _U(reference_row - 1), _U(reference_row + 1)
+    w, w_up, w_down = _U(warped_row), _U(warped_row - 1), _U(warped_row + 1)
+    left, middle, right = _U(pad - reach), _U(pad), _U(pad + reach)
+    for i in range(_U(total.shape[0])):  # everything in 16 bits, so that a register holds as many pixels as can be
+        level = _step(reference[r, middle + i], warped[w, middle + i])
+        across = _I(
+            _step(reference[r, right + i], reference[r, left + i]) - _step(warped[w, right + i], warped[w, left + i])
+        )
+        down = _I(
+            _step(reference[r_down, middle + i], reference[r_up, middle + i])
+            - _step(warped[w_down, middle + i], warped[w_up, middle + i])
+        )
+        gradient = _I(max(across, _I(-across)) + max(down, _I(-down)))
+        grey = _I(min(max(level, _I(-level)), _LARGEST_LEVEL) + min(gradient, _LARGEST_GRADIENT))
+        census = np.uint16(np.uint16(census_weight) * np.uint16(disagree[i]))
+        total[i] = np.uint16(census + np.uint16(np.uint16(GREY_WEIGHT) * np.uint16(grey)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _step(a: np.uint8, b: np.uint8) -> np.int16:
+    return _I(_I(a) - _I(b))

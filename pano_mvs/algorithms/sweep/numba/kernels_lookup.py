@@ -105,6 +105,7 @@ def warp_band(
     pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
     packed, colors, vector = sources.packed, sources.colors, sources.vector
     valid, valid_start = sources.valid, sources.valid_starts[source]
+    first_masked, after_masked = sources.masked[source]
     knots, warped, votes, against, pixel_costs = found
     width = sin_cos_azimuth.shape[1]
     x_px, y_px = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -133,7 +134,7 @@ def warp_band(
             add_sampled_differences(colors, starts[0], index, weight_y, weight_x, against, j, pad, pixel_costs)
         else:
             sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
-        vote_row(valid, valid_start, index, votes, j)
+        vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -174,8 +175,19 @@ def sample_row(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def vote_row(valid: U8, start: int, index: I32, votes: U8, row: int) -> None:
-    """Write whether the patches at `index`, (W,), are valid to a row of `votes`; nothing if `valid` is empty."""
-    if len(valid):
-        for i in range(_U(index.shape[0])):
-            votes[_U(row), i] = valid[_U(start) + _U(index[i])]
+def vote_row(valid: U8, start: int, first_masked: int, after_masked: int, index: I32, votes: U8, row: int) -> None:
+    """Write whether the patches at `index`, (W,), are valid to a row of `votes`; nothing if all of the source's are.
+
+    Masks often cover a few rows, such as those of a tripod, and most rows of a sweep are looked up in others.
+    """
+    if first_masked == after_masked:
+        return
+    lowest = highest = index[0]
+    for i in range(_U(index.shape[0])):
+        lowest = min(lowest, index[i])
+        highest = max(highest, index[i])
+    if highest < first_masked or lowest >= after_masked:
+        votes[row] = 1
+        return
+    for i in range(_U(index.shape[0])):
+        votes[_U(row), i] = valid[_U(start) + _U(index[i])]

@@ -33,6 +33,8 @@ class Sources(NamedTuple):
         shapes: (S, 2) int64 rows and columns of each source.
         valid: (·,) uint8 like a packed plane: whether a patch is valid; empty if all are.
         valid_starts: (S,) int64, where each source begins in `valid`.
+        masked: (S, 2) int64, the first of a source's patches that is not valid, and the one after the last of these;
+            equal if all are valid.
         vector: whether to use vector instructions; the result is the same.
     """
 
@@ -43,6 +45,7 @@ class Sources(NamedTuple):
     shapes: I64
     valid: U8
     valid_starts: I64
+    masked: I64
     vector: bool
 
 

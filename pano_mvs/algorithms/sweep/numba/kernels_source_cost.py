@@ -81,15 +81,13 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
         zncc_rows(first, reference[0], warped[0], reach, box_radius, pad, pixel_costs, scratch, means)
         return
     disagree = np.empty(width, np.uint8)
-    total = np.empty(width, np.uint16)
     for j in range(rows + 2 * box_radius):
         y = first - box_radius + j
         mirrored = -1 - y if y < 0 else (2 * height - 1 - y if y >= height else y)
         offsets = window_offsets[mirrored]
         compared = j + compare_radius
+        total = pixel_costs[j, pad : pad + width]
         pixel_cost_row(cost, census_weight, reference, y + pad, warped, compared, offsets, pad, disagree, total)
-        for i in range(_U(width)):
-            pixel_costs[_U(j), _U(pad) + i] = total[i]
         wrap_row(pixel_costs[j], width, pad)
     if box_radius:
         box_rows(pixel_costs, reach, box_radius, pad, scratch[0], scratch[1], means)
@@ -103,9 +101,8 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
 def silence(votes: U8, halo: int, costs: F32) -> None:
     """Make costs, (rows, W), infinite where a source is not valid; `votes` has `halo` rows more on either side."""
     for j in range(costs.shape[0]):
-        for i in range(costs.shape[1]):
-            if votes[j + halo, i] == 0:
-                costs[j, i] = np.inf
+        for i in range(_U(costs.shape[1])):
+            costs[_U(j), i] = costs[_U(j), i] if votes[_U(j + halo), i] else _F(np.inf)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -65,14 +65,23 @@ def pack_sources(
     return packed, np.zeros(0, np.uint64), starts.reshape(len(sources), -1)
 
 
-def pack_votes(work: SweepInput) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Return whether each patch of each source is valid (all four pixels are), and where each source begins."""
+def pack_votes(work: SweepInput) -> tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]:
+    """Return whether each patch of each source is valid (all four pixels are), and `valid_starts` and `masked`."""
+    count = len(work.sources)
     if work.source_valid is None:
-        return np.zeros(0, np.uint8), np.zeros(len(work.sources), np.int64)
-    whole = np.uint32(0x81818181)  # four ones, less 128
-    return _joined(
-        [(pack_plane(mask.astype(np.uint8)) == whole).astype(np.uint8).ravel() for mask in work.source_valid]
-    )
+        return np.zeros(0, np.uint8), np.zeros(count, np.int64), np.zeros((count, 2), np.int64)
+    votes = [_valid_patches(mask).ravel() for mask in work.source_valid]
+    valid, starts = _joined(votes)
+    masked = [np.flatnonzero(vote == 0)[[0, -1]] + (0, 1) if not vote.all() else (0, 0) for vote in votes]
+    return valid, starts, np.array(masked, np.int64)
+
+
+def _valid_patches(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return which patches are valid, (H, W) to (H + 1, W + 2); those of the last column, which is not used, are."""
+    padded = pad_panorama(mask, 1)
+    patches = np.ones((len(mask) + 1, mask.shape[1] + 2), np.uint8)
+    patches[:, :-1] = padded[:-1, :-1] & padded[1:, :-1] & padded[:-1, 1:] & padded[1:, 1:]
+    return patches
 
 
 def _joined(arrays: Sequence[NDArray[Element]]) -> tuple[NDArray[Element], NDArray[np.int64]]:
