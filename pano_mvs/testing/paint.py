@@ -9,7 +9,7 @@ import numpy as np
 from pano_mvs.testing.surfaces import FloatArray, Vector
 from pano_mvs.testing.texture import noise
 
-Texture = Literal["strong", "weak", "isotropic", "outdoor", "none"]
+Texture = Literal["strong", "weak", "faint", "isotropic", "outdoor", "none"]
 
 Colors = tuple[Vector, Vector]
 
@@ -34,6 +34,7 @@ RED: Colors = ((0.70, 0.26, 0.22), (0.80, 0.52, 0.40))
 _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
     "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
     "weak": ((0.047, 0.03), (0.16, 0.05)),
+    "faint": ((0.047, 0.01), (0.16, 0.018)),
     "isotropic": ((0.015, 0.7), (0.047, 0.7)),
     "outdoor": ((0.012, 0.25), (0.04, 0.25), (0.13, 0.3), (0.5, 0.3)),
     "none": (),
@@ -41,6 +42,7 @@ _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
 _HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
     "strong": ((0.06, 1.0),),
     "weak": ((0.2, 0.15),),
+    "faint": ((0.2, 0.05),),
     "isotropic": ((0.06, 0.6),),
     "outdoor": ((0.25, 0.8),),
     "none": (),

@@ -258,6 +258,30 @@ def desk(
     return _scene("desk", room, views=views, turned=turned, spread=spread, exposure=exposure)
 
 
+def plain_table(
+    *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, height: float = 0.4
+) -> Scene:
+    """Return a room of 6 × 2.9 × 5 with cameras above a large table that has hardly any texture, and nothing on it.
+
+    All other surfaces are farther away. It is not one of `SCENES`, since it is for near limits alone.
+
+    Args:
+        seed: seed of textures, cameras and exposures.
+        views: number of cameras, about 0.9 apart.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
+        height: of the cameras above the table.
+    """
+    surfaces: list[Painted] = [
+        (Cuboid((-3.0, -1.7, -2.5), (3.0, 1.2, 2.5), STONE), "strong"),
+        (Cuboid((-1.6, height, -1.1), (1.6, height + 0.04, 1.1), OAK), "faint"),
+        (Cuboid((2.0, 0.3, -2.4), (2.8, 1.2, -1.0), BLUE), "strong"),
+        (Cuboid((-2.8, -0.3, 1.4), (-2.0, 1.2, 2.4), BRICK), "strong"),
+    ]
+    room = _painted("table", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
+    return _scene("plain_table", room, views=views, turned=turned, spread=(0.9, 0.06, 0.6), exposure=exposure)
+
+
 def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
     """Return the furnished room of `pano_mvs.testing.room` with its nearly plain texture.
 

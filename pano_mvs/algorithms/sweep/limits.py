@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend
-from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_limits
+from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_at, range_limits
+from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
@@ -24,6 +28,7 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 _STEPS_PER_OCTAVE = 4
 _WIDTH = 256
 _PLANES = 96
+_SETTINGS = SURFACE_SETTINGS.replace(planes=_PLANES)
 _MAX_PICTURES = 5
 # The small sweeps begin at this share of the mean baseline.
 _NEAREST_BASELINES = 0.05
@@ -33,6 +38,9 @@ _MIN_SHARE = 0.01
 # Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest measurable range
 # or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
 _OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
+# A plain surface nearer than any textured one ends in the nearest planes, in an area of at least this share of the
+# sphere. The near limit is then lowered in steps of half an octave. Where four do not help, chance decides.
+_NEAREST_PLANES, _MIN_ENDED_SHARE, _MAX_STEPS = 3, 0.003, 4
 # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
 _MIN_CONTRAST = 4
 
@@ -51,6 +59,8 @@ def limits_by_sweeping(
     agree on, where there is texture, gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin.
     Unlike sparse points this sees smooth and near surfaces too, and it does not care how the pictures are turned.
     Where a tenth of the sphere lies as good as infinitely far (the sky), the farthest range is the resolution's limit.
+    If a small sweep between these limits ends in the nearest planes on a large area without texture, the surface there
+    may be nearer than all that have texture. The near limit is then lowered until no such area is left.
 
     Args:
         pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
@@ -72,10 +82,9 @@ def limits_by_sweeping(
     width = pictures[0].shape[1]
     small = [reduced_panorama(picture, _WIDTH) for picture in pictures[:_MAX_PICTURES]]
     small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MAX_PICTURES]]
-    maps = [
-        _coarse(idx, small, small_masks, poses=poses, width=width, backend=helper_backend(backend), device=device)
-        for idx in range(len(poses))
-    ]
+    sweeps = _SmallSweeps(small, small_masks, poses, helper_backend(backend), device)
+    nearest, farthest = range_limits(_baselines(0, poses), width=width)
+    maps = [_coarse(idx, sweeps, width=width) for idx in range(len(poses))]
     checked = check_consistency(
         maps[0],
         poses[0],
@@ -90,41 +99,61 @@ def limits_by_sweeping(
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()
     if solid_angle[agreed].sum() <= _MIN_SHARE * seen_angle:
-        return range_limits(_baselines(0, poses), width=width)
+        return nearest, farthest
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
-    nearest, farthest = range_limits(_baselines(0, poses), width=width)
     near, far = _outward(min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far)
     open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
-    return near, max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
+    far = max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
+    return _lowered(near, far, sweeps), far
 
 
-def _coarse(
-    idx: int,
-    pictures: Sequence[NDArray[np.uint8]],
-    masks: Sequence[NDArray[np.bool_]],
-    *,
-    poses: Sequence[Rigid3],
-    width: int,
-    backend: str,
-    device: str,
-) -> RangeMap:
-    """Return the small range map of one of the pictures, swept against all others."""
-    baselines = _baselines(idx, poses)
-    others = [other for other, baseline in enumerate(baselines) if baseline > 0]
-    near = _NEAREST_BASELINES * mean_baseline(baselines)
+@dataclass(frozen=True, eq=False)
+class _SmallSweeps:
+    """Reduced pictures that can be swept against each other: (H, W, 3) each, with masks (H, W) and poses."""
+
+    pictures: Sequence[NDArray[np.uint8]]
+    masks: Sequence[NDArray[np.bool_]]
+    poses: Sequence[Rigid3]
+    backend: str
+    device: str
+
+    def range_map(self, idx: int, *, near: float, far: float) -> RangeMap:
+        """Return the range map of one of the pictures, swept against all others that are at another place."""
+        others = [other for other, baseline in enumerate(_baselines(idx, self.poses)) if baseline > 0]
+        return sweep_range(
+            self.pictures[idx],
+            [self.pictures[other] for other in others],
+            [self.poses[other] @ self.poses[idx].inverse() for other in others],
+            near=near,
+            far=far,
+            settings=_SETTINGS,
+            backend=self.backend,
+            device=self.device,
+            reference_mask=self.masks[idx],
+            source_masks=[self.masks[other] for other in others],
+        )
+
+
+def _coarse(idx: int, sweeps: _SmallSweeps, *, width: int) -> RangeMap:
+    """Return the range map of one of the pictures between very wide limits."""
+    baselines = _baselines(idx, sweeps.poses)
     far = range_limits(baselines, width=width)[1]
-    return sweep_range(
-        pictures[idx],
-        [pictures[other] for other in others],
-        [poses[other] @ poses[idx].inverse() for other in others],
-        near=near,
-        far=far,
-        settings=SURFACE_SETTINGS.replace(planes=_PLANES),
-        backend=backend,
-        device=device,
-        reference_mask=masks[idx],
-        source_masks=[masks[other] for other in others],
-    )
+    return sweeps.range_map(idx, near=_NEAREST_BASELINES * mean_baseline(baselines), far=far)
+
+
+def _lowered(near: float, far: float, sweeps: _SmallSweeps) -> float:
+    """Return the near limit, lowered until no large area without texture ends there; unchanged if one always does."""
+    bare = is_bare(sweeps.pictures[0])
+    most_px = _MIN_ENDED_SHARE * 2 / np.pi * bare.size
+    baseline = mean_baseline(_baselines(0, sweeps.poses))
+    for step in range(_MAX_STEPS + 1):
+        lower = near / 2 ** (step / 2)
+        found = sweeps.range_map(0, near=lower, far=far)
+        first = range_at(_NEAREST_PLANES, lower, far, planes=_PLANES, spacing=_SETTINGS.spacing, baseline=baseline)
+        ended = np.where(bare & (found.range < first), np.float32(lower), np.float32(np.nan))
+        if not remove_speckles(with_ranges(found, ended), max_size_px=most_px).valid.any():
+            return float(lower)
+    return near
 
 
 def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:

@@ -1,18 +1,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep import limits
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, roll_panorama
+from pano_mvs.scene import RangeMap
 from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
-from pano_mvs.testing.scenes import desk
+from pano_mvs.testing.scenes import desk, plain_table
 
 Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], list[NDArray[np.float32]]]
 
@@ -56,6 +61,45 @@ def test_something_near_is_possible_where_nothing_near_agrees(capture: Capture) 
     """A surface without texture, which no small sweep finds, may still be as near as half a baseline."""
     pictures, poses, _ = capture
     assert limits_by_sweeping(pictures, poses, masks=no_masks(4))[0] <= 0.5 * mean_baseline(poses)
+
+
+@pytest.fixture(scope="module")
+def table() -> Capture:
+    """Pictures of a table without much texture, the last one first."""
+    scene = plain_table(seed=0, views=4, height=0.35)
+    views = [scene.view(idx, SIZE_HW, supersample=1) for idx in (3, 0, 1, 2)]
+    return [image for image, _ in views], [scene.poses[idx] for idx in (3, 0, 1, 2)], [truth for _, truth in views]
+
+
+def test_the_near_limit_reaches_a_plain_table_nearer_than_all_textured_surfaces(
+    table: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures, poses, truth = table
+    nearest = np.nanmin(truth[0])
+    near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+    assert 0.6 * nearest < near < nearest
+    monkeypatch.setattr(limits, "_MIN_ENDED_SHARE", 1.0)
+    textured, same_far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+    assert textured > 1.2 * nearest
+    assert same_far == far
+
+
+def test_the_near_limit_stays_where_lower_ones_do_not_help(table: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain pixels that end in the nearest planes of every sweep are there by chance."""
+    pictures, poses, _ = table
+    wide, tried = limits._NEAREST_BASELINES * 2 * mean_baseline(poses), []
+
+    def ended(*args: Any, near: float, **settings: Any) -> RangeMap:
+        found = sweep_range(*args, near=near, **settings)
+        if near < wide:
+            return found
+        tried.append(near)
+        return replace(found, range=np.full_like(found.range, near))
+
+    monkeypatch.setattr(limits, "sweep_range", ended)
+    near, _ = limits_by_sweeping(pictures, poses, masks=no_masks(4))
+    assert near == tried[0]
+    assert tried[-1] == pytest.approx(near / 4)
 
 
 def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
