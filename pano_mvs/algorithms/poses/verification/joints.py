@@ -40,8 +40,8 @@ class JointEvidence:
     Attributes:
         agreeing_sr: solid angle in which both parts see a surface at the same place.
         contradicting_sr: solid angle in which one part looks through a surface of the other one.
-        density: matches per solid angle that agrees, relative to those of cameras of one part; NaN if no image of one
-            part was compared with one of the other.
+        density: matches per solid angle that agrees, relative to those of cameras of one part; NaN if a matcher has
+            compared none of these pairs.
     """
 
     agreeing_sr: float
@@ -182,17 +182,15 @@ def joint_evidence(
             ranges[image] = _own_range(confirmation, cameras, image, partners=partners)
             matches = np.mean([_matches_of(model, image, partner) for partner in partners])
             own_density.append(matches / max(_solid_angle(np.isfinite(ranges[image])), _MIN_AGREEING_SR))
-    agreeing = contradicting = common = matches_between = 0.0
+    agreeing = contradicting = matches_between = 0.0
     pairs = [pair for one in sides[0] for other in sides[1] for pair in ((one, other), (other, one))]
     for a, b in pairs:
         agrees, contradicts = _compared(ranges[a], ranges[b], cameras[b] @ cameras[a].inverse())
         agreeing += _solid_angle(agrees) / len(pairs)
         contradicting += _solid_angle(contradicts) / len(pairs)
-        if _was_compared(model, a, b):
-            common += _solid_angle(agrees) / len(pairs)
-            matches_between += _matches_of(model, a, b) / len(pairs)
+        matches_between += _matches_of(model, a, b) / len(pairs)
+    density = matches_between / max(agreeing, 1e-9) / max(float(np.median(own_density)), 1e-9)
     is_known = any(_was_compared(model, a, b) for a, b in pairs)
-    density = matches_between / max(common, 1e-9) / max(float(np.median(own_density)), 1e-9)
     return JointEvidence(agreeing, contradicting, density if is_known else np.nan)
 
 
