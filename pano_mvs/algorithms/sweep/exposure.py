@@ -149,8 +149,8 @@ def shrink(picture: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
     factor = max(1, height // rows)
     while height % factor or width % (2 * factor):
         factor -= 1
-    rows = np.sum([picture[row::factor] for row in range(factor)], axis=0, dtype=np.uint32)
-    blocks = np.sum([rows[:, column::factor] for column in range(factor)], axis=0)
+    lines = np.asarray(np.sum([picture[row::factor] for row in range(factor)], axis=0, dtype=np.uint32))
+    blocks = np.sum([lines[:, column::factor] for column in range(factor)], axis=0)
     return np.asarray(np.rint(blocks / factor**2), dtype=np.uint8)
 
 
