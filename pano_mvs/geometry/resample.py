@@ -38,9 +38,14 @@ def pad_panorama(panorama: NDArray[Scalar], pad_px: int) -> NDArray[Scalar]:
             f"cannot pad a {width}×{height} panorama by {pad_px} px: the width must be even, the margin "
             f"at most the height"
         )
-    turned = np.roll(panorama, width // 2, axis=1)
-    rows = np.concatenate([turned[:pad_px][::-1], panorama, turned[height - pad_px :][::-1]], axis=0)
-    return np.concatenate([rows[:, width - pad_px :], rows, rows[:, :pad_px]], axis=1)
+    padded = np.empty((height + 2 * pad_px, width + 2 * pad_px, *panorama.shape[2:]), panorama.dtype)
+    inner = slice(pad_px, pad_px + width)
+    padded[pad_px : pad_px + height, inner] = panorama
+    padded[:pad_px, inner] = np.roll(panorama[:pad_px], width // 2, axis=1)[::-1]
+    padded[pad_px + height :, inner] = np.roll(panorama[height - pad_px :], width // 2, axis=1)[::-1]
+    padded[:, :pad_px] = padded[:, width : width + pad_px]
+    padded[:, pad_px + width :] = padded[:, pad_px : 2 * pad_px]
+    return padded
 
 
 def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDArray[np.float64]:

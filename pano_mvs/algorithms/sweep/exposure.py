@@ -145,12 +145,13 @@ def _smooth(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def shrink(picture: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
     """Return a picture of at most `rows` rows, made smaller by a whole factor by averaging; (H, W, C)."""
-    height, width, channels = picture.shape
+    height, width = picture.shape[:2]
     factor = max(1, height // rows)
     while height % factor or width % (2 * factor):
         factor -= 1
-    blocks = picture.reshape(height // factor, factor, width // factor, factor, channels)
-    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
+    lines = np.asarray(np.sum([picture[row::factor] for row in range(factor)], axis=0, dtype=np.uint32))
+    blocks = np.sum([lines[:, column::factor] for column in range(factor)], axis=0)
+    return np.asarray(np.rint(blocks / factor**2), dtype=np.uint8)
 
 
 def match_all(
