@@ -121,10 +121,14 @@ def test_rooms_have_no_sky(gain: float) -> None:
 
 
 @pytest.mark.slow
-def test_the_sky_is_found_through_windows_and_walls_stay() -> None:
-    """Panes look like plain panels in the frames of the windows, and get their ranges."""
+@pytest.mark.parametrize("shade", [(1.0, 1.0, 1.0), (0.5, 0.3, 0.2)], ids=["sky", "dark"])
+def test_the_sky_is_found_through_windows_and_walls_stay(shade: tuple[float, float, float]) -> None:
+    """Panes look like plain panels in the frames of the windows, and get their ranges; those with a dark hall stay."""
     scene, size = window_room(seed=0, sky="blue"), (256, 512)
     views = [scene.view(idx, size, supersample=1) for idx in range(3)]
+    pictures = [
+        np.where(np.isnan(true)[..., None], picture * shade, picture).astype(np.uint8) for picture, true in views
+    ]
     true = views[1][1]
     sky = np.isnan(true)
     ranges = np.where(sky, np.float32(2.7), true)
@@ -132,14 +136,17 @@ def test_the_sky_is_found_through_windows_and_walls_stay() -> None:
     everything = np.ones(size, np.bool_)
     found = sky_pixels(
         RangeMap(ranges, confidence),
-        views[1][0],
-        [views[0][0], views[2][0]],
+        pictures[1],
+        [pictures[0], pictures[2]],
         source_from_reference=[scene.poses[idx] @ scene.poses[1].inverse() for idx in (0, 2)],
         valid=everything,
         source_valid=[everything] * 2,
         rng=np.random.default_rng(0),
     )
     area = np.broadcast_to(pixel_solid_angle(size)[:, None], size)
+    if shade[0] < 1:
+        assert not found.any()
+        return
     assert area[found & sky].sum() > 0.4 * area[sky].sum()
     assert area[found & ~sky].sum() < 0.005 * area[~sky].sum()
 

@@ -67,6 +67,8 @@ _ENCLOSED = 0.7
 # A window: the smallest and the largest pane, how far what is behind it is, and how many pixels beside must show it.
 _PANE_SHARES, _FAR_PARALLAX = (2e-4, 0.01), 0.125
 _BESIDE_PX, _MIN_BESIDE, _MIN_FAR_SHARE = 4, 8, 0.04
+# It is far compared with the room, too, and the pane is among the brightest of the picture, and no redder than half.
+_MAX_FAR_RATIO, _BRIGHTER_SHARE, _BLUER_SHARE, _MIN_LIGHT = 0.4, 0.9, 0.5, 0.5
 # At infinity, one source agrees; at the range of the frame, another one sees what is behind the window.
 _MAX_BESIDE_ERROR, _MIN_SEEN_BEHIND, _MOST_MOVED = 4.0, 30.0, 0.9
 
@@ -189,7 +191,9 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
     at_infinity, at_range = source_errors(view.picture, view.consistent, view.comparisons)
     parallax = np.max([source.parallax_px for source in view.comparisons], axis=0) * (2 * np.pi / labels.shape[1])
     known = view.consistent & ~is_bare(view.picture)
-    far = known & (parallax > 0) & (parallax < _FAR_PARALLAX)
+    usual = float(np.median(parallax[known])) if known.any() else 0.0
+    far = known & (parallax > 0) & (parallax < min(_FAR_PARALLAX, _MAX_FAR_RATIO * usual))
+    light = _could_be_light(view)
     best, worst = np.fmin.reduce(at_infinity), np.nan_to_num(np.fmax.reduce(at_range))
     near_far = dilated(far, _BESIDE_PX)
     found: Mask = np.zeros(far.shape, np.bool_)
@@ -197,7 +201,7 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
     for label in np.unique(labels[near_far & (labels >= 0)]):
         area = labels == label
         beside = area & near_far & np.isfinite(best)
-        if not least <= sizes[label] <= most or beside.sum() < _MIN_BESIDE:
+        if not least <= sizes[label] <= most or beside.sum() < _MIN_BESIDE or light[area].mean() < _MIN_LIGHT:
             continue
         around = dilated(area, _BESIDE_PX) & ~dilated(area, 1)
         is_open = (far & around).sum() >= _MIN_FAR_SHARE * max((known & around).sum(), 1)
@@ -205,6 +209,21 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
         if is_open and moved and np.median(best[beside]) <= _MAX_BESIDE_ERROR:
             found |= area
     return found
+
+
+def _could_be_light(view: _View) -> Mask:
+    """Return the pixels (H, W) that are bright and not redder than most of the picture, as the sky is from indoors."""
+    levels = view.picture.astype(np.float64)
+    brightness, blueness = largest_channel(view.picture), (levels[..., 2] + 4) / (levels[..., 0] + 4)
+    is_bright = brightness >= _quantile(brightness, _BRIGHTER_SHARE)
+    return np.asarray(is_bright & (blueness >= _quantile(blueness, _BLUER_SHARE)))
+
+
+def _quantile(values: NDArray[Any], share: float) -> float:
+    """Return a quantile over the sphere of values (H, W)."""
+    order = np.argsort(values, axis=None, kind="stable")
+    below = np.cumsum(pixel_weights(values.shape).ravel()[order])
+    return float(values.ravel()[order[np.searchsorted(below, share * below[-1])]])
 
 
 def _clouds(view: _View) -> Mask:
