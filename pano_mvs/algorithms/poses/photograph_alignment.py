@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -43,15 +44,15 @@ class Aligned(NamedTuple):
 
 
 class PanoramaPatches:
-    """The panoramas and the points of their surfaces, of which those of the last few photographs stay in memory.
+    """The panoramas and the points of their surfaces; the panoramas of the last few photographs stay in memory.
 
     Args:
-        surfaces: points by the names of the panoramas.
+        surface: returns the points of a panorama by its name.
         load: returns a panorama (H, W, 3) by its name.
     """
 
-    def __init__(self, surfaces: Mapping[str, SurfacePoints], load: Callable[[str], NDArray[np.uint8]]) -> None:
-        self.surfaces = surfaces
+    def __init__(self, surface: Callable[[str], SurfacePoints], load: Callable[[str], NDArray[np.uint8]]) -> None:
+        self.surface = surface
         self._load = load
         self._held: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
 
@@ -66,7 +67,7 @@ class PanoramaPatches:
 
 
 class PhotographPatches:
-    """A photograph that is aligned with panoramas.
+    """A photograph that is aligned with panoramas. It is kept in grey, and smoothed when it is needed.
 
     Args:
         photograph: (H, W, 3) uint8 RGB.
@@ -75,8 +76,12 @@ class PhotographPatches:
 
     def __init__(self, photograph: NDArray[np.uint8], panoramas: PanoramaPatches) -> None:
         self._size_hw = (photograph.shape[0], photograph.shape[1])
-        self._levels = photograph_levels(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY))
+        self._gray = np.asarray(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY), np.uint8)
         self._panoramas = panoramas
+
+    @cached_property
+    def _levels(self) -> list[NDArray[np.float32]]:
+        return photograph_levels(self._gray)
 
     def aligned(self, camera: PhotographCamera, names: Iterable[str], *, prior: FocalPrior) -> Aligned:
         """Return the camera that some panoramas' patches confirm best, from one that is accurate to about a degree.
@@ -99,7 +104,7 @@ class PhotographPatches:
         return Sightings.joined(
             [
                 sight_points(
-                    self._panoramas.surfaces[name],
+                    self._panoramas.surface(name),
                     self._panoramas.levels(name)[level],
                     self._levels,
                     camera=camera,

@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.faces.pictures import face_image
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
-from pano_mvs.algorithms.poses.colmap.localise import (
-    KnownPoints,
-    Localised,
-    has_sift,
-    known_points,
-    localise_photograph,
-)
+from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
+from pano_mvs.algorithms.poses.photograph_points import KnownPoints, has_sift, known_points
 from pano_mvs.algorithms.poses.photograph_surface import surface_points
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
@@ -49,7 +44,7 @@ def model() -> Model:
         known[name] = known_points(features, pose, range_map, min_confidence=128)
         surfaces[name] = surface_points(features, pose, range_map, min_confidence=128)
         pictures[name] = picture
-    return known, PanoramaPatches(surfaces, pictures.__getitem__)
+    return known, PanoramaPatches(surfaces.__getitem__, pictures.__getitem__)
 
 
 @pytest.fixture(scope="module")

@@ -79,7 +79,7 @@ def test_a_camera_is_recovered_from_sightings(given: Given) -> None:
 
 def test_alignment_improves_a_camera_and_confirms_it(given: Given) -> None:
     surface, panorama, photograph = given
-    patches = PhotographPatches(photograph, PanoramaPatches({"a": surface}, {"a": panorama}.__getitem__))
+    patches = PhotographPatches(photograph, PanoramaPatches(lambda _: surface, lambda _: panorama))
     turn = rotation_from_rotvec(np.radians([0.5, -0.4, 0.3]))
     start = PhotographCamera(Rigid3.from_center(turn @ POSE.rotation, POSE.center + 0.03), 1.01 * FOCAL_PX, 0.0)
     aligned = patches.aligned(start, ["a"], prior=FocalPrior(FOCAL_PX, 0.1))
