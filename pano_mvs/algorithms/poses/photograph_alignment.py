@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, Sightings, refine_by_sightings
-from pano_mvs.algorithms.poses.photograph_patches import panorama_levels, photograph_levels, sight_points
+from pano_mvs.algorithms.poses.photograph_patches import (
+    MIN_SIDE_PX,
+    panorama_levels,
+    photograph_levels,
+    sight_points,
+)
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
+from pano_mvs.core.errors import UsageError
 
 _MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
 _KEPT_PANORAMAS = 10
@@ -79,6 +85,11 @@ class PhotographPatches:
         self._gray = np.asarray(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY), np.uint8)
         self._panoramas = panoramas
 
+    @property
+    def too_narrow(self) -> bool:
+        """Whether the photograph, reduced to at most 2048 pixels, is narrower or lower than a patch."""
+        return min(self._gray.shape) < MIN_SIDE_PX
+
     @cached_property
     def _levels(self) -> list[NDArray[np.float32]]:
         return photograph_levels(self._gray)
@@ -90,7 +101,12 @@ class PhotographPatches:
             camera: the camera to start from.
             names: the panoramas.
             prior: what is known about the focal length.
+
+        Raises:
+            UsageError: if the photograph is too narrow.
         """
+        if self.too_narrow:
+            raise UsageError(f"the photograph, reduced to {self._gray.shape}, is smaller than a patch")
         chosen, sightings = list(names), Sightings.joined([])
         for level in _ROUNDS:
             sightings = self._sightings(camera, chosen, level)

@@ -194,6 +194,22 @@ def test_a_photograph_of_something_else_is_refused(panoramas: dict[str, KnownPoi
     assert "match" in found
 
 
+def test_a_strip_is_refused(model: Model, taken: tuple[Picture, Rigid3]) -> None:
+    """It has enough matches for a pose, but no patch fits into it."""
+    keypoints = photograph_keypoints(taken[0])
+    inside = np.abs(keypoints.pixels_px[:, 1] - 180) < 10
+    strip = PhotographKeypoints(keypoints.pixels_px[inside] - [0, 170], keypoints.descriptors[inside])
+    found = localise_photograph(
+        strip,
+        (20, PHOTO_HW[1]),
+        model[0],
+        focal_px=FOCAL_PX,
+        patches=PhotographPatches(taken[0][170:190], model[1]),
+        rng=np.random.default_rng(0),
+    )
+    assert found == "it is 480 × 20 pixels, which is too narrow to be compared with panoramas"
+
+
 def test_a_blank_photograph_is_refused(panoramas: dict[str, KnownPoints]) -> None:
     assert localised(np.full((*PHOTO_HW, 3), 128, np.uint8), panoramas) == (
         "only 0 of its 0 key points match points of the panoramas"

@@ -93,6 +93,8 @@ def localise_photograph(
         max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
+    if patches is not None and patches.too_narrow:
+        return f"it is {size_hw[1]} × {size_hw[0]} pixels, which is too narrow to be compared with panoramas"
     panoramas = _similar(keypoints, panoramas, candidates)
     each = {name: _matches(keypoints, known) for name, known in panoramas.items()}
     matches = _joined(each.values())
