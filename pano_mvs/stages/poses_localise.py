@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
@@ -25,12 +25,13 @@ from pano_mvs.api import (
     Params,
     Poses,
     RangeMap,
+    UsageError,
     arguments_from,
     params_from,
     stage,
 )
-from pano_mvs.core.paths import is_file
-from pano_mvs.io.images.captures import list_pictures
+from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.io.images.captures import PICTURE_SUFFIXES, files_below, list_pictures
 from pano_mvs.io.images.containers import read_container
 from pano_mvs.io.images.exif import focal_from_exif
 from pano_mvs.scene.image_files.image_file import decode_image
@@ -57,6 +58,17 @@ class LocaliseParams(Params):
 
     path: InputPath = Field(description="folder of photographs, or one photograph")
     min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of ranges (128: consistent)")
+
+    @field_validator("path")
+    @classmethod
+    def _has_photographs(cls, path: Path) -> Path:
+        """Refuse a folder without photographs with the workflow, before anything is computed."""
+        if is_folder(path) and not any(file.suffix.lower() in PICTURE_SUFFIXES for file in files_below(path, [])):
+            kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
+            raise UsageError(
+                f"{path}: no photographs here. Supported formats: {kinds}; folders called masks are skipped"
+            )
+        return path
 
 
 @stage("poses.localise", memory=localise_memory_bytes)

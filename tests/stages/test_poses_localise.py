@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 
 from pano_mvs.algorithms.faces.pictures import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
@@ -105,6 +106,17 @@ def test_memory_does_not_grow_with_captures_of_more_panoramas_than_are_used() ->
     assert needed(10) < needed(20) < needed(21)
     assert needed(5000, candidates=40) - needed(5000) == needed(80, candidates=40) - needed(40)
     assert needed(5000, candidates=0) > 30e9
+
+
+def test_an_empty_folder_is_refused_with_the_settings(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (8, 8)).save(tmp_path / "masks" / "1.png")
+    (tmp_path / "notes.txt").write_text("no photograph")
+    with pytest.raises(ValidationError, match="no photographs here"):
+        LocaliseParams(path=tmp_path)
+    (tmp_path / "lobby").mkdir()
+    (tmp_path / "lobby" / "1.JPG").touch()
+    assert LocaliseParams(path=tmp_path).path == tmp_path
 
 
 def test_a_missing_folder_is_named(capture: Inputs, tmp_path: Path) -> None:
