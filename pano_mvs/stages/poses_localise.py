@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from pano_mvs.algorithms.features.photograph import photograph_keypoints
-from pano_mvs.algorithms.poses.colmap.localise import (
-    KnownPoints,
-    Localised,
-    has_sift,
-    known_points,
-    localise_photograph,
-)
+from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
+from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
+from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
 from pano_mvs.api import (
     All,
     Context,
@@ -31,12 +25,13 @@ from pano_mvs.api import (
     Params,
     Poses,
     RangeMap,
+    UsageError,
     arguments_from,
     params_from,
     stage,
 )
-from pano_mvs.core.paths import is_file
-from pano_mvs.io.images.captures import list_pictures
+from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.io.images.captures import PICTURE_SUFFIXES, files_below, list_pictures
 from pano_mvs.io.images.containers import read_container
 from pano_mvs.io.images.exif import focal_from_exif
 from pano_mvs.scene.image_files.image_file import decode_image
@@ -44,10 +39,17 @@ from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.record import FilePart
 
+# Photographs whose panoramas are chosen together: the larger, the less often the panoramas are read.
+_BLOCK = 32
+_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 600_000_000, 7_000_000, 6_000_000
 
-def localise_memory_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
-    """Return the memory for a photograph and the key points of all panoramas, of which there are 8000 by default."""
-    return 600_000_000 + 6_000_000 * len(inputs["ranges"])
+
+def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for a block of photographs and the panoramas in memory, of 8000 key points (the default)."""
+    candidates, count = _candidates(params), len(inputs["ranges"])
+    photographs = _BLOCK if 0 < candidates < count else 1
+    kept = LocatedPanoramas.kept(candidates, count)
+    return _BASE_BYTES + _BYTES_OF_A_PHOTOGRAPH * photographs + _BYTES_OF_A_PANORAMA * kept
 
 
 @params_from(localise_photograph, own_last=True)
@@ -56,6 +58,17 @@ class LocaliseParams(Params):
 
     path: InputPath = Field(description="folder of photographs, or one photograph")
     min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of ranges (128: consistent)")
+
+    @field_validator("path")
+    @classmethod
+    def _has_photographs(cls, path: Path) -> Path:
+        """Refuse a folder without photographs with the workflow, before anything is computed."""
+        if is_folder(path) and not any(file.suffix.lower() in PICTURE_SUFFIXES for file in files_below(path, [])):
+            kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
+            raise UsageError(
+                f"{path}: no photographs here. Supported formats: {kinds}; folders called masks are skipped"
+            )
+        return path
 
 
 @stage("poses.localise", memory=localise_memory_bytes)
@@ -74,50 +87,94 @@ def localise(
     used.
     """
     group = split_groups(poses)[0]
-    known: dict[str, KnownPoints] = {}
-    surfaces: dict[str, SurfacePoints] = {}
-    for idx, name in enumerate(group.names):
-        if name in features and name in ranges and name in images and has_sift(features[name]):
-            given = features[name], group.cam_from_world(idx), ranges[name]
-            known[name] = known_points(*given, min_confidence=params.min_confidence)
-            surfaces[name] = surface_points(*given, min_confidence=params.min_confidence)
-    patches = PanoramaPatches(surfaces, lambda name: images[name].load())
-    if not known:
+    panoramas = LocatedPanoramas(
+        {name: group.cam_from_world(idx) for idx, name in enumerate(group.names) if name in images},
+        features,
+        ranges,
+        min_confidence=params.min_confidence,
+        candidates=_candidates(params),
+    )
+    if not panoramas:
         ctx.note("no panorama has both a range map and SIFT key points (features.sift_tangent)")
+    patches = PanoramaPatches(panoramas.surface, lambda name: images[name].load())
     folder, paths = _photographs(params.path)
-    found: dict[str, tuple[tuple[int, int], Localised]] = {}
+    named = {path.relative_to(folder).as_posix(): path for path in paths}
+    found: dict[str, _Found] = {}
     rejected: dict[str, str] = {}
-    for path in paths:
-        name = path.relative_to(folder).as_posix()
-        try:
-            size_hw, result = _localised(path, known, patches, params=params, ctx=ctx)
-        except InputError as error:
-            result = str(error)
-        if isinstance(result, Localised):
-            found[name] = size_hw, result
-        else:
+    for name, result in _results(named, panoramas, patches, params=params, ctx=ctx):
+        if isinstance(result, str):
             rejected[name] = result
             ctx.note(f"{name} was not localised: {result}")
+        else:
+            found[name] = result
     ctx.note(f"{len(found)} of {len(paths)} photographs were localised")
     ctx.metric("localised", len(found) / max(1, len(paths)))
-    return _record(found, rejected, {path.relative_to(folder).as_posix(): path for path in paths}, ctx=ctx)
+    return _record(found, rejected, named, ctx=ctx)
 
 
-def _localised(
-    path: Path, known: dict[str, KnownPoints], patches: PanoramaPatches, *, params: LocaliseParams, ctx: Context
-) -> tuple[tuple[int, int], Localised | str]:
-    data = FilePart(path).read_bytes()
-    picture = decode_image(path, data)
-    size_hw = (picture.shape[0], picture.shape[1])
-    return size_hw, localise_photograph(
-        photograph_keypoints(picture),
-        size_hw,
-        known,
-        focal_px=focal_from_exif(read_container(data).exif, size_hw),
-        patches=PhotographPatches(picture, patches),
-        **arguments_from(localise_photograph, params),
-        rng=ctx.rng,
-    )
+def _candidates(params: Params) -> int:
+    candidates: int = arguments_from(localise_photograph, params)["candidates"]
+    return candidates
+
+
+class _Found(NamedTuple):
+    size_hw: tuple[int, int]
+    localised: Localised
+
+
+class _Photograph(NamedTuple):
+    size_hw: tuple[int, int]
+    focal_px: float | None
+    keypoints: PhotographKeypoints
+    patches: PhotographPatches
+
+
+def _results(
+    paths: Mapping[str, Path],
+    panoramas: LocatedPanoramas,
+    patches: PanoramaPatches,
+    *,
+    params: LocaliseParams,
+    ctx: Context,
+) -> Iterator[tuple[str, _Found | str]]:
+    """Yield each photograph that is localised, and the reason for each other one, by name.
+
+    In large captures, the panoramas are read once for each block of photographs.
+    """
+    block = _BLOCK if panoramas.chooses else 1
+    for names in (list(paths)[start : start + block] for start in range(0, len(paths), block)):
+        read = {name: _read(paths[name], patches) for name in names}
+        readable = {name: photograph for name, photograph in read.items() if isinstance(photograph, _Photograph)}
+        chosen = panoramas.most_similar([photograph.keypoints.descriptors for photograph in readable.values()])
+        of_name = dict(zip(readable, chosen, strict=True))
+        del readable
+        for name in names:
+            photograph = read.pop(name)  # what it computes is freed before the next one
+            if isinstance(photograph, str):
+                yield name, photograph
+                continue
+            result = localise_photograph(
+                photograph.keypoints,
+                photograph.size_hw,
+                panoramas.points(of_name[name]),
+                focal_px=photograph.focal_px,
+                patches=photograph.patches,
+                **arguments_from(localise_photograph, params),
+                rng=ctx.rng,
+            )
+            yield name, result if isinstance(result, str) else _Found(photograph.size_hw, result)
+
+
+def _read(path: Path, patches: PanoramaPatches) -> _Photograph | str:
+    """Return a photograph, or the reason why it cannot be read."""
+    try:
+        data = FilePart(path).read_bytes()
+        picture = decode_image(path, data)
+        size_hw = (picture.shape[0], picture.shape[1])
+        focal_px = focal_from_exif(read_container(data).exif, size_hw)
+    except InputError as error:
+        return str(error)
+    return _Photograph(size_hw, focal_px, photograph_keypoints(picture), PhotographPatches(picture, patches))
 
 
 def _photographs(path: Path) -> tuple[Path, list[Path]]:
@@ -135,7 +192,7 @@ def _copied(path: Path, number: int, ctx: Context) -> FilePart:
 
 
 def _record(
-    found: dict[str, tuple[tuple[int, int], Localised]],
+    found: dict[str, _Found],
     rejected: dict[str, str],
     paths: dict[str, Path],
     *,
@@ -144,10 +201,10 @@ def _record(
     def each(values: Iterable[object], dtype: type[np.generic], *shape: int) -> NDArray[Any]:
         return np.array(list(values), dtype).reshape(len(found), *shape)
 
-    results = [result for _, result in found.values()]
+    results = [one.localised for one in found.values()]
     return Photographs(
         names=tuple(found),
-        sizes_hw=each((size_hw for size_hw, _ in found.values()), np.int32, 2),
+        sizes_hw=each((one.size_hw for one in found.values()), np.int32, 2),
         focals_px=each((result.focal_px for result in results), np.float64),
         radials=each((result.radial for result in results), np.float64),
         rotations=each((result.cam_from_world.rotation for result in results), np.float64, 3, 3),

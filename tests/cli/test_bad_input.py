@@ -171,6 +171,20 @@ def test_masks_that_are_not_there(pano_mvs: Command, short: Path) -> None:
     assert "nowhere does not exist" in result.flat
 
 
+@pytest.mark.parametrize("command", ["check", "plan", "run"])
+def test_a_folder_without_photographs_is_refused_before_anything_is_computed(
+    pano_mvs: Command, tmp_path: Path, capture: Path, command: str
+) -> None:
+    path = tmp_path / "photographs.yaml"
+    path.write_text("pano_mvs: 1\nextends: quality\nstages:\n  photographs: {use: poses.localise, path: phone}\n")
+    (tmp_path / "phone").mkdir()
+    arguments = ("check", path) if command == "check" else (command, path, "--images", capture / "images")
+    result = pano_mvs(*arguments)
+    assert result.code == 2
+    assert "photographs.yaml:4:" in result.flat
+    assert "no photographs here" in result.flat
+
+
 def test_picture_without_its_mask_is_noted(pano_mvs: Command, short: Path, capture: Path) -> None:
     Path("masks").mkdir()
     for name in ("000.png.png", "001.png"):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 
 from pano_mvs.algorithms.faces.pictures import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
@@ -14,7 +15,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, FilePart, Panorama, Poses, RangeMap
-from pano_mvs.stages.poses_localise import LocaliseParams, localise
+from pano_mvs.stages.poses_localise import LocaliseParams, localise, localise_memory_bytes
 from pano_mvs.testing.room import default_room, render
 
 SIZE_HW = (192, 384)
@@ -75,6 +76,47 @@ def test_a_folder_is_localised_and_the_rest_is_named(capture: Inputs, folder: Pa
 def test_a_single_photograph_is_localised(capture: Inputs, folder: Path, tmp_path: Path) -> None:
     ctx = Context(np.random.default_rng(0), tmp_path)
     assert localise(*capture, LocaliseParams(path=folder / "2.png"), ctx).names == ("2.png",)
+
+
+@pytest.mark.parametrize("block", [1, 32])
+def test_photographs_of_a_large_capture_are_localised_in_blocks(
+    capture: Inputs, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    """Only one of two panoramas is used; `a.png` matches better."""
+    poses, features, ranges, images = capture
+    monkeypatch.setattr("pano_mvs.stages.poses_localise._BLOCK", block)
+    alone = {"a.png": ranges["a.png"]}
+    expected = localise(
+        poses, features, alone, images, LocaliseParams(path=folder), Context(np.random.default_rng(0), tmp_path)
+    )
+    settings = LocaliseParams.model_validate({"path": folder, "candidates": 1})
+    found = localise(*capture, settings, Context(np.random.default_rng(0), tmp_path))
+    assert found.names == ("phone/2.png",)
+    assert found.rejected == expected.rejected
+    assert found.rotations.tobytes() == expected.rotations.tobytes()
+    assert found.translations.tobytes() == expected.translations.tobytes()
+
+
+def test_memory_does_not_grow_with_captures_of_more_panoramas_than_are_used() -> None:
+    def needed(panoramas: int, **settings: int) -> int:
+        params = LocaliseParams.model_validate({"path": "phone", **settings})
+        return localise_memory_bytes(params, {"ranges": range(panoramas)})
+
+    assert needed(40) == needed(5000) < 1.2e9
+    assert needed(10) < needed(20) < needed(21)
+    assert needed(5000, candidates=40) - needed(5000) == needed(80, candidates=40) - needed(40)
+    assert needed(5000, candidates=0) > 30e9
+
+
+def test_an_empty_folder_is_refused_with_the_settings(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (8, 8)).save(tmp_path / "masks" / "1.png")
+    (tmp_path / "notes.txt").write_text("no photograph")
+    with pytest.raises(ValidationError, match="no photographs here"):
+        LocaliseParams(path=tmp_path)
+    (tmp_path / "lobby").mkdir()
+    (tmp_path / "lobby" / "1.JPG").touch()
+    assert LocaliseParams(path=tmp_path).path == tmp_path
 
 
 def test_a_missing_folder_is_named(capture: Inputs, tmp_path: Path) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -11,8 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, Sightings, refine_by_sightings
-from pano_mvs.algorithms.poses.photograph_patches import panorama_levels, photograph_levels, sight_points
+from pano_mvs.algorithms.poses.photograph_patches import (
+    MIN_SIDE_PX,
+    panorama_levels,
+    photograph_levels,
+    sight_points,
+)
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
+from pano_mvs.core.errors import UsageError
 
 _MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
 _KEPT_PANORAMAS = 10
@@ -43,15 +50,15 @@ class Aligned(NamedTuple):
 
 
 class PanoramaPatches:
-    """The panoramas and the points of their surfaces, of which those of the last few photographs stay in memory.
+    """The panoramas and the points of their surfaces; the panoramas of the last few photographs stay in memory.
 
     Args:
-        surfaces: points by the names of the panoramas.
+        surface: returns the points of a panorama by its name.
         load: returns a panorama (H, W, 3) by its name.
     """
 
-    def __init__(self, surfaces: Mapping[str, SurfacePoints], load: Callable[[str], NDArray[np.uint8]]) -> None:
-        self.surfaces = surfaces
+    def __init__(self, surface: Callable[[str], SurfacePoints], load: Callable[[str], NDArray[np.uint8]]) -> None:
+        self.surface = surface
         self._load = load
         self._held: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
 
@@ -66,7 +73,7 @@ class PanoramaPatches:
 
 
 class PhotographPatches:
-    """A photograph that is aligned with panoramas.
+    """A photograph that is aligned with panoramas. It is kept in grey, and smoothed when it is needed.
 
     Args:
         photograph: (H, W, 3) uint8 RGB.
@@ -75,8 +82,17 @@ class PhotographPatches:
 
     def __init__(self, photograph: NDArray[np.uint8], panoramas: PanoramaPatches) -> None:
         self._size_hw = (photograph.shape[0], photograph.shape[1])
-        self._levels = photograph_levels(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY))
+        self._gray = np.asarray(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY), np.uint8)
         self._panoramas = panoramas
+
+    @property
+    def too_narrow(self) -> bool:
+        """Whether the photograph, reduced to at most 2048 pixels, is narrower or lower than a patch."""
+        return min(self._gray.shape) < MIN_SIDE_PX
+
+    @cached_property
+    def _levels(self) -> list[NDArray[np.float32]]:
+        return photograph_levels(self._gray)
 
     def aligned(self, camera: PhotographCamera, names: Iterable[str], *, prior: FocalPrior) -> Aligned:
         """Return the camera that some panoramas' patches confirm best, from one that is accurate to about a degree.
@@ -85,7 +101,12 @@ class PhotographPatches:
             camera: the camera to start from.
             names: the panoramas.
             prior: what is known about the focal length.
+
+        Raises:
+            UsageError: if the photograph is too narrow.
         """
+        if self.too_narrow:
+            raise UsageError(f"the photograph, reduced to {self._gray.shape}, is smaller than a patch")
         chosen, sightings = list(names), Sightings.joined([])
         for level in _ROUNDS:
             sightings = self._sightings(camera, chosen, level)
@@ -99,7 +120,7 @@ class PhotographPatches:
         return Sightings.joined(
             [
                 sight_points(
-                    self._panoramas.surfaces[name],
+                    self._panoramas.surface(name),
                     self._panoramas.levels(name)[level],
                     self._levels,
                     camera=camera,

@@ -16,6 +16,9 @@ from pano_mvs.algorithms.two_view.refinement import tangent_basis
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+MIN_SIDE_PX = SIZE + 2 * MARGIN + 1
+"""Photographs with a shorter side have no levels."""
+
 _PAD_PX = 8
 _SMOOTHING = 0.5
 # A patch is compared only where the photograph sees the surface at less than 75° from its normal, and not from behind.
@@ -28,10 +31,13 @@ _MAX_LEVELS = 7
 
 
 def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-    """Return a photograph (H, W) at its size, half of it, a quarter …, smoothed as the panoramas are."""
+    """Return a photograph (H, W) at its size, half of it, a quarter …, smoothed as the panoramas are.
+
+    The smaller side of each level has at least `MIN_SIDE_PX` pixels.
+    """
     levels: list[NDArray[np.float32]] = []
     reduced = gray.astype(np.float32)
-    while len(levels) < _MAX_LEVELS and min(reduced.shape) > SIZE + 2 * MARGIN:
+    while len(levels) < _MAX_LEVELS and min(reduced.shape) >= MIN_SIDE_PX:
         levels.append(np.asarray(cv2.GaussianBlur(reduced, (0, 0), _SMOOTHING), np.float32))
         size_xy = [max(1, round(side / 2 ** len(levels))) for side in gray.shape[::-1]]
         reduced = np.asarray(cv2.resize(reduced, size_xy, interpolation=cv2.INTER_AREA), np.float32)

@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.faces.pictures import face_image
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
-from pano_mvs.algorithms.poses.colmap.localise import (
-    KnownPoints,
-    Localised,
-    has_sift,
-    known_points,
-    localise_photograph,
-)
+from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
+from pano_mvs.algorithms.poses.photograph_points import KnownPoints, has_sift, known_points
 from pano_mvs.algorithms.poses.photograph_surface import surface_points
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
@@ -49,7 +44,7 @@ def model() -> Model:
         known[name] = known_points(features, pose, range_map, min_confidence=128)
         surfaces[name] = surface_points(features, pose, range_map, min_confidence=128)
         pictures[name] = picture
-    return known, PanoramaPatches(surfaces, pictures.__getitem__)
+    return known, PanoramaPatches(surfaces.__getitem__, pictures.__getitem__)
 
 
 @pytest.fixture(scope="module")
@@ -197,6 +192,22 @@ def test_a_photograph_of_something_else_is_refused(panoramas: dict[str, KnownPoi
     found = localised(other, panoramas)
     assert isinstance(found, str)
     assert "match" in found
+
+
+def test_a_strip_is_refused(model: Model, taken: tuple[Picture, Rigid3]) -> None:
+    """It has enough matches for a pose, but no patch fits into it."""
+    keypoints = photograph_keypoints(taken[0])
+    inside = np.abs(keypoints.pixels_px[:, 1] - 180) < 10
+    strip = PhotographKeypoints(keypoints.pixels_px[inside] - [0, 170], keypoints.descriptors[inside])
+    found = localise_photograph(
+        strip,
+        (20, PHOTO_HW[1]),
+        model[0],
+        focal_px=FOCAL_PX,
+        patches=PhotographPatches(taken[0][170:190], model[1]),
+        rng=np.random.default_rng(0),
+    )
+    assert found == "it is 480 × 20 pixels, which is too narrow to be compared with panoramas"
 
 
 def test_a_blank_photograph_is_refused(panoramas: dict[str, KnownPoints]) -> None:

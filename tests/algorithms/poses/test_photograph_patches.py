@@ -15,8 +15,14 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     Sightings,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_patches import panorama_levels, photograph_levels, sight_points
+from pano_mvs.algorithms.poses.photograph_patches import (
+    MIN_SIDE_PX,
+    panorama_levels,
+    photograph_levels,
+    sight_points,
+)
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.photograph import render_photograph
@@ -77,9 +83,26 @@ def test_a_camera_is_recovered_from_sightings(given: Given) -> None:
     assert found.focal_px == pytest.approx(FOCAL_PX, rel=0.01)
 
 
+@pytest.mark.parametrize(("shape_hw", "levels"), [((21, 640), 0), ((22, 640), 1), ((240, 320), 4)])
+def test_no_level_is_smaller_than_a_patch(shape_hw: tuple[int, int], levels: int) -> None:
+    found = photograph_levels(np.zeros(shape_hw, np.uint8))
+    assert [min(level.shape) >= MIN_SIDE_PX for level in found] == [True] * levels
+
+
+@pytest.mark.parametrize(("shape_hw", "too_narrow"), [((21, 640), True), ((640, 22), False), ((100, 12000), True)])
+def test_a_strip_cannot_be_aligned(given: Given, shape_hw: tuple[int, int], too_narrow: bool) -> None:
+    strip = PhotographPatches(
+        np.zeros((*shape_hw, 3), np.uint8), PanoramaPatches(lambda _: given[0], lambda _: given[1])
+    )
+    assert strip.too_narrow is too_narrow
+    if too_narrow:
+        with pytest.raises(UsageError, match="smaller than a patch"):
+            strip.aligned(TRUE, ["a"], prior=FocalPrior(FOCAL_PX, 0.1))
+
+
 def test_alignment_improves_a_camera_and_confirms_it(given: Given) -> None:
     surface, panorama, photograph = given
-    patches = PhotographPatches(photograph, PanoramaPatches({"a": surface}, {"a": panorama}.__getitem__))
+    patches = PhotographPatches(photograph, PanoramaPatches(lambda _: surface, lambda _: panorama))
     turn = rotation_from_rotvec(np.radians([0.5, -0.4, 0.3]))
     start = PhotographCamera(Rigid3.from_center(turn @ POSE.rotation, POSE.center + 0.03), 1.01 * FOCAL_PX, 0.0)
     aligned = patches.aligned(start, ["a"], prior=FocalPrior(FOCAL_PX, 0.1))

@@ -14,20 +14,17 @@ from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
 from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
+from pano_mvs.algorithms.poses.photograph_points import KnownPoints
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_from_ray
-from pano_mvs.scene import Features, RangeMap
+from pano_mvs.geometry import Rigid3, geodesic_angle
 
 FloatArray = NDArray[np.float64]
 
 _SEED_LIMIT = 2**31 - 1
-_SIFT_LENGTH = 128
 # Without a focal length in the file, a picture is taken to be as wide as most phones' for the first guess.
 _GUESSED_FOV_DEG = 65.0
 _FOV_BOUNDS_DEG = (15.0, 120.0)
 _MAX_RADIAL = 0.5
-# Ranges are used where the surface is continuous: the relative difference to the pixels beside it.
-_MAX_STEP = 0.03
 # How well EXIF's focal length, or a guessed one, is known: the standard deviation of its natural logarithm.
 _EXIF_LOG_STD, _GUESSED_LOG_STD = 0.1, 0.4
 # With a pose, key points within this many times the maximum error of a point's place are compared with it.
@@ -60,52 +57,6 @@ class Localised(NamedTuple):
     radial: float
     inliers: int
     error_px: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownPoints:
-    """The key points of a panorama whose position is known.
-
-    Attributes:
-        descriptors: (N, D).
-        points_in_world: (N, 3) float64.
-    """
-
-    descriptors: NDArray[np.generic]
-    points_in_world: FloatArray
-
-
-def has_sift(features: Features) -> bool:
-    """Return whether key points can be compared with those of photographs."""
-    return features.metric == "l2" and features.descriptors.shape[1] == _SIFT_LENGTH
-
-
-def known_points(
-    features: Features, cam_from_world: Rigid3, range_map: RangeMap, *, min_confidence: int
-) -> KnownPoints:
-    """Return the key points of a panorama that its range map places in the world.
-
-    Key points at edges of surfaces, whose range is uncertain, are left out.
-
-    Args:
-        features: key points by `extract_sift`.
-        cam_from_world: the panorama's pose.
-        range_map: its ranges.
-        min_confidence: smallest confidence of a range that is used.
-    """
-    height, width = range_map.range.shape
-    x, y = np.floor(pixel_from_ray(features.bearings, (height, width))).astype(np.intp).T
-    x, y = x % width, np.clip(y, 0, height - 1)
-    ranges = range_map.range[y, x].astype(np.float64)
-    beside = np.stack([range_map.range[np.clip(y + dy, 0, height - 1), (x + dx) % width] for dx, dy in _BESIDE])
-    with np.errstate(invalid="ignore"):
-        smooth = (np.abs(beside - ranges) <= _MAX_STEP * ranges).all(axis=0)
-    keep = smooth & np.isfinite(ranges) & (range_map.confidence[y, x] >= min_confidence)
-    points = cam_from_world.inverse().apply(features.bearings[keep] * ranges[keep, None])
-    return KnownPoints(features.descriptors[keep], points)
-
-
-_BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 @checks_settings
@@ -142,6 +93,8 @@ def localise_photograph(
         max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
+    if patches is not None and patches.too_narrow:
+        return f"it is {size_hw[1]} × {size_hw[0]} pixels, which is too narrow to be compared with panoramas"
     panoramas = _similar(keypoints, panoramas, candidates)
     each = {name: _matches(keypoints, known) for name, known in panoramas.items()}
     matches = _joined(each.values())
@@ -174,8 +127,11 @@ def localise_photograph(
 def _similar(
     keypoints: PhotographKeypoints, panoramas: Mapping[str, KnownPoints], count: int
 ) -> dict[str, KnownPoints]:
-    described = {name: known.descriptors for name, known in panoramas.items()}
-    return {name: panoramas[name] for name in similar_panoramas(keypoints.descriptors, described, count=count)}
+    if not 0 < count < len(panoramas):
+        return dict(panoramas)
+    described = ((name, known.descriptors) for name, known in panoramas.items())
+    (chosen,) = similar_panoramas([keypoints.descriptors], described, count=count)
+    return {name: panoramas[name] for name in chosen}
 
 
 class _Matches(NamedTuple):
