@@ -22,10 +22,10 @@ stages:
   poses: {use: poses.from_model, path: CAPTURE/truth/poses.json}
   views: {use: views.nearest, sources: 2}
   depth: {use: depth.sweep, backend: numpy, planes: 8, near: 0.5, far: 6, aggregation: box}
-  speckle: {use: filters.speckle, in: {range_map: depth}}
+  filled: {use: filters.fill, in: {range_map: depth}}
   gaussian: {use: filters.gaussian, in: {range_map: depth}}
 """
-KERNEL = "algorithms/filters/kernels_components.py"
+KERNEL = "algorithms/filters/kernels_fill.py"
 
 
 def edit(path: Path, change: Callable[[str], str]) -> None:
@@ -54,15 +54,15 @@ def test_an_edit_of_a_kernel_costs_the_units_that_depend_on_it_and_a_comment_non
         stages = json.loads((tmp_path / "out" / "run.json").read_bytes())["stages"]
         return {stage["name"]: stage["run"] for stage in stages if stage["run"]}
 
-    assert computed() == {"images": 4, "poses": 1, "views": 1, "depth": 4, "speckle": 4, "gaussian": 4}
+    assert computed() == {"images": 4, "poses": 1, "views": 1, "depth": 4, "filled": 4, "gaussian": 4}
 
     edit(package / KERNEL, lambda text: text.replace('"""', '"""In other words: ', 1) + "\n# a comment\n")
     edit(package / "report" / "page.py", lambda text: text + "\nONE_MORE = 1\n")
     assert computed() == {}
 
-    edit(package / KERNEL, lambda text: text.replace("(1 + max_step)", "(1.001 + max_step)"))
+    edit(package / KERNEL, lambda text: text.replace("1 / steps[idx]", "1.001 / steps[idx]"))
     plan = pano_mvs("plan")
-    assert "speckle:000.png and 3 more: code of filters.speckle changed" in plan
+    assert "filled:000.png and 3 more: code of filters.fill changed" in plan
     assert "4 units would run" in plan
     assert "nothing to compute" in pano_mvs("plan", "--accept-code")
-    assert computed() == {"speckle": 4}
+    assert computed() == {"filled": 4}

@@ -37,9 +37,9 @@ def test_examples_of_a_module(module: str) -> None:
 
 
 @pytest.mark.slow
-def test_examples_that_run_the_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_that_run_the_sample(tmp_path: Path, sample_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
+    monkeypatch.setenv("PANO_MVS_CACHE", str(sample_cache))
     for module in COMPUTING:
         failed, tried = examples(module)
         assert (failed, tried > 0) == (0, True), module

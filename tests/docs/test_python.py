@@ -51,10 +51,12 @@ def test_the_notebook_is_in_version_4_of_the_format_and_holds_no_output() -> Non
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_notebook_runs(
+    tmp_path: Path, sample_cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its range maps and poses are shown, and are those of the sample."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
+    monkeypatch.setenv("PANO_MVS_CACHE", str(sample_cache))
     mpl.use("agg")
     names: dict[str, Any] = {"__name__": "notebook"}
     shown = []

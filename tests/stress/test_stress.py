@@ -43,7 +43,7 @@ def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", ["processes", "serial"])
 def test_killed_runs_lose_nothing(executor: str) -> None:
-    assert kills.main(["4", "--executor", executor]) == 0
+    assert kills.main(["3", "--executor", executor]) == 0
 
 
 @pytest.mark.slow

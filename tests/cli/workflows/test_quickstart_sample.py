@@ -14,7 +14,7 @@ from tests.cli.conftest import deliverables, run_json
 pytestmark = pytest.mark.slow
 
 
-def command(folder: Path) -> list[str]:
+def command(folder: Path, *settings: str) -> list[str]:
     return [
         sys.executable,
         "-m",
@@ -25,7 +25,11 @@ def command(folder: Path) -> list[str]:
         str(folder / "out"),
         "--cache",
         str(folder / "cache"),
+        *settings,
     ]
+
+
+SMALL = ("--set", "images.max_width=512", "--set", "depth.planes=48")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,7 @@ def test_second_run_computes_nothing(finished: Path) -> None:
 
 def kill_in(stage: str, folder: Path) -> None:
     """Run until the first unit of a stage is computed, and kill the run while the others are in work."""
-    process = subprocess.Popen([*command(folder), "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([*command(folder, *SMALL), "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     events = (json.loads(line) for line in process.stdout)
     assert any((event["event"], event.get("stage")) == ("unit_finished", stage) for event in events)
@@ -65,16 +69,20 @@ def times_of_records(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in (folder / "cache" / "records").rglob("*.json")}
 
 
-def test_killed_in_the_middle_it_resumes_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
+def test_killed_in_the_middle_it_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     """The run is killed twice: while it matches, and in the middle of the sweep."""
-    whole = len(times_of_records(finished))
-    kill_in("matches", tmp_path)
-    matched = times_of_records(tmp_path)
-    kill_in("depth", tmp_path)
-    swept = times_of_records(tmp_path)
+    undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
+    for folder in (undisturbed, killed):
+        folder.mkdir()
+    subprocess.run(command(undisturbed, *SMALL), check=True)
+    whole = len(times_of_records(undisturbed))
+    kill_in("matches", killed)
+    matched = times_of_records(killed)
+    kill_in("depth", killed)
+    swept = times_of_records(killed)
     assert 0 < len(matched) < len(swept) < whole
-    subprocess.run(command(tmp_path), check=True)
-    resumed = times_of_records(tmp_path)
+    subprocess.run(command(killed, *SMALL), check=True)
+    resumed = times_of_records(killed)
     assert len(resumed) == whole
     assert matched.items() <= swept.items() <= resumed.items()  # what was computed is not computed again
-    assert deliverables(tmp_path / "out") == deliverables(finished / "out")
+    assert deliverables(killed / "out") == deliverables(undisturbed / "out")
