@@ -98,7 +98,7 @@ class PhotographPatches:
     @property
     def too_narrow(self) -> bool:
         """Whether the photograph, reduced to at most 2048 pixels, is narrower or lower than a patch."""
-        return min(self._gray.shape) < MIN_SIDE_PX
+        return bool(min(self._gray.shape) < MIN_SIDE_PX)
 
     @cached_property
     def _levels(self) -> list[NDArray[np.float32]]:

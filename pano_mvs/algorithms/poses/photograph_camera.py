@@ -187,7 +187,8 @@ def optical_center_offset(
     scale = max(1.0, _ROBUST * float(np.median(np.linalg.norm(sightings.errors(camera, size_hw), axis=1))))
     found = least_squares(residuals, np.zeros(10), x_scale=(*_STEPS, 0.02, 0.02))
     variance = 2 * found.cost / max(1, len(found.fun) - len(found.x))
-    covariance = variance * np.linalg.pinv(found.jac.T @ found.jac)
+    jacobian: FloatArray = np.asarray(found.jac, np.float64)
+    covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)
     return np.asarray(found.x[8:]), np.sqrt(np.diag(covariance)[8:])
 
 
