@@ -42,7 +42,7 @@ FOLDERS = (
     "truth",
     "videos",
 )
-FILES = ("walk.mp4", "mask.png", "rig.yaml")
+FILES = ("walk.mp4", "mask.png", "rig.yaml", "phone/1.jpg")
 # What the commands of the pages read, where they are run.
 PICTURES = {
     "photos/lobby": ("hall.jpg", "stairs.jpg"),

@@ -11,7 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, Sightings, refine_by_sightings
+from pano_mvs.algorithms.poses.photograph_camera import (
+    FocalPrior,
+    PhotographCamera,
+    Sightings,
+    optical_center_offset,
+    refine_by_sightings,
+)
 from pano_mvs.algorithms.poses.photograph_patches import (
     MIN_SIDE_PX,
     panorama_levels,
@@ -28,6 +34,7 @@ _ROUNDS = (1, 0, 0)
 # With fewer patches than these, the pose is wrong.
 _MIN_SIGHTINGS, _MIN_SEEN_SHARE = 12, 0.03
 _CONFIRMED_STD = 3.0
+_SIGNIFICANT_STD = 4.0
 
 
 class Aligned(NamedTuple):
@@ -37,11 +44,14 @@ class Aligned(NamedTuple):
         camera: the camera.
         confirmed: number of points that the photograph shows where the camera predicts them.
         tested: number of points that it could show.
+        off_center: distance of the optical centre from the middle of the photograph, as a share of the longer side;
+            0 if it is not significant.
     """
 
     camera: PhotographCamera
     confirmed: int
     tested: int
+    off_center: float = 0.0
 
     @property
     def share(self) -> float:
@@ -88,7 +98,7 @@ class PhotographPatches:
     @property
     def too_narrow(self) -> bool:
         """Whether the photograph, reduced to at most 2048 pixels, is narrower or lower than a patch."""
-        return min(self._gray.shape) < MIN_SIDE_PX
+        return bool(min(self._gray.shape) < MIN_SIDE_PX)
 
     @cached_property
     def _levels(self) -> list[NDArray[np.float32]]:
@@ -114,7 +124,10 @@ class PhotographPatches:
                 return Aligned(camera, 0, sightings.tested)
             camera = refine_by_sightings(camera, sightings, size_hw=self._size_hw, prior=prior)
         errors = np.linalg.norm(sightings.errors(camera, self._size_hw), axis=1)
-        return Aligned(camera, int((errors < _CONFIRMED_STD).sum()), sightings.tested)
+        offset, stds = optical_center_offset(camera, sightings, size_hw=self._size_hw, prior=prior)
+        significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > _SIGNIFICANT_STD
+        off_center = float(np.linalg.norm(offset)) if significant else 0.0
+        return Aligned(camera, int((errors < _CONFIRMED_STD).sum()), sightings.tested, off_center)
 
     def _sightings(self, camera: PhotographCamera, names: Iterable[str], level: int) -> Sightings:
         return Sightings.joined(

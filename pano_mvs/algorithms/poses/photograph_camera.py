@@ -160,6 +160,38 @@ def refine_by_sightings(
     return _moved(camera, least_squares(residuals, np.zeros(8), x_scale=_STEPS).x)
 
 
+def optical_center_offset(
+    camera: PhotographCamera, sightings: Sightings, *, size_hw: tuple[int, int], prior: FocalPrior
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far the optical centre is from the middle of the photograph, (2,), and its standard deviations (2,).
+
+    Both are shares of the longer side. All other parameters are estimated with it. It is far from the middle if the
+    photograph was cropped.
+
+    Args:
+        camera: the refined camera, whose optical centre is the middle.
+        sightings: where the photograph shows points.
+        size_hw: (height, width) of the photograph.
+        prior: what is known about the focal length.
+    """
+    from scipy.optimize import least_squares
+
+    def residuals(change: FloatArray) -> FloatArray:
+        moved = _moved(camera, change[:8])
+        away = moved.project(sightings.points_in_world, size_hw)[0] + max(size_hw) * change[8:] - sightings.pixels_px
+        errors = np.einsum("nij,nj->ni", sightings.whitening, away) / scale
+        squared = (errors**2).sum(axis=1, keepdims=True) + 1e-12
+        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
+        return np.concatenate([(errors * np.sqrt(np.log1p(squared) / squared)).ravel(), own])
+
+    scale = max(1.0, _ROBUST * float(np.median(np.linalg.norm(sightings.errors(camera, size_hw), axis=1))))
+    found = least_squares(residuals, np.zeros(10), x_scale=(*_STEPS, 0.02, 0.02))
+    variance = 2 * found.cost / max(1, len(found.fun) - len(found.x))
+    jacobian: FloatArray = np.asarray(found.jac, np.float64)
+    covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)
+    return np.asarray(found.x[8:]), np.sqrt(np.diag(covariance)[8:])
+
+
 def _adjusted(
     pixels_px: FloatArray,
     points_in_world: FloatArray,

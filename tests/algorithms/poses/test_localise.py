@@ -115,6 +115,16 @@ def test_patches_refine_the_camera(model: Model, focal_px: float | None) -> None
     assert found.radial == pytest.approx(-0.05, abs=0.01)
 
 
+def test_a_photograph_that_was_cropped_on_one_side_is_refused(model: Model) -> None:
+    """Its pose would be wrong by a degree for each 2 % of its width."""
+    pose = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))
+    picture = render_photograph(default_room(), pose, PHOTO_HW, focal_px=FOCAL_PX, radial=-0.05, supersample=1)
+    cropped = np.ascontiguousarray(picture[:, 60:])
+    found = localised(cropped, model[0], focal_px=FOCAL_PX, patches=model[1])
+    assert isinstance(found, str)
+    assert "it seems to be cropped: its optical centre is" in found
+
+
 def test_patches_confirm_a_pose_of_few_key_points(model: Model, taken: tuple[Picture, Rigid3]) -> None:
     picture, pose = taken
     refused = localised(picture, model[0], focal_px=FOCAL_PX, max_keypoints=60)

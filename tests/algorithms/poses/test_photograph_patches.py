@@ -13,6 +13,7 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     FocalPrior,
     PhotographCamera,
     Sightings,
+    optical_center_offset,
     refine_by_sightings,
 )
 from pano_mvs.algorithms.poses.photograph_patches import (
@@ -98,6 +99,30 @@ def test_a_strip_cannot_be_aligned(given: Given, shape_hw: tuple[int, int], too_
     if too_narrow:
         with pytest.raises(UsageError, match="smaller than a patch"):
             strip.aligned(TRUE, ["a"], prior=FocalPrior(FOCAL_PX, 0.1))
+
+
+@pytest.mark.parametrize(("offset", "std"), [((0.0, 0.0), 0.3), ((0.05, -0.03), 0.3), ((0.004, 0.0), 3.0)])
+def test_the_optical_centre_is_found(given: Given, offset: tuple[float, float], std: float) -> None:
+    """Sightings with known errors: as far from the middle as they were moved, within the deviations that it states."""
+    seen = sightings(given, TRUE)
+    noise = np.random.default_rng(3).normal(0, std, seen.pixels_px.shape)
+    pixels = TRUE.project(seen.points_in_world, PHOTO_HW)[0] + 320 * np.array(offset) + noise
+    moved = Sightings(pixels, seen.points_in_world, np.broadcast_to(np.eye(2) / std, seen.whitening.shape), seen.tested)
+    found, stds = optical_center_offset(TRUE, moved, size_hw=PHOTO_HW, prior=FocalPrior(FOCAL_PX, 0.1))
+    assert (np.abs(found - offset) < 4 * stds).all(), (found, stds)
+    assert (stds < 0.003 * std / 0.3).all()
+
+
+@pytest.mark.parametrize("left", [0, 32])
+def test_alignment_tells_whether_a_photograph_was_cropped(given: Given, left: int) -> None:
+    surface, panorama, photograph = given
+    cropped = np.ascontiguousarray(photograph[:, left:])
+    patches = PhotographPatches(cropped, PanoramaPatches(lambda _: surface, lambda _: panorama))
+    turn = rotation_from_rotvec(np.array([0.0, -np.arctan(left / 2 / FOCAL_PX), 0.0]))
+    start = PhotographCamera(Rigid3.from_center(turn @ POSE.rotation, POSE.center), FOCAL_PX, 0.0)
+    aligned = patches.aligned(start, ["a"], prior=FocalPrior(FOCAL_PX, 0.1))
+    assert aligned.confirmed > 40
+    assert aligned.off_center == pytest.approx(left / 2 / (320 - left), abs=0.02)
 
 
 def test_alignment_improves_a_camera_and_confirms_it(given: Given) -> None:

@@ -39,6 +39,8 @@ _MIN_CONFIRMED, _MIN_CONFIRMED_SHARE = 60, 0.3
 _ALIGNED_PANORAMAS = 8
 # Patches refine a pose if there are at least this many, and if they turn the camera by less than this.
 _MIN_ALIGNED, _MAX_TURN = 40, float(np.radians(2.0))
+# A photograph whose optical centre is further from its middle, as a share of the longer side, was cropped.
+_MAX_OFF_CENTER = 0.02
 
 
 class Localised(NamedTuple):
@@ -117,7 +119,7 @@ def localise_photograph(
         max_error=float(np.radians(max_error_deg)),
     )
     found = search.located(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
-    if isinstance(found, Localised) or patches is None:
+    if isinstance(found, Localised | _Cropped) or patches is None:
         return found
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
     singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO) for name in most]
@@ -188,12 +190,17 @@ class _Search:
             return reason
         if self.patches is not None:
             aligned = self.patches.aligned(camera, names, prior=self.prior)
+            if aligned.confirmed >= _MIN_ALIGNED and (reason := _cropped(aligned)):
+                return reason
             if aligned.confirmed >= _MIN_ALIGNED and self._close(camera, aligned.camera):
                 camera = aligned.camera
         return self.localised(camera, agreeing)
 
-    def confirmed(self, candidates: Sequence[_Matches], rng: np.random.Generator) -> Localised | None:
-        """Return the camera that patches confirm best among those that few key points suggest; None if none is sure."""
+    def confirmed(self, candidates: Sequence[_Matches], rng: np.random.Generator) -> Localised | str:
+        """Return the camera that patches confirm best among those that few key points suggest.
+
+        The reason if that photograph was cropped; "" if no camera is sure.
+        """
         assert self.patches is not None
         best: tuple[Aligned, _Matches] | None = None
         for matches in candidates:
@@ -208,15 +215,17 @@ class _Search:
             if best is None or aligned.confirmed > best[0].confirmed:
                 best = aligned, agreeing
         if best is None or best[0].confirmed < _MIN_CONFIRMED or best[0].share < _MIN_CONFIRMED_SHARE:
-            return None
+            return ""
         aligned, _ = best
+        if reason := _cropped(aligned):
+            return reason
         matches, _, _ = self.guided(_joined([]), aligned.camera)
         agreeing = self.agreeing(matches, aligned.camera)
         distinct = len(np.unique(agreeing.pixels_px, axis=0))
         if distinct < _FEW or _implausible(
             agreeing.pixels_px, self.size_hw, camera=aligned.camera, matches=len(agreeing.pixels_px), min_inliers=_FEW
         ):
-            return None
+            return ""
         return self.localised(aligned.camera, agreeing)
 
     def first(self, matches: _Matches, *, seed: int) -> PhotographCamera | None:
@@ -331,6 +340,22 @@ def _most_similar(
     if len(distances) > 1 and distances[best] > _GUIDED_RATIO * np.partition(distances, 1)[1]:
         return np.inf, -1
     return float(distances[best]), candidates[best]
+
+
+class _Cropped(str):
+    """Why a photograph is taken to be cropped, which other poses would not change."""
+
+    __slots__ = ()
+
+
+def _cropped(aligned: Aligned) -> _Cropped:
+    """Return why a photograph is taken to be cropped, "" if it is not."""
+    if aligned.off_center <= _MAX_OFF_CENTER:
+        return _Cropped()
+    return _Cropped(
+        f"it seems to be cropped: its optical centre is {100 * aligned.off_center:.0f} % of its longer side away from "
+        "its middle. Give it as the camera stored it"
+    )
 
 
 def _implausible(
