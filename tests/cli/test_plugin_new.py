@@ -72,9 +72,10 @@ def test_new_plugins_are_clean(written: Path) -> None:
 
 
 @pytest.mark.slow
-def test_new_plugins_are_typed_and_their_tests_pass(written: Path) -> None:
+def test_new_plugins_are_typed_and_their_tests_pass(written: Path, tmp_path: Path) -> None:
     mypy = [sys.executable, "-m", "mypy", "--strict", "--config-file=", *map(str, written.glob("new_*.py"))]
-    for command in (mypy, [sys.executable, "-m", "pytest", "-q", "-W", "error", str(written)]):
+    own = [sys.executable, "-m", "pytest", "-q", "-W", "error", "--basetemp", str(tmp_path / "own"), str(written)]
+    for command in (mypy, own):
         result = subprocess.run(command, cwd=written, capture_output=True, text=True)
         assert result.returncode == 0, result.stdout + result.stderr
 
