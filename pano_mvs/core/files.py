@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
@@ -55,6 +57,19 @@ def set_aside(path: Path) -> Path:
         return path.rename(free)
     except OSError as error:
         raise StoreError(f"{path} exists and cannot be renamed ({error.strerror}). Move it elsewhere") from error
+
+
+def make_room(path: Path) -> None:
+    """Remove a file, or rename a folder that somebody has put in its place.
+
+    Raises:
+        StoreError: if the folder cannot be renamed.
+        OSError: if the file cannot be removed.
+    """
+    if is_folder(path) and not is_link(path):
+        set_aside(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def temporary_prefix() -> str:
@@ -153,6 +168,22 @@ def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durab
     """Write a text file atomically (UTF-8, line ends as given); see `replacing`."""
     with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
         temporary.write_bytes(text.encode(errors="backslashreplace"))  # file names may have bytes that are not text
+
+
+def read_regular(path: Path | str) -> bytes:
+    """Return the bytes of a file, but do not wait for a FIFO, and do not read a device without end.
+
+    Raises:
+        OSError: if it cannot be read, or is not a regular file.
+    """
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
+        with open(handle, "rb", closefd=False) as stream:
+            return stream.read()
+    finally:
+        os.close(handle)
 
 
 def copy_file(source: Path, target: Path) -> None:

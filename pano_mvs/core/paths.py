@@ -86,6 +86,11 @@ def resolved(path: Path) -> Path:
             return path
 
 
+def is_inside(path: Path, folder: Path) -> bool:
+    """Return whether a path is in a folder or is that folder, after following links."""
+    return resolved(path).is_relative_to(resolved(folder))
+
+
 def children(folder: Path, pattern: str = "*") -> list[Path]:
     """Return the entries of a folder, sorted by name; none if it cannot be listed.
 

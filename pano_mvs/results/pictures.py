@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.file_names import file_inside
 
 _QUALITIES = (82, 70, 55, 40)
 _MIN_PX = 32
@@ -69,8 +69,8 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
         relative: the preview's path below it.
         small: decode at an eighth of the size, which is faster.
     """
-    path = resolved(out_dir / relative)
-    if not relative or not path.is_relative_to(resolved(out_dir)) or not is_file(path):
+    path = file_inside(out_dir, relative)
+    if path is None:
         return ()
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_REDUCED_COLOR_8 if small else cv2.IMREAD_COLOR) if len(data) else None

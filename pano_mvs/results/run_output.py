@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.file_names import file_inside, item_problem
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
@@ -57,11 +58,19 @@ class RunOutput:
 
     @cached_property
     def poses(self) -> Poses | None:
-        """The camera poses."""
+        """The camera poses.
+
+        Raises:
+            InputError: if they cannot be read, or files cannot be named after one of the images.
+        """
         poses = self.values.poses
         if poses is None and is_folder(self.out / "colmap") and not self._has_old_model():
             groups = read_groups(self.out)
             poses = join_groups(groups) if len(groups) > 1 else groups[0]
+        # Names in a COLMAP model have not passed the checks of a source.
+        for name in poses.names if poses is not None else ():
+            if problem := item_problem(name):
+                raise InputError(f"{self.out}: the poses contain an image that cannot be used: {problem}")
         return poses
 
     @cached_property
@@ -85,7 +94,7 @@ class RunOutput:
         Args:
             name: path relative to the output folder.
         """
-        return name not in self.summary.left_over and is_file(self.out / name)
+        return name not in self.summary.left_over and file_inside(self.out, name) is not None
 
     def _has_old_model(self) -> bool:
         """Return whether the COLMAP model is left over from an earlier run."""
@@ -179,8 +188,8 @@ class RunView:
         panorama = self._run.values.panorama(self.name)
         if panorama is not None:
             return panorama.load()
-        folder = self._run.summary.source_folder
-        return decode_image(folder / self.name) if folder is not None and is_file(folder / self.name) else None
+        path = self._run.summary.source_file(self.name)
+        return decode_image(path) if path is not None else None
 
     @property
     def cam_from_world(self) -> Rigid3 | None:
@@ -190,9 +199,8 @@ class RunView:
 
     @property
     def preview(self) -> Path | None:
-        """The file in the output folder that shows the panorama and its range map."""
-        path = self._run.out / self.summary.preview
-        return path if self.summary.preview and is_file(path) else None
+        """The file in the output folder that shows the panorama and its range map; None if it is not in there."""
+        return file_inside(self._run.out, self.summary.preview)
 
     def __repr__(self) -> str:
         """Return the name."""

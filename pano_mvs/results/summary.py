@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.file_names import file_inside
 from pano_mvs.core.files import replacing
 from pano_mvs.results.records import (
     BlockedUnit,
@@ -138,6 +139,11 @@ class RunSummary(Entry):
             raise InputError(f"{path} is not a valid run.json ({error}). Run the workflow again") from error
         if not isinstance(value, Mapping) or not isinstance(value.get("stages"), list):
             raise InputError(f"{path} is not a run.json. Run the workflow again")
+        if isinstance(schema := value.get("schema"), int) and schema > SCHEMA:
+            raise InputError(
+                f"{path} was written by a newer version of pano_mvs (schema {schema}; this one reads up to {SCHEMA}). "
+                "Update pano_mvs, or run the workflow again"
+            )
         try:
             return RunSummary.from_json(value)
         except InputError as error:
@@ -181,6 +187,11 @@ class RunSummary(Entry):
             return Path(self.merged.images) if self.merged.images else None
         paths = [stage.params.get("path") for stage in self.stages if stage.use.startswith("source.")]
         return next((Path(str(path)) for path in paths if path), None)
+
+    def source_file(self, name: str, images: Path | None = None) -> Path | None:
+        """Return the file of an image in a folder, by default the `source_folder`; None if it is not there."""
+        folder = images or self.source_folder
+        return file_inside(folder, name, through_links=True) if folder is not None else None
 
 
 def cache_of(summary: RunSummary, given: Path | None = None) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 # A ray hits a point within this angle: half the width of a click at a usual field of view.
 _REACH_RAD = np.deg2rad(0.4)

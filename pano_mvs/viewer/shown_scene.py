@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.file_names import file_inside
 from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
@@ -21,8 +22,6 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 from pano_mvs.scene.upright import states_y_down
-
-FloatArray = NDArray[np.float64]
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
@@ -204,14 +203,12 @@ def _cameras(
     previews = {view.name: view.preview for view in run.views}
     cameras = []
     for idx, name in enumerate(poses.names):
-        picture = source / name if source is not None else None
-        preview = folder / (previews.get(name) or f"preview/{PurePosixPath(name).with_suffix('.jpg')}")
         cameras.append(
             ShownCamera(
                 name=name,
                 cam_from_world=poses.cam_from_world(idx),
-                picture=picture if picture is not None and is_file(picture) else None,
-                preview=preview if is_file(preview) else None,
+                picture=run.source_file(name, images),
+                preview=file_inside(folder, previews.get(name) or f"preview/{PurePosixPath(name).with_suffix('.jpg')}"),
                 range_file=_map_of(folder, "range", name, suffix=".tiff"),
                 confidence_file=_map_of(folder, "confidence", name, suffix=".png"),
                 doubtful=name in run.poses.doubts,
@@ -225,8 +222,8 @@ def _cameras(
 
 def _map_of(folder: Path, kind: str, name: str, *, suffix: str) -> Path | None:
     """Return the file of an image in range/ or confidence/, named with or without the image's extension."""
-    candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
-    return next((path for path in candidates if is_file(path)), None)
+    candidates = (f"{kind}/{name}{suffix}", f"{kind}/{PurePosixPath(name).with_suffix(suffix)}")
+    return next((path for candidate in candidates if (path := file_inside(folder, candidate))), None)
 
 
 def _frame(cameras: tuple[ShownCamera, ...], *, is_level: bool = False) -> tuple[FloatArray, FloatArray]:

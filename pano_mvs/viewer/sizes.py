@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 # Radius of a sphere as a share of the distance to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
 _MIN_ANGLE_DEG, _MAX_ANGLE_DEG = 15.0, 110.0

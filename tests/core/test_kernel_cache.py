@@ -69,6 +69,32 @@ def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, firs
     assert list(folder.rglob("*.nbi"))
 
 
+COMPILE = """
+import numpy
+from pano_mvs.algorithms.filters.kernels_components import label_surfaces
+from pano_mvs.core.kernel_cache import compilation_time, count_compiled
+print("ready", flush=True)
+label_surfaces(numpy.ones((8, 16), numpy.float32), 1.0)
+print(sum(label_surfaces.stats.cache_misses.values()), count_compiled() > 0, compilation_time.seconds > 0.1)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kernel files are not locked there")
+def test_processes_that_need_the_same_kernel_compile_it_once(tmp_path: Path) -> None:
+    import fcntl
+
+    environment = {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    with (kernel_cache.PACKAGE / "algorithms" / "filters" / "kernels_components.py").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        command = [sys.executable, "-c", COMPILE]
+        started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+        for process in started:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+    assert sorted(process.communicate()[0] for process in started) == ["0 True True\n", "1 True True\n"]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="permissions as POSIX has them")
 def test_kernels_that_others_could_have_written_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))

@@ -15,9 +15,8 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.cloud_colors import drawn_cloud
-from pano_mvs.viewer.controller import Tour
+from pano_mvs.viewer.controller import Tour, pixel_readout
 from pano_mvs.viewer.picking import camera_under, point_under
-from pano_mvs.viewer.pixel_readout import pixel_readout
 from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
 from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, outer_box, sphere_radius
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along

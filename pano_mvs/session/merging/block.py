@@ -96,7 +96,7 @@ def load_blocks(outs: Sequence[Path], cache: Path | None = None) -> list[Block]:
 
     Raises:
         UsageError: if there are fewer than two folders, or one is given twice.
-        InputError: if a folder has no run, or the run has no poses.
+        InputError: if a folder has no run, the run has no poses, or files cannot be named after one of its images.
     """
     if len(outs) < 2:
         raise UsageError("give two or more output folders to merge")

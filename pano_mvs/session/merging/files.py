@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks.merging import MergedBlocks, nearest_owners
+from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.core.files import copy_file, replacing, write_text
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Similarity3
 from pano_mvs.io.clouds.ply_writer import write_ply_parts
 from pano_mvs.io.colmap.model_writer import write_colmap_model
@@ -60,7 +61,7 @@ class MergeFiles:
         sizes: dict[str, tuple[int, int]] = {}
         for block in self.blocks:
             sizes |= block.sizes_hw()
-        folder = self.out / "colmap" / "sparse" / "0"
+        folder = path_inside(self.out, "colmap/sparse/0")
         folder.mkdir(parents=True, exist_ok=True)
         write_colmap_model(folder, poses, sizes)
         frames = [
@@ -88,7 +89,7 @@ class MergeFiles:
         if not any(block.has_cloud for block in self.blocks):
             return 0
         turn = z_up_from_world(world_up(self.merged.poses))
-        with replacing(self.out / self._listed("cloud.ply")) as temporary:
+        with replacing(self._to_write("cloud.ply")) as temporary:
             return write_ply_parts(temporary, self._cloud_parts(), quality=True, uncertainty=True, file_from_world=turn)
 
     def write_ranges(self) -> list[ViewSummary]:
@@ -111,22 +112,19 @@ class MergeFiles:
         if view.range_map is None:
             return False
         range_file, confidence_file, uncertainty_file = map_files(stem)
-        for name in map_files(stem):
-            (self.out / name).parent.mkdir(parents=True, exist_ok=True)
         ranges = (view.range_map * np.float32(scale)).astype(np.float32)
-        write_range_tiff(self.out / self._listed(range_file), ranges)
+        write_range_tiff(self._to_write(range_file), ranges)
         if view.confidence is not None:
-            write_confidence_png(self.out / self._listed(confidence_file), np.ascontiguousarray(view.confidence))
+            write_confidence_png(self._to_write(confidence_file), np.ascontiguousarray(view.confidence))
         if view.uncertainty is not None:
-            write_range_tiff(self.out / self._listed(uncertainty_file), np.ascontiguousarray(view.uncertainty))
+            write_range_tiff(self._to_write(uncertainty_file), np.ascontiguousarray(view.uncertainty))
         return True
 
     def _preview(self, view: RunView, stem: str) -> str:
         if view.preview is None:
             return ""
         name = f"preview/{stem}{view.preview.suffix}"
-        (self.out / name).parent.mkdir(parents=True, exist_ok=True)
-        copy_file(view.preview, self.out / self._listed(name))
+        copy_file(view.preview, self._to_write(name))
         return name
 
     def remove_stale(self, earlier: RunSummary) -> None:
@@ -135,13 +133,15 @@ class MergeFiles:
         maps = (name for view in earlier.views if view.name in stems for name in map_files(stems[view.name]))
         old = {"cloud.ply", *maps, *(view.preview for view in earlier.views if view.preview)}
         for name in old - self.written:
-            if resolved((self.out / name).parent).is_relative_to(resolved(self.out)):
-                (self.out / name).unlink(missing_ok=True)
+            if path := file_inside(self.out, name):
+                path.unlink()
 
-    def _listed(self, name: str) -> str:
-        """Return the name of a file that is about to be written."""
+    def _to_write(self, name: str) -> Path:
+        """Return the path of a file that is about to be written, in its folder."""
+        path = path_inside(self.out, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
         self.written.add(name)
-        return name
+        return path
 
     def _cloud_parts(self) -> Iterator[PointCloud]:
         centers = self.merged.poses.centers
@@ -152,10 +152,10 @@ class MergeFiles:
                 yield _selected(moved, own)
 
     def _image_path(self, name: str, number: int) -> str:
-        folder = self.blocks[number].run.summary.source_folder
-        if folder is None or not is_file(folder / name):
+        path = self.blocks[number].run.summary.source_file(name)
+        if path is None:
             return name
-        return PurePosixPath(Path(os.path.relpath(resolved(folder / name), resolved(self.out)))).as_posix()
+        return PurePosixPath(Path(os.path.relpath(resolved(path), resolved(self.out)))).as_posix()
 
 
 def map_files(stem: str) -> tuple[str, str, str]:

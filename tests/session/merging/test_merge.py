@@ -284,3 +284,28 @@ def test_the_images_are_found_through_the_links_of_the_blocks(tmp_path: Path) ->
     (tmp_path / "links_1/019.png").unlink()
     (tmp_path / "links_1/019.png").touch()
     assert merge_outputs(outs, tmp_path / "merged").summary.source_folder is None
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_preview_outside_a_block_is_not_copied(folder: Path, tmp_path: Path, linked: bool) -> None:
+    """The name of a preview in run.json could be that of any file, which was copied into the result."""
+    (tmp_path / "secret.txt").write_text("secret")
+    block = tmp_path / "block_0"
+    shutil.copytree(folder / "block_0", block)
+    run = json.loads((block / "run.json").read_bytes())
+    for view in run["views"]:
+        view["preview"] = "linked.txt" if linked else "../secret.txt"
+    (block / "run.json").write_text(json.dumps(run))
+    if linked:
+        (block / "linked.txt").symlink_to(tmp_path / "secret.txt")
+    assert all(view.preview is None for view in load(block).views.values())
+    merge_outputs([block, folder / "block_1"], tmp_path / "merged")
+    assert not list((tmp_path / "merged").rglob("*.txt"))
+
+
+def test_a_run_of_a_newer_version_is_refused(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "block_0", tmp_path / "block_0")
+    run = json.loads((tmp_path / "block_0/run.json").read_bytes())
+    (tmp_path / "block_0/run.json").write_text(json.dumps(run | {"schema": 99}))
+    with pytest.raises(InputError, match=r"written by a newer version of pano_mvs \(schema 99"):
+        merge_outputs([tmp_path / "block_0", folder / "block_1"], tmp_path / "merged")

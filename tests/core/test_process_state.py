@@ -1,0 +1,77 @@
+"""What a plugin can change in its process is noticed, named, and undone."""
+
+from __future__ import annotations
+
+import ctypes
+import locale
+import math
+import os
+import random
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.core import process_state, text
+from pano_mvs.core.process_state import ProcessState, loading_plugin
+
+_UPWARD = 0x800  # FE_UPWARD of x86
+
+
+def _replace_code() -> None:
+    text.plural.__code__ = (lambda count, one, many="": "patched").__code__
+
+
+CHANGES: dict[str, tuple[Callable[[], object], str]] = {
+    "optimisation": (lambda: cv2.setUseOptimized(not cv2.useOptimized()), "OpenCV's optimisation"),
+    "numpy errors": (lambda: np.seterr(divide="ignore", over="raise"), "numpy's handling of errors"),
+    "random": (lambda: random.seed(1), "the random numbers of Python"),
+    "numpy random": (lambda: np.random.seed(1), "the random numbers of numpy"),  # noqa: NPY002
+    "folder": (lambda: os.chdir("/"), "the working folder"),
+    "variable": (lambda: os.environ.update(OMP_NUM_THREADS="77"), "the environment"),
+    "no variables": (os.environ.clear, "the environment"),
+    "handler": (lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN), "the signal handlers"),
+    "locale": (lambda: locale.setlocale(locale.LC_ALL, "C.UTF-8"), "the locale"),
+    "function": (lambda: setattr(cv2, "remap", None), "cv2.remap"),
+    "numpy function": (lambda: delattr(np.linalg, "svd"), "numpy.linalg.svd"),
+    "own function": (lambda: setattr(text, "shortened", str), "pano_mvs.core.text.shortened"),
+    "code": (_replace_code, "pano_mvs.core.text.plural"),
+    "builtin": (lambda: setattr(math, "floor", math.ceil), "math.floor"),
+    "rounding": (lambda: ctypes.CDLL(None).fesetround(_UPWARD), "the floating-point modes"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_changes_are_named_and_undone(what: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    change, name = CHANGES[what]
+    if what == "rounding" and (sys.platform != "linux" or os.uname().machine != "x86_64"):
+        pytest.skip("the number of this mode is that of Linux on x86")
+    monkeypatch.chdir(tmp_path)
+    before = ProcessState.now()
+    assert not before.restore()
+    change()
+    found = before.restore()
+    assert str(found) == name
+    assert not before.restore()
+    assert (cv2.remap is not None, math.floor(0.5), text.plural(2, "file")) == (True, 0, "files")
+
+
+def test_only_what_decides_results_counts_against_built_in_stages() -> None:
+    before = ProcessState.now()
+    random.seed(1)
+    os.environ["PANO_MVS_SOMETHING"] = "1"
+    cv2.setUseOptimized(not cv2.useOptimized())
+    assert str(before.restore().deciding) == "OpenCV's optimisation"
+
+
+def test_loading_a_plugin_leaves_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_state, "_PLUGINS", process_state._Plugins())
+    was = cv2.useOptimized()
+    with loading_plugin():
+        cv2.setUseOptimized(not was)
+    assert cv2.useOptimized() == was
+    assert process_state.has_plugins()

@@ -1,0 +1,19 @@
+"""Names of images that a hostile file may state; none of them may name a file."""
+
+from __future__ import annotations
+
+HOSTILE_NAMES = (
+    "..",
+    "../secret.png",
+    "a/../../secret.png",
+    "/secret.png",
+    "//host/share/secret.png",
+    "\\\\host\\share\\secret.png",
+    "a\\..\\..\\secret.png",
+    "C:secret.png",
+    "C:/secret.png",
+    "a/nul",
+    "con.png",
+    "e\x07.png",
+    "e\x1b[2J.png",
+)
