@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import check_settings, setting
 from pano_mvs.scene import PointCloud
-
-FloatArray = NDArray[np.float64]
 
 # The nearest point of each cell and its neighbours hides points that are further away by more than this share.
 _CELLS, _HIDDEN = 200, 0.08

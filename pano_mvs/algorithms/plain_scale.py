@@ -12,15 +12,12 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sharp_scale import enlarged_range_map, finest_detail
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # At fewer columns, a window of a few pixels spans several degrees: furniture melts into blobs.
 _MIN_WIDTH = 1024

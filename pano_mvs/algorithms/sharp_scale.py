@@ -11,15 +11,11 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama
+from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-FloatImage = NDArray[np.float32]
 
 # The contrast of the detail between two resolutions over that of the detail between the lower one and the next: 0.6 to
 # 0.9 for sharp pictures, 0.3 after a blur of a pixel. After more blur, noise hides that the finest detail is gone; but

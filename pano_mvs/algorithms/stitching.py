@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, ray_from_pixel
-
-FloatArray = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 # Pictures with more pixels per radian than this times those of the panorama are reduced first, against aliasing.
 _MAX_DENSITY = 1.25

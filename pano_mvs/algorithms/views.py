@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses, Views
 from pano_mvs.scene.pose_groups import split_groups
-
-FloatArray = NDArray[np.float64]
 
 # With fewer shared points than this, the overlap of two images cannot be judged.
 _MIN_SHARED = 8

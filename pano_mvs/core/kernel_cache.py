@@ -14,6 +14,7 @@ import shutil
 import stat
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
@@ -26,13 +27,27 @@ PACKAGE = Path(__file__).parent.parent
 _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/Caches")}
 
 
+@dataclass(slots=True)
+class CompilationTime:
+    """Time that this process has spent on compiling kernels, waiting for another process that does, and loading them.
+
+    Attributes:
+        seconds: in total.
+    """
+
+    seconds: float = 0.0
+
+
+compilation_time = CompilationTime()
+
+
 def use_kernel_cache(package: Path = PACKAGE) -> None:
     """Set numba's cache folder for the kernels in a package, unless the user has set one.
 
     Packages with kernels call this when they are imported, before any of their kernels is; later calls do nothing.
 
     Args:
-        package: folder that contains the kernel files, `kernels_*.py`.
+        package: folder that contains the kernel files, `kernels_*.py`, and of their decorators, `core/kernels.py`.
     """
     if VARIABLE in os.environ:
         return
@@ -53,8 +68,14 @@ def kernel_cache_folder(package: Path = PACKAGE) -> Path:
     Raises:
         OSError: if the user has no writable folder for caches.
     """
-    sources = {str(path.relative_to(package)): path.read_bytes() for path in below(package, "kernels_*.py")}
+    sources = {str(path.relative_to(package)): path.read_bytes() for path in below(package, "kernels*.py")}
     return user_cache_folder() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
+
+
+def count_compiled() -> int:
+    """Return how many kernels all processes together have compiled into the cache."""
+    folder = os.environ.get(VARIABLE)
+    return len(below(Path(folder), "*.nbi")) if folder else 0
 
 
 def user_cache_folder() -> Path:

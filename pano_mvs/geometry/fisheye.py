@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 _ITERATIONS = 20
 _EXACT = 1e-14

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from pano_mvs.core.kernels import inlined
 
 _F = np.float32
 _HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
@@ -25,19 +26,19 @@ _Q3, _Q4 = 4.853903996359136964868e2, 1.945506571482613964425e2
 _REDUCED_FROM, _TINY_64 = 0.66, 1e-300
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def azimuth_from_x(x: float, width: int) -> float:
     """Return the azimuth θ of a column position, in radians."""
     return 2 * math.pi * (x / width - 0.5)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def elevation_from_y(y: float, height: int) -> float:
     """Return the elevation φ of a row position, in radians."""
     return math.pi * (0.5 - y / height)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def pixel_from_ray(x: float, y: float, z: float, height: int, width: int) -> tuple[float, float]:
     """Return the position (x, y) in pixels of a ray of any length but zero, x in [0, w], y in [0, h]."""
     azimuth = math.atan2(x, z)
@@ -45,13 +46,13 @@ def pixel_from_ray(x: float, y: float, z: float, height: int, width: int) -> tup
     return (azimuth / (2 * math.pi) + 0.5) * width, (0.5 - elevation / math.pi) * height
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def pixel_at(x: float, y: float, height: int, width: int) -> tuple[int, int]:
     """Return (row, column) of the pixel that contains a position; x wraps, y is clipped."""
     return min(max(math.floor(y), 0), height - 1), math.floor(x) % width
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def wrapped_row(row: int, height: int) -> int:
     """Return the row, in the panorama, of a pixel at most one height outside of it: reflected at the poles."""
     if row < 0:
@@ -61,7 +62,7 @@ def wrapped_row(row: int, height: int) -> int:
     return row
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def wrapped_column(row: int, column: int, height: int, width: int) -> int:
     """Return the column, in the panorama, of a pixel: wrapped at the seam, half a turn further beyond a pole."""
     if row < 0 or row >= height:
@@ -69,7 +70,7 @@ def wrapped_column(row: int, column: int, height: int, width: int) -> int:
     return column % width
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def corners_at(x: float, y: float, height: int, width: int) -> tuple[int, int, int, int, int, int, float, float]:
     """Return the four pixels around a position, and the weights of the right and of the lower ones.
 
@@ -90,7 +91,7 @@ def corners_at(x: float, y: float, height: int, width: int) -> tuple[int, int, i
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def bilinear(v00: float, v01: float, v10: float, v11: float, weight_x: float, weight_y: float) -> float:
     """Return the bilinear mean of values upper left, upper right, lower left and lower right."""
     upper = (1 - weight_x) * v00 + weight_x * v01
@@ -98,14 +99,14 @@ def bilinear(v00: float, v01: float, v10: float, v11: float, weight_x: float, we
     return (1 - weight_y) * upper + weight_y * lower
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def angle_between(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
     """Return the angle between two vectors, in radians in [0, π], by atan2(|a × b|, a · b)."""
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     return math.atan2(math.sqrt(x * x + y * y + z * z), ax * bx + ay * by + az * bz)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _fast_atan(a: np.float32) -> np.float32:
     """Return atan of a float32 in [0, 1]."""
     s = a * a
@@ -113,7 +114,7 @@ def _fast_atan(a: np.float32) -> np.float32:
     return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def fast_azimuth(x: np.float32, z: np.float32) -> np.float32:
     """Return atan2(x, z), the azimuth, float32."""
     ax, az = abs(x), abs(z)
@@ -125,7 +126,7 @@ def fast_azimuth(x: np.float32, z: np.float32) -> np.float32:
     return -turn if x < _F(0) else turn
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def fast_dip(y: np.float32, level: np.float32) -> np.float32:
     """Return atan2(y, level), the angle below the horizon, for level = hypot(x, z), float32."""
     ay = abs(y)
@@ -136,7 +137,7 @@ def fast_dip(y: np.float32, level: np.float32) -> np.float32:
     return -dip if y < _F(0) else dip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def even_atan2(y: float, x: float) -> float:
     """Return atan2(y, x) in float64, without branches; 0 for (0, 0)."""
     ay, ax = abs(y), abs(x)

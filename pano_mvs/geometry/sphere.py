@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 
 def ray_from_pixel(pixels_px: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:

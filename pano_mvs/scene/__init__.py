@@ -11,6 +11,7 @@ from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
 from pano_mvs.scene.scores import Scores
 from pano_mvs.scene.two_view import TwoView, TwoViews
+from pano_mvs.scene.weak_images import WeakImage, WeakImages
 
 __all__ = [
     "Axis",
@@ -31,4 +32,6 @@ __all__ = [
     "TwoView",
     "TwoViews",
     "Views",
+    "WeakImage",
+    "WeakImages",
 ]

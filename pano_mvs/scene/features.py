@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from pano_mvs.scene.record import Axis, Record, require, require_array
 
 @dataclass(frozen=True, eq=False)
 class Features(Record):
-    """Key points of one panorama, strongest first.
+    """Key points of one panorama, the strongest of each detector first.
 
     Attributes:
         bearings: (N, 3) float64 unit rays in the camera frame.
@@ -23,6 +23,8 @@ class Features(Record):
         colors_rgb: (N, 3) uint8 colour of the panorama at the key point.
         metric: "l2" or "hamming".
         size_hw: (height, width) of the panorama in which they were detected.
+        learned: number of key points, the last ones, that the network ALIKED found and LightGlue can match.
+        up: direction of the zenith in the camera frame, by which the network's views were levelled.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -34,10 +36,24 @@ class Features(Record):
     colors_rgb: NDArray[np.uint8]
     metric: Literal["l2", "hamming"]
     size_hw: tuple[int, int]
+    learned: int = 0
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
 
     def __len__(self) -> int:
         """Return the number of key points."""
         return len(self.bearings)
+
+    def only_learned(self) -> Features:
+        """Return the key points that a network found."""
+        return self._part(slice(len(self) - self.learned, None), learned=self.learned)
+
+    def without_learned(self) -> Features:
+        """Return the key points that no network found."""
+        return self._part(slice(0, len(self) - self.learned), learned=0)
+
+    def _part(self, chosen: slice, *, learned: int) -> Features:
+        names = ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names}, learned=learned)
 
     def check(self) -> None:
         """Raise ContractError unless all arrays agree and the bearings are unit vectors."""

@@ -25,11 +25,14 @@ class TwoView(Record):
         geometry: "general"; "rotation" (both images from the same position: no direction, no range); or "none".
         reason: why the geometry is not general.
         candidates: number of matches before verification.
+        log10_false_alarms: log₁₀ of the expected number of equally good geometries among random matches.
         parallax_deg: median angle between the two rays of a verified match after de-rotation.
         rotation_std_deg: standard deviation of the rotation about its least certain axis, from the matches.
         direction_std_deg: the same for the direction; both are 0 unless the geometry is general.
+        unverified_idx: (U, 2) int32 the other matches, which do not agree with the geometry; None if unknown.
         alternative_rotations: (K, 3, 3) float64 of second_from_first of the runner-up geometries, best supported first;
-            None, as the next four, without runners-up. Repeated structure often makes a false geometry the best.
+            None, as the next four, without runners-up. Repeated structure often makes a false geometry the best. Those
+            of a pair whose geometry is "none" are hypotheses: each by itself may be chance.
         alternative_directions: (K, 3) float64 their unit translations.
         alternative_sizes: (K,) int32 number of matches that support each.
         alternative_matches_idx: (S, 2) int32 these matches, ordered by geometry, S = Σ sizes. A match may
@@ -38,7 +41,7 @@ class TwoView(Record):
     """
 
     axis: ClassVar[Axis | None] = Axis.PAIR
-    kind_version: ClassVar[int] = 3
+    kind_version: ClassVar[int] = 4
 
     matches_idx: NDArray[np.int32]
     rotation: NDArray[np.float64]
@@ -50,6 +53,8 @@ class TwoView(Record):
     parallax_deg: float = 0.0
     rotation_std_deg: float = 0.0
     direction_std_deg: float = 0.0
+    log10_false_alarms: float = 0.0
+    unverified_idx: NDArray[np.int32] | None = None
     alternative_rotations: NDArray[np.float64] | None = None
     alternative_directions: NDArray[np.float64] | None = None
     alternative_sizes: NDArray[np.int32] | None = None
@@ -57,10 +62,10 @@ class TwoView(Record):
     alternative_residuals_rad: NDArray[np.float32] | None = None
 
     @staticmethod
-    def failed(reason: str, *, candidates: int = 0) -> TwoView:
+    def failed(reason: str, *, candidates: int = 0, unverified_idx: NDArray[np.int32] | None = None) -> TwoView:
         """Return the falsy value for a pair without geometry."""
-        empty = np.zeros((0, 2), np.int32)
-        return TwoView(empty, np.eye(3), np.zeros(3), np.zeros(0, np.float32), "none", reason, candidates)
+        none = TwoView(np.zeros((0, 2), np.int32), np.eye(3), np.zeros(3), np.zeros(0, np.float32), "none", reason)
+        return replace(none, candidates=candidates, unverified_idx=unverified_idx)
 
     def __bool__(self) -> bool:
         """Return whether the pair has a general geometry: a rotation and a direction of translation."""
@@ -69,6 +74,13 @@ class TwoView(Record):
     def __len__(self) -> int:
         """Return the number of verified matches."""
         return len(self.matches_idx)
+
+    @property
+    def all_matches_idx(self) -> NDArray[np.int32]:
+        """All known matches before verification, (M + U, 2)."""
+        if self.unverified_idx is None:
+            return self.matches_idx
+        return np.concatenate([self.matches_idx, self.unverified_idx])
 
     @property
     def residual_deg(self) -> float:
@@ -127,6 +139,8 @@ class TwoView(Record):
         require_array(self, "rotation", dtype=np.float64, shape=(3, 3))
         require_array(self, "direction", dtype=np.float64, shape=(3,))
         require_array(self, "residuals_rad", dtype=np.float32, shape=(len(self.matches_idx),))
+        if self.unverified_idx is not None:
+            require_array(self, "unverified_idx", dtype=np.int32, shape=(None, 2))
         if self.alternative_sizes is not None:
             sizes = require_array(self, "alternative_sizes", dtype=np.int32, shape=(None,))
             require_array(self, "alternative_rotations", dtype=np.float64, shape=(len(sizes), 3, 3))

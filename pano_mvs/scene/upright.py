@@ -11,13 +11,12 @@ import re
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.scene.poses import Poses
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
-
-FloatArray = NDArray[np.float64]
 
 _Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))

@@ -12,7 +12,7 @@ from pano_mvs.stages.exports.mesh import mesh
 from pano_mvs.stages.exports.mesh_textured import mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
-from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
+from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
     confidence,
@@ -29,8 +29,8 @@ from pano_mvs.stages.filters import (
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
-from pano_mvs.stages.matches import bridges, brute_force
-from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
+from pano_mvs.stages.matches import brute_force, lightglue, merge, weak
+from pano_mvs.stages.pairs import exhaustive, learned, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch, plain_surfaces
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
@@ -40,13 +40,15 @@ from pano_mvs.stages.rigs.dual_fisheye import dual_fisheye
 from pano_mvs.stages.rigs.exports import colmap_lenses
 from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
+from pano_mvs.stages.source_tour import tour
 from pano_mvs.stages.source_video import video
+from pano_mvs.stages.structure import scene_planes, structure
 from pano_mvs.stages.views import nearest
 
 __all__ = [
+    "aliked",
     "apply",
     "bilateral_solver",
-    "bridges",
     "brute_force",
     "colmap",
     "colmap_dense",
@@ -70,9 +72,12 @@ __all__ = [
     "from_model",
     "gaussian",
     "guided",
+    "learned",
     "level",
+    "lightglue",
     "localise",
     "median",
+    "merge",
     "mesh",
     "mesh_textured",
     "moving",
@@ -95,6 +100,7 @@ __all__ = [
     "scale_cloud",
     "scale_ranges",
     "scaled_translation",
+    "scene_planes",
     "sequential",
     "sift_tangent",
     "sky",
@@ -103,8 +109,10 @@ __all__ = [
     "splat_bundle",
     "splat_frames",
     "static",
+    "structure",
     "surface",
     "sweep",
+    "tour",
     "tracked",
     "triangulate",
     "truth",
@@ -113,4 +121,5 @@ __all__ = [
     "video",
     "vlad",
     "vote",
+    "weak",
 ]

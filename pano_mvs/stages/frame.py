@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
-from pano_mvs.algorithms.poses.frame.vertical import Evidence, find_vertical
+from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
@@ -42,7 +42,8 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
 
     The origin is the first registered camera; the unit of length does not change. The frame states the evidence and its
     uncertainty. If the vertical cannot be determined, or not well enough, the poses do not change and the report states
-    why. Each group of poses is levelled on its own.
+    why. Each group of poses is levelled on its own. A group that was taken upside down is turned around, unless
+    `evidence` names a source of the vertical.
     """
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
@@ -56,11 +57,26 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
             ctx.note(f"{which}the world was not levelled: {vertical.reason}")
         else:
             ctx.note(f"{which}levelled by {vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°")
+            if _on_orientation(vertical):
+                ctx.note(f"{which}{_on_orientation(vertical)}")
             if not number:
                 ctx.metric("uncertainty_deg", vertical.uncertainty_deg)
                 if np.isfinite(vertical.disagreement_deg):
                     ctx.metric("disagreement_deg", vertical.disagreement_deg)
     return join_groups(levelled, order=poses.names, rejected=poses.rejected)
+
+
+def _on_orientation(vertical: Vertical) -> str:
+    """Return what to report about cameras that are, or may be, upside down; "" if they are upright."""
+    why = f"probability {vertical.upside_down:.2f}, by brightness, texture and the floor below and above the cameras"
+    if vertical.upside_down >= SURE:
+        return (
+            f"the panoramas are upside down ({why}), so the world was turned around. If they are not, set "
+            f"`evidence: {vertical.source}` for poses.level"
+        )
+    if vertical.upside_down >= 1 - SURE:
+        return f"the panoramas may be upside down ({why}). If they are, rotate the images by 180° and run again"
+    return ""
 
 
 class BaselineParams(Params):

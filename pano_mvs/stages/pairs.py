@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.neighbours import (
     east_north_m,
     loop_closing_pairs,
@@ -84,6 +85,19 @@ def retrieval(
 ) -> Pairs:
     """Match each image with the most similar ones; for hundreds of images without order."""
     pairs = retrieval_pairs(images, descriptors, **arguments_from(retrieval_pairs, params))
+    ctx.metric("pairs", len(pairs.pairs))
+    return pairs
+
+
+@params_from(learned_pairs)
+class LearnedPairsParams(Params):
+    """Settings of pairs.learned."""
+
+
+@stage("pairs.learned", memory="600MB")
+def learned(features: All[Features], params: LearnedPairsParams, ctx: Context) -> Pairs:
+    """Match each image that has key points of features.aliked with those whose learned key points are most similar."""
+    pairs = learned_pairs(features, **arguments_from(learned_pairs, params))
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
 

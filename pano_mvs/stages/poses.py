@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.refine import fitted_elevation_range, refine_poses
 from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
 from pano_mvs.algorithms.poses.loop_closures import find_false_closures
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
@@ -168,14 +169,31 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     if largest.center_stds is not None and largest.rotation_stds_rad is not None:
         ctx.metric("center_std_median", np.nanmedian(largest.center_stds))
         ctx.metric("rotation_std_median_deg", np.rad2deg(np.nanmedian(largest.rotation_stds_rad)))
-    return checked_poses(refined, ctx)
+    return checked_poses(refined if rigs else _checked_projection(poses, refined, ctx=ctx, params=params), ctx)
+
+
+def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, ctx: Context) -> Poses:
+    """Return refined poses whose cameras are doubtful if their panoramas do not cover the full sphere."""
+    settings = arguments_from(refine_poses, params)
+    found = fitted_elevation_range(poses, refined, loss=settings["loss"], loss_scale_deg=settings["loss_scale_deg"])
+    if found is None or found.is_full:
+        return refined
+    reason = (
+        f"the images do not cover the full sphere: their rays fit elevations from {found.bottom_deg:.0f}° to "
+        f"{found.top_deg:.0f}°. They were probably cropped above or below and stretched to twice as wide as high, "
+        "which makes the result wrong. Use the original images, or undo the stretching and state the crop as GPano "
+        "metadata"
+    )
+    ctx.note(reason)
+    return replace(refined, doubts={name: refined.doubts.get(name, reason) for name in refined.names})
 
 
 class FromModelParams(Params):
     """Settings of poses.from_model."""
 
     path: InputPath = Field(
-        description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json or CSV"
+        description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json, "
+        "sfm_data.json, XML of Metashape, or CSV"
     )
 
 

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
+from pano_mvs.algorithms.learned.networks import Networks
+from pano_mvs.algorithms.learned.photographs import PhotographView, match_photograph, view_of_photograph
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
+from pano_mvs.algorithms.poses.photograph_points import KnownPoints
 from pano_mvs.api import (
     All,
     Context,
@@ -38,10 +41,11 @@ from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.record import FilePart
+from pano_mvs.stages.features import NetworkParams
 
 # Photographs whose panoramas are chosen together: the larger, the less often the panoramas are read.
 _BLOCK = 32
-_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 600_000_000, 7_000_000, 6_000_000
+_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 900_000_000, 7_000_000, 6_000_000
 
 
 def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
@@ -53,7 +57,7 @@ def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
 
 
 @params_from(localise_photograph, own_last=True)
-class LocaliseParams(Params):
+class LocaliseParams(NetworkParams):
     """Settings of poses.localise."""
 
     path: InputPath = Field(description="folder of photographs, or one photograph")
@@ -84,7 +88,7 @@ def localise(
 
     The key points of each photograph are matched with those of the most similar panoramas that have range maps.
     Photographs that cannot be localised reliably are left out, each with a reason. Only the largest group of poses is
-    used.
+    used. If the panoramas have key points of features.aliked, networks match them with the photographs, too.
     """
     group = split_groups(poses)[0]
     panoramas = LocatedPanoramas(
@@ -101,7 +105,7 @@ def localise(
     named = {path.relative_to(folder).as_posix(): path for path in paths}
     found: dict[str, _Found] = {}
     rejected: dict[str, str] = {}
-    for name, result in _results(named, panoramas, patches, params=params, ctx=ctx):
+    for name, result in _results(named, panoramas, patches, features=features, params=params, ctx=ctx):
         if isinstance(result, str):
             rejected[name] = result
             ctx.note(f"{name} was not localised: {result}")
@@ -127,6 +131,7 @@ class _Photograph(NamedTuple):
     focal_px: float | None
     keypoints: PhotographKeypoints
     patches: PhotographPatches
+    view: PhotographView | None
 
 
 def _results(
@@ -134,6 +139,7 @@ def _results(
     panoramas: LocatedPanoramas,
     patches: PanoramaPatches,
     *,
+    features: Mapping[str, Features],
     params: LocaliseParams,
     ctx: Context,
 ) -> Iterator[tuple[str, _Found | str]]:
@@ -142,8 +148,9 @@ def _results(
     In large captures, the panoramas are read once for each block of photographs.
     """
     block = _BLOCK if panoramas.chooses else 1
+    networks = params.networks if any(features[name].learned for name in features) else None
     for names in (list(paths)[start : start + block] for start in range(0, len(paths), block)):
-        read = {name: _read(paths[name], patches) for name in names}
+        read = {name: _read(paths[name], patches, networks) for name in names}
         readable = {name: photograph for name, photograph in read.items() if isinstance(photograph, _Photograph)}
         chosen = panoramas.most_similar([photograph.keypoints.descriptors for photograph in readable.values()])
         of_name = dict(zip(readable, chosen, strict=True))
@@ -153,10 +160,12 @@ def _results(
             if isinstance(photograph, str):
                 yield name, photograph
                 continue
+            known = panoramas.points(of_name[name])
             result = localise_photograph(
                 photograph.keypoints,
                 photograph.size_hw,
-                panoramas.points(of_name[name]),
+                known,
+                learned=_learned_matches(photograph, known, features, networks=networks),
                 focal_px=photograph.focal_px,
                 patches=photograph.patches,
                 **arguments_from(localise_photograph, params),
@@ -165,7 +174,28 @@ def _results(
             yield name, result if isinstance(result, str) else _Found(photograph.size_hw, result)
 
 
-def _read(path: Path, patches: PanoramaPatches) -> _Photograph | str:
+def _learned_matches(
+    photograph: _Photograph,
+    known: Mapping[str, KnownPoints],
+    features: Mapping[str, Features],
+    *,
+    networks: Networks | None,
+) -> dict[str, NDArray[np.int32]]:
+    """Return the matches that the network finds with each panorama, as positions among its known points."""
+    if networks is None or photograph.view is None:
+        return {}
+    found = {}
+    first = len(photograph.keypoints.pixels_px) - len(photograph.view.pixels_px)
+    for name, points in known.items():
+        matches = match_photograph(photograph.view, features[name], networks=networks)
+        there = np.full(len(features[name]), -1)
+        there[points.keypoints_idx] = np.arange(len(points.keypoints_idx))
+        of_point = there[matches[:, 1]]
+        found[name] = np.stack([matches[:, 0] + first, of_point], axis=1)[of_point >= 0].astype(np.int32)
+    return found
+
+
+def _read(path: Path, patches: PanoramaPatches, networks: Networks | None) -> _Photograph | str:
     """Return a photograph, or the reason why it cannot be read."""
     try:
         data = FilePart(path).read_bytes()
@@ -174,7 +204,14 @@ def _read(path: Path, patches: PanoramaPatches) -> _Photograph | str:
         focal_px = focal_from_exif(read_container(data).exif, size_hw)
     except InputError as error:
         return str(error)
-    return _Photograph(size_hw, focal_px, photograph_keypoints(picture), PhotographPatches(picture, patches))
+    keypoints, view = photograph_keypoints(picture), None
+    if networks is not None:
+        view = view_of_photograph(picture, networks=networks)
+        keypoints = PhotographKeypoints(
+            np.concatenate([keypoints.pixels_px, view.pixels_px]),
+            np.concatenate([keypoints.descriptors, view.descriptors]),
+        )
+    return _Photograph(size_hw, focal_px, keypoints, PhotographPatches(picture, patches), view)
 
 
 def _photographs(path: Path) -> tuple[Path, list[Path]]:

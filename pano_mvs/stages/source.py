@@ -12,6 +12,7 @@ from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.images.copies import Copy, find_copies
 from pano_mvs.io.images.mask_files import find_mask, require_masks
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
@@ -57,13 +58,27 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         )
     if params.masks is not None:
         require_masks(params.masks, [path.relative_to(params.path).as_posix() for path in pictures])
-    for path in pictures:
-        name, problem = printable_name(path.relative_to(params.path).as_posix())
+    names = [printable_name(path.relative_to(params.path).as_posix()) for path in pictures]
+    usable = {name: path for path, (name, problem) in zip(pictures, names, strict=True) if not problem}
+    copies = find_copies(usable, max_pixels=params.max_pixels)
+    if len(pictures) - len(copies) < 2:
+        raise InputError(
+            f"{params.path}: all images are copies of one ({pictures[0].name}); depth needs two or more panoramas of "
+            "the same place, taken from different positions"
+        )
+    for path, (name, problem) in zip(pictures, names, strict=True):
         files = {"image": path}
         mask = None if problem else _mask_of(name, params)
         if mask is not None:
             files["mask"] = mask
+        if name in copies:
+            problem = _is_a_copy(copies[name])
         yield SourceItem(name, files, problem, (*unread, *_notes_on_masks(name, mask, params)))
+
+
+def _is_a_copy(copy: Copy) -> str:
+    turned = f", turned by {copy.turn_deg:.0f}°" if copy.turn_deg else ""
+    return f"it is a copy of {copy.original}{turned}, which is used alone, as a copy adds nothing; remove one of them"
 
 
 def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:

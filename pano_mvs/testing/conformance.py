@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import inspect
 import json
+import multiprocessing
 import re
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.process_state import ProcessState
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
@@ -143,6 +146,19 @@ def _same_bytes(case: StageCase) -> None:
     assert digests[0] == digests[2], f"{case.spec.name} returns something else with three threads"
 
 
+def _leaves_its_process(case: StageCase) -> None:
+    """The stage changes nothing that other stages compute with, and leaves no thread or process behind."""
+    case.call(case.capture)  # what it loads at its first call may change more
+    before, threads = ProcessState.now(), set(threading.enumerate())
+    case.call(case.capture)
+    changes = before.restore()
+    assert not changes, f"{case.spec.name} changes {changes} in its process; runs undo this after every unit"
+    left = [thread.name for thread in threading.enumerate() if thread not in threads]
+    assert not left, f"{case.spec.name} leaves the threads {', '.join(left)} running; other units run beside them"
+    left = [child.name for child in multiprocessing.active_children()]
+    assert not left, f"{case.spec.name} leaves the processes {', '.join(left)} running; they end with its worker"
+
+
 def _any_size(case: StageCase, variant: Variant) -> None:
     """The stage returns a valid result or raises one of our errors."""
     case.call(tiny_capture(variant))
@@ -228,6 +244,7 @@ _CONTRACT: dict[str, Callable[[StageCase], None]] = {
     "has settings that are values": _settings_are_values,
     "returns what it declares and does not modify its inputs": _result,
     "returns the same bytes again and with more threads": _same_bytes,
+    "leaves its process as it was": _leaves_its_process,
     **{f"accepts or rejects images {name}": partial(_any_size, variant=size) for name, size in _SIZES.items()},
     "accepts or rejects empty inputs": _nothing_to_see,
     "accepts or rejects missing inputs": _optional_inputs,

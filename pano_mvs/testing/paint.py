@@ -6,7 +6,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from pano_mvs.testing.surfaces import FloatArray, Vector
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.testing.surfaces import Vector
 from pano_mvs.testing.texture import noise
 
 Texture = Literal["strong", "weak", "faint", "isotropic", "outdoor", "none"]

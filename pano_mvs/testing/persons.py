@@ -12,12 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.testing.texture import noise
 
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 Point = tuple[float, float, float]
 
 # x to the right of the person, y up from the ground, z to the front; radii at both ends; what it wears there.

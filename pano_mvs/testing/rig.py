@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid
 from pano_mvs.testing.texture import noise
 
-FloatArray = NDArray[np.float64]
 Drawn = tuple[FloatArray, NDArray[np.bool_]]
 
 

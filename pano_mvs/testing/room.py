@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
 from pano_mvs.testing.paint import Pattern, Texture, albedo_at, sky_color
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Surface, Vector
 
 _RAYS_AT_ONCE = 1 << 17
 

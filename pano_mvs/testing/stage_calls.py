@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, PanoMvsError, UsageError
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import is_file, is_inside
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.ports import Cardinality, Names, Port
@@ -130,7 +130,7 @@ def require_valid(value: object, spec: StageSpec, scratch: Path) -> None:
     for item in value.explode().values():
         item.check()
     for path in value.files.values() if isinstance(value, Files) else ():
-        inside = resolved(path).is_relative_to(resolved(scratch))
+        inside = is_inside(path, scratch)
         assert is_file(path), f"{spec.name} returns {path} as written, but the file does not exist"
         assert inside, f"{spec.name} wrote {path}, outside ctx.scratch"
 

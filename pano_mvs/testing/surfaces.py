@@ -8,7 +8,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray: TypeAlias = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
+
 Vector: TypeAlias = tuple[float, float, float]
 Hit: TypeAlias = tuple[FloatArray, FloatArray]
 

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_quat_wxyz
-
-FloatArray = NDArray[np.float64]
 
 _CELLS = 64
 # Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.

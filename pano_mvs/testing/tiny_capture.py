@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM
 from pano_mvs.core.paths import exists
 from pano_mvs.geometry import Rigid3, pixel_from_ray, roll_panorama
 from pano_mvs.scene import (
@@ -29,11 +30,13 @@ from pano_mvs.scene import (
     Scores,
     TwoView,
     Views,
+    WeakImage,
 )
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.static_masks import StaticMasks, camera_of
+from pano_mvs.scene.structure import Structure
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
@@ -106,6 +109,7 @@ class TinyCapture:
             RangeMap: {name: self._range_map(idx) for idx, name in enumerate(self.names)},
             FaceFiles: {name: FaceFiles({}, size_px=12) for name in self.names},
             SurfaceSamples: {name: self._samples(idx) for idx, name in enumerate(self.names)},
+            WeakImage: {name: WeakImage(wanted=True) for name in self.names},
             TwoView: {pair: self._two_view(*pair) for pair in pairs.pairs},
         }
 
@@ -122,6 +126,7 @@ class TinyCapture:
             PointCloud: self._cloud(),
             TrackedPoints: self._tracked_points(),
             StaticMasks: self._static_masks(),
+            Structure: self._structure(),
             Scores: Scores({"registered": 1.0}, {}),
             Photographs: self._photographs(),
         }
@@ -172,16 +177,18 @@ class TinyCapture:
         count = 0 if self.variant.blank else _POINTS
         bearings = self.bearings(idx)[:count]
         pixels = np.floor(pixel_from_ray(bearings, (height, width))).astype(int)
-        descriptors = np.random.default_rng(7).normal(size=(_POINTS, 32))[:count]
+        descriptors = np.random.default_rng(7).normal(size=(_POINTS, 128))[:count]
+        descriptors *= DESCRIPTOR_NORM / np.linalg.norm(descriptors, axis=1, keepdims=True)
         return frozen(
             Features(
                 bearings=bearings,
-                descriptors=descriptors.astype(np.float32),
+                descriptors=np.rint(descriptors).astype(np.float32),
                 sizes_rad=np.full(count, 0.05, np.float32),
                 scores=np.linspace(1, 0.1, _POINTS, dtype=np.float32)[:count],
                 colors_rgb=self.pictures[idx][pixels[:, 1] % height, pixels[:, 0] % width],
                 metric="l2",
                 size_hw=(height, width),
+                learned=count,
             )
         )
 
@@ -289,6 +296,11 @@ class TinyCapture:
         pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
         camera = camera_of(self.images[self.names[0]])
         return frozen(StaticMasks(pixels[None], (camera,)))
+
+    def _structure(self) -> Structure:
+        """Return the floor and one wall."""
+        normals, offsets = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]]), np.array([-1.3, -3.0])
+        return frozen(Structure(normals, offsets, np.full(2, 0.004), np.zeros(2, np.int32)))
 
     def _cloud(self) -> PointCloud:
         points = self.points_in_world[: 0 if self.variant.blank else None]

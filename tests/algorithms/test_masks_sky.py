@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, share_of_sphere
-from pano_mvs.algorithms.masks.sky import sky_pixels
+from pano_mvs.algorithms.masks.sky import confirmed_parts, sky_pixels
 from pano_mvs.algorithms.masks.sky_colors import sharpened_sky, sky_colors
 from pano_mvs.algorithms.masks.sky_comparison import compare_with_source, errors_of_area
 from pano_mvs.core.errors import UsageError
@@ -118,6 +118,18 @@ def test_rooms_have_no_sky(gain: float) -> None:
     room = replace(default_room(), texture="none")
     views = views_of(room, gain=gain)
     assert not found_in(views, range_map=measured(views[1][0], confirmed=0.33)).any()
+
+
+def test_parts_of_the_sky_that_others_confirm_are_surfaces() -> None:
+    """A floor and a part of it that reaches up to the sky; single confirmed ranges leave the sky as it is."""
+    sky, floor = np.zeros(SIZE_HW, np.bool_), np.zeros(SIZE_HW, np.bool_)
+    sky[10:50] = True
+    floor[90:110, 20:80] = floor[30:60, 100:140] = True
+    share = np.where(floor, 0.9, 0.08)
+    confirmed = np.random.default_rng(0).random(SIZE_HW) < share
+    surface = confirmed_parts(sky | floor, confirmed)
+    assert AREA[surface & floor].sum() > 0.95 * AREA[floor].sum()
+    assert AREA[surface & ~floor].sum() < 0.05 * AREA[sky].sum()  # beside the floor
 
 
 @pytest.mark.slow

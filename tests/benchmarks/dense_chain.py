@@ -23,6 +23,7 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.structure import Structure
 from pano_mvs.session.session import open_session
 from tests.benchmarks.captures import Capture
 from tests.benchmarks.depth_metrics import DepthMetrics, depth_metrics
@@ -114,6 +115,8 @@ class DenseChain:
             if edge is None:
                 arguments[port.name] = None
                 continue
+            if port.kind is Structure and edge.producer not in done.results:
+                done.results[edge.producer] = {"": self.run_one(edge.producer, "", index, given, done)}
             items = done.results.get(edge.producer) or self._given(port, given)
             arguments[port.name] = _delivered(port, items, image, index)
         arguments |= {
@@ -132,8 +135,10 @@ class DenseChain:
 
 
 def true_poses(capture: Capture) -> Poses:
-    """Return the true poses of a capture, without points."""
-    return Poses.without_points(capture.poses, frame="the truth's", scale="the truth's", metric=True)
+    """Return the true poses of a capture, without points; the worlds of all captures with truth have y down."""
+    return Poses.without_points(
+        capture.poses, frame="the truth's, y down along gravity", scale="the truth's", metric=True
+    )
 
 
 def given_records(capture: Capture, poses: Poses) -> dict[type[Record], dict[str, Any]]:

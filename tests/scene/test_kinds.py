@@ -28,6 +28,7 @@ from pano_mvs.scene.files import group_file, item_stems
 from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
 from pano_mvs.scene.scores import Scores
+from pano_mvs.scene.structure import Structure
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 from tests.scene.pose_groups import drawn_group
@@ -53,6 +54,7 @@ KINDS: dict[str, Record] = {
     ),
     "range map": RangeMap(np.ones((2, 4), np.float32), np.full((2, 4), 200, np.uint8)),
     "samples": SurfaceSamples(UNITS, FLOATS, COLORS, BYTES),
+    "structure": Structure(UNITS, np.ones(4), np.full(4, 0.01), np.zeros(4, np.int32)),
     "tracked points": TrackedPoints(("a", "b"), UNITS, COLORS, FLOATS, TRACKS, TRACKS % 2, UNITS[:3]),
     "two views": GENERAL.with_alternatives([replace(GENERAL, direction=UNITS[idx]) for idx in (1, 2)]),
 }
@@ -410,7 +412,7 @@ def test_kinds_have_the_axes_that_users_read_of() -> None:
         Axis.PAIR: (TwoView,),
         Axis.VIEW: (RangeMap, SurfaceSamples, FaceFiles),
         None: (Files,),
-        Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, TrackedPoints),
+        Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, Structure, TrackedPoints),
     }
     for axis, those in kinds.items():
         assert {kind.axis for kind in those} == {axis}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import trimesh
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap, UsageError
+from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.pose_groups import join_groups
@@ -146,14 +145,6 @@ def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -
     ]
     assert files["mesh_textured.glb"].read_bytes() == files["mesh_textured_1.glb"].read_bytes()
     assert ctx.notes[0].startswith("no mesh_textured_2.glb: 5 of 5 points are left")
-
-
-def test_a_missing_extra_is_named(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for library in ("fast_simplification", "xatlas"):
-        with monkeypatch.context() as patch:
-            patch.setitem(sys.modules, library, None)
-            with pytest.raises(UsageError, match=r"pip install 'pano-mvs\[mesh\]'"):
-                run(inputs, tmp_path / library)
 
 
 def test_a_mesh_that_no_panorama_sees_is_refused(inputs: Inputs, tmp_path: Path) -> None:

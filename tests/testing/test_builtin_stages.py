@@ -9,6 +9,7 @@ import pytest
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
+from tests.io.images.tours import tiny_tour
 from tests.io.images.videos import tiny_video
 from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
 
@@ -22,6 +23,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "calibration": str(tiny_rig_capture() / "rig.yaml"),
         "width": 64,
     },
+    "source.tour": {"path": str(tiny_tour())},
     "source.video": {"path": str(tiny_video())},
 }
 FRAME = NerfstudioFrame(
@@ -30,6 +32,7 @@ FRAME = NerfstudioFrame(
 INPUTS: dict[str, dict[str, Any]] = {
     "export.colmap_lenses": {"image": tiny_rig_panorama()},
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
+    "features.aliked": {"features": None},  # those of the tiny capture, which the stage returns, too, are everywhere
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
 SIZES_HW = {"poses.colmap_sift": (96, 192)}

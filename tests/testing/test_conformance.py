@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -201,17 +204,33 @@ def stops_at_the_seam(x: Each[RangeMap]) -> RangeMap:
     return RangeMap(np.where(keep & x.valid, x.range, np.nan).astype(np.float32), np.where(keep, x.confidence, 0))
 
 
+@stage("bad.changes_libraries")
+def changes_libraries(x: Each[RangeMap]) -> RangeMap:
+    """OpenCV computes otherwise afterwards."""
+    cv2.setUseOptimized(not cv2.useOptimized())
+    return x
+
+
+@stage("bad.leaves_a_thread")
+def leaves_a_thread(x: Each[RangeMap]) -> RangeMap:
+    """Something goes on afterwards."""
+    threading.Thread(target=time.sleep, args=(1.0,), daemon=True).start()
+    return x
+
+
 BROKEN_BY = {
     undocumented: "declares itself",
     misnamed: "declares itself",
     undescribed: "declares itself|settings that are values",
     changed_by_json: "settings that are values",
-    another_kind: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
-    unsound: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
-    scribbles: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
+    another_kind: "returns what it declares|returns the same|accepts or rejects|respects|rolls|leaves its process",
+    unsound: "returns what it declares|returns the same|accepts or rejects|respects|rolls|leaves its process",
+    scribbles: "returns what it declares|returns the same|accepts or rejects|respects|rolls|leaves its process",
     forces: "returns what it declares|returns the same|rolls",
-    elsewhere: "returns what it declares|returns the same|accepts or rejects",
-    never_written: "returns what it declares|returns the same|accepts or rejects",
+    elsewhere: "returns what it declares|returns the same|accepts or rejects|leaves its process",
+    never_written: "returns what it declares|returns the same|accepts or rejects|leaves its process",
+    changes_libraries: "leaves its process",
+    leaves_a_thread: "leaves its process",
     draws: "returns the same bytes",
     counts_threads: "returns the same bytes",
     reports_at_random: "returns the same bytes",

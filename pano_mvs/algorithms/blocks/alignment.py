@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import (
     Rigid3,
     Similarity3,
@@ -18,8 +18,6 @@ from pano_mvs.geometry import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
-
-FloatArray = NDArray[np.float64]
 
 MIN_COMMON = 3
 """Number of common cameras that two blocks need."""

@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 # Images of two blocks are of one place if they are this near, in median steps of the path.
 _NEAR = 1.5

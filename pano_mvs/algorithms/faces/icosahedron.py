@@ -12,11 +12,9 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import PinholeView
-
-FloatArray = NDArray[np.float64]
 
 _MARGIN = 0.17  # in units of the focal length; required by detectors and descriptors beyond the face
 _MIN_MARGIN_PX = 24

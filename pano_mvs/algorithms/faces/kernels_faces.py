@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import sample_range
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import pixel_from_ray
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def z_depth_rows(
     first: int,
     rows: int,

@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.icosahedron import face_centers
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, spiral_rays
 from pano_mvs.scene.face_files import FaceLayout
 
 __all__ = ["CUBE_NAMES", "CUBE_ROTATIONS", "Face", "FaceLayout", "covers_sphere", "default_face_size", "panorama_faces"]
 
-FloatArray = NDArray[np.float64]
 
 # face_from_cam, rows: the face's x, y and z axis in the panorama's camera frame.
 CUBE_ROTATIONS: FloatArray = np.array(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import bilinear
 
 FloatArray = NDArray[np.float64]
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 ARC = 10  # of the 18 cells of the ring
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def segment_score(differences: NDArray[np.int64]) -> np.int64:
     """Return the greatest threshold at which an arc of a ring (18,) int64 is entirely brighter or entirely darker."""
     best = np.int64(0)
@@ -29,7 +29,7 @@ def segment_score(differences: NDArray[np.int64]) -> np.int64:
     return best
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def score_corners(
     pictures: NDArray[np.uint8],
     ring: NDArray[np.int64],
@@ -72,7 +72,7 @@ def score_corners(
                     score[at] = found
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def local_maxima(
     scores: NDArray[np.uint8], neighbours: NDArray[np.int64], margin: int, reach: int, cells: NDArray[np.int64]
 ) -> int:
@@ -107,7 +107,7 @@ def local_maxima(
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def harris_response(
     picture: NDArray[np.uint8], at: int, side: int, window: NDArray[np.int64], weights: FloatArray
 ) -> float:
@@ -129,7 +129,7 @@ def harris_response(
     return xx * yy - xy * xy - 0.04 * (xx + yy) ** 2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def hexagon_peak(center: float, around: FloatArray) -> tuple[float, float]:
     """Return lattice steps (u, v) from a cell to the maximum of the paraboloid through it and its six neighbours (6,).
 
@@ -152,7 +152,7 @@ def hexagon_peak(center: float, around: FloatArray) -> tuple[float, float]:
     return x - y / math.sqrt(3.0), y * 2 / math.sqrt(3.0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def refine_corners(
     pictures: NDArray[np.uint8],
     cells: NDArray[np.int64],
@@ -196,7 +196,7 @@ def refine_corners(
         responses[n] = center
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def disc_is_clear(
     valid: NDArray[np.uint8],
     faces: NDArray[np.int64],
@@ -229,7 +229,7 @@ def disc_is_clear(
                 break
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sample_lattice(picture: NDArray[np.uint8], u: float, v: float) -> float:
     """Return the bilinear value of a picture (side, side) at column u and row v."""
     column, row = math.floor(u), math.floor(v)
@@ -239,7 +239,7 @@ def sample_lattice(picture: NDArray[np.uint8], u: float, v: float) -> float:
     return value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def describe_corners(
     pictures: NDArray[np.uint8],
     faces: NDArray[np.int64],

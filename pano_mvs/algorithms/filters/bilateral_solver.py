@@ -31,12 +31,11 @@ from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain, MaxHoleDeg
 from pano_mvs.algorithms.filters.sphere.cells import SphereCells, sphere_cells
 from pano_mvs.algorithms.filters.support.supported import supported_pixels
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
 
 # [1 2 1] along two spatial and three colour dimensions: the centre counts twice for each.
 _BLUR_CENTER = 10.0

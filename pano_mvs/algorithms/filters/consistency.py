@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty
 from pano_mvs.algorithms.filters.view_doubts import Agreement
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
 
 # Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.settings import Domain
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
-
-FloatArray = NDArray[np.float64]
 
 
 def require_guide(guide: NDArray[np.uint8], range_map: RangeMap) -> None:

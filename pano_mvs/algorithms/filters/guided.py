@@ -16,12 +16,11 @@ from pano_mvs.algorithms.filters.data_term import data_term, require_guide
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain
 from pano_mvs.algorithms.filters.sphere.box import box_spread, box_sum
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import FILLED_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
 
 # Relative to a window with full weight of all pixels: windows with less weight than this are ignored.
 _MIN_SUPPORT = 1e-6

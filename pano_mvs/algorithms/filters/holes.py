@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pad_panorama, ray_grid
-
-Mask = NDArray[np.bool_]
 
 
 def large_holes(valid: Mask, max_hole_deg: float) -> Mask:

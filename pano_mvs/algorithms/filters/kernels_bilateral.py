@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import inlined, kernel
 
 FloatArray = NDArray[np.float64]
 # The arguments of `apply_system` after the values.
@@ -27,13 +28,13 @@ _LUMA, _BLUE, _RED = COLOR_BINS * COLOR_BINS, COLOR_BINS, 1
 _PRIME, _MULTIPLIER = 2147483647, 1640531527
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _slot(key: int, bits: int) -> int:
     """Return the first slot to probe for a key in a table of 2^bits slots (multiplicative hashing without overflow)."""
     return int(((np.int64(key) % _PRIME * _MULTIPLIER) >> 20) & ((1 << bits) - 1))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _find(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int, bits: int) -> int:
     """Return the number of a key, or −1."""
     slot = _slot(key, bits)
@@ -45,7 +46,7 @@ def _find(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int, bits: 
     return -1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _find_or_add(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int, bits: int, count: int) -> int:
     """Return the number of a key; a new key gets the number `count`."""
     slot = _slot(key, bits)
@@ -59,7 +60,7 @@ def _find_or_add(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int,
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _bits_for(count: int) -> int:
     """Return the size of a table, as a power of two, that stays at most half full."""
     bits = 4
@@ -68,7 +69,7 @@ def _bits_for(count: int) -> int:
     return bits
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def number_elements(
     colors: NDArray[np.int64], cell_elements: NDArray[np.int32], gap_of_row: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -98,7 +99,7 @@ def number_elements(
     return elements, keys[:count].copy()
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _grow(keys: NDArray[np.int64], count: int, bits: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
     """Return a table of twice the size that holds the same keys and numbers, and its bits."""
     bits += 1
@@ -108,7 +109,7 @@ def _grow(keys: NDArray[np.int64], count: int, bits: int) -> tuple[NDArray[np.in
     return table, numbers, bits
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def number_vertices(
     element_keys: NDArray[np.int64], corners: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -132,7 +133,7 @@ def number_vertices(
     return vertices, keys[:used].copy()
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def blur_graph(
     vertex_keys: NDArray[np.int64], starts: NDArray[np.int32], neighbours: NDArray[np.int32], strengths: FloatArray
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], FloatArray]:
@@ -166,7 +167,7 @@ def blur_graph(
     return rows
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _rows_from_edges(
     heads: NDArray[np.int32], tails: NDArray[np.int32], values: FloatArray, count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], FloatArray]:
@@ -186,7 +187,7 @@ def _rows_from_edges(
     return starts, indices, strengths
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _corner_weights(weights: FloatArray, weight_row: float, upper: float, lower: float) -> None:
     weights[0] = (1 - weight_row) * (1 - upper)
     weights[1] = (1 - weight_row) * upper
@@ -194,7 +195,7 @@ def _corner_weights(weights: FloatArray, weight_row: float, upper: float, lower:
     weights[3] = weight_row * lower
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def assemble(
     elements: NDArray[np.int32],
     targets: FloatArray,
@@ -224,7 +225,7 @@ def assemble(
     return mass, gram, right
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_at_vertices(values: FloatArray, vertices: NDArray[np.int32], count: int) -> FloatArray:
     """Return the sum at each vertex, (V,), of the elements' corner values, (E, 4)."""
     result = np.zeros(count)
@@ -234,7 +235,7 @@ def sum_at_vertices(values: FloatArray, vertices: NDArray[np.int32], count: int)
     return result
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def slice_pixels(
     elements: NDArray[np.int32],
     vertices: NDArray[np.int32],
@@ -260,7 +261,7 @@ def slice_pixels(
     return result
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def blur(
     values: FloatArray, starts: NDArray[np.int64], indices: NDArray[np.int32], strengths: FloatArray, center: float
 ) -> FloatArray:
@@ -274,7 +275,7 @@ def blur(
     return result
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def bistochastise(
     mass: FloatArray,
     starts: NDArray[np.int64],
@@ -294,7 +295,7 @@ def bistochastise(
     return n, n * blur(n, starts, indices, strengths, center)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def apply_system(
     values: FloatArray,
     smoothness: float,
@@ -319,7 +320,7 @@ def apply_system(
     return result
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def solve(
     right: FloatArray, initial: FloatArray, diagonal: FloatArray, tolerance: float, iterations: int, system: System
 ) -> tuple[FloatArray, int]:

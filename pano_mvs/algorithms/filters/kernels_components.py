@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _root(parents: NDArray[np.int64], index: int) -> int:
     while parents[index] != index:
         parents[index] = parents[parents[index]]
@@ -19,7 +19,7 @@ def _root(parents: NDArray[np.int64], index: int) -> int:
     return index
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _join(parents: NDArray[np.int64], first: int, second: int) -> None:
     a, b = _root(parents, first), _root(parents, second)
     # The smaller index wins, so that a component's label is its first pixel.
@@ -29,7 +29,7 @@ def _join(parents: NDArray[np.int64], first: int, second: int) -> None:
         parents[a] = b
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def label_surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.int64]:
     """Return for each pixel the flat index of the first pixel of its component, (H W) int64; −1 is invalid.
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 FloatArray = NDArray[np.float64]
@@ -15,7 +16,7 @@ FloatArray = NDArray[np.float64]
 _DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def nearest_trusted(
     inverse: FloatArray,
     trusted: NDArray[np.bool_],
@@ -40,7 +41,7 @@ def nearest_trusted(
     return 0.0, 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def background_mean(values: FloatArray, steps: FloatArray, count: int, max_ratio: float) -> tuple[float, float]:
     """Return the mean of the farther of some 1/ranges, weighted by 1/steps, and the steps to the nearest of them.
 
@@ -61,7 +62,7 @@ def background_mean(values: FloatArray, steps: FloatArray, count: int, max_ratio
     return total / weight, nearest
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@kernel(parallel=True)
 def fill_holes(
     inverse: FloatArray,
     wanted: NDArray[np.bool_],

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, even_atan2, pixel_from_ray
 
 FloatArray = NDArray[np.float64]
@@ -21,7 +21,7 @@ _U = np.uint64
 _FINE, _FINEST = 2.0**40, 2.0**60
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: float) -> float:
     """Return the range between pixels: bilinear in 1/range if the four lie on one surface, else that of the nearest."""
     height, width = ranges.shape
@@ -39,7 +39,7 @@ def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: floa
     return float(r10) if weight_x < 0.5 else float(r11)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def transformed(point: Triple, rotation: FloatArray, translation: FloatArray) -> tuple[float, float, float]:
     """Return R x + t of a point (3 numbers)."""
     a = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
@@ -48,7 +48,7 @@ def transformed(point: Triple, rotation: FloatArray, translation: FloatArray) ->
     return a, b, c
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def reprojection_angle(point: Triple, baseline: FloatArray, ratio: float) -> float:
     """Return the angle, at the reference, between a point and the source's point along its own ray.
 
@@ -62,7 +62,7 @@ def reprojection_angle(point: Triple, baseline: FloatArray, ratio: float) -> flo
     return angle
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def judge_point(
     point: Triple,
     rotation: FloatArray,
@@ -94,7 +94,7 @@ def judge_point(
     return UNKNOWN, error, x, y, seen
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def squared_motion(point: Triple, distance: float, baseline: FloatArray) -> float:
     """Return the squared motion of a point, in radians at the source, per relative change of its range.
 
@@ -107,7 +107,7 @@ def squared_motion(point: Triple, distance: float, baseline: FloatArray) -> floa
     return motion
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def locate_row(
     ranges: NDArray[np.float32],
     turns: FloatArray,
@@ -149,7 +149,7 @@ def locate_row(
         places[2, i] = math.sqrt(a * a + b * b + c * c)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def reproject_row(
     ranges: NDArray[np.float32],
     turns: FloatArray,
@@ -180,7 +180,7 @@ def reproject_row(
         angles[i] = even_atan2(math.sqrt(x * x + y * y + z * z), p0 * o0 + p1 * o1 + p2 * o2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def judge_row(
     ranges: NDArray[np.float32],
     turns: FloatArray,
@@ -219,7 +219,7 @@ def judge_row(
         verdicts[i] = AGREES if agrees else verdict
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def compare_rows(
     rows: tuple[int, int],
     ranges: NDArray[np.float32],
@@ -276,7 +276,7 @@ def compare_rows(
                 hiding[row, i] += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def count_agreeing(
     points: FloatArray,
     view: tuple[FloatArray, FloatArray],

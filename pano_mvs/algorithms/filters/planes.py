@@ -20,13 +20,11 @@ from pano_mvs.algorithms.filters.data_term import require_guide
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import MaxHoleDeg
+from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
 # Within a surface, colours change by less than this share from pixel to pixel.

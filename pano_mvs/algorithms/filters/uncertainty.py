@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 UNCONFIRMED_UNCERTAINTY = 0.15
 """Relative standard deviation of ranges that no other view confirms: weak, moved and filled ones."""

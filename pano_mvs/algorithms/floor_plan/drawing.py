@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _PAPER, _INK, _CAMERA = (255, 255, 255), (24, 32, 56), (214, 72, 36)
 _STRIP_SHARE, _MIN_STRIP_PX = 0.06, 36

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.floor_plan.storeys import Storey
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 LAYERS = 32
 """Number of layers between floor and ceiling in which walls are looked for."""

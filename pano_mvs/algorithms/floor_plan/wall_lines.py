@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from pano_mvs.algorithms.floor_plan.plan_grid import LAYERS, WallCells
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _ANGLE_BINS = 180
 _MAX_LINES = 500

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import (
@@ -14,6 +13,7 @@ from pano_mvs.algorithms.filters.kernels_reprojection import (
     Triple,
     judge_row,
 )
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_at
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +24,7 @@ Tallies = tuple[
 ]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_color(image: NDArray[np.uint8], x: float, y: float, weight: float, color: FloatArray) -> None:
     """Add the bilinear colour at a position, times a weight, to color (4,): r, g, b, weight."""
     height, width = image.shape[0], image.shape[1]
@@ -37,7 +37,7 @@ def add_color(image: NDArray[np.uint8], x: float, y: float, weight: float, color
     color[3] += weight
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pixel_footprint(view: Triple, normal: NDArray[np.float32]) -> float:
     """Return the surface area, per steradian, that a camera sees along `view` (camera to point): r² / cosine.
 
@@ -49,7 +49,7 @@ def pixel_footprint(view: Triple, normal: NDArray[np.float32]) -> float:
     return footprint
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
     """Return the confidence of the pixel at a position."""
     row, column = pixel_at(x, y, confidence.shape[0], confidence.shape[1])
@@ -57,14 +57,14 @@ def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
     return value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def uncertainty_at(uncertainty: NDArray[np.float32], x: float, y: float) -> float:
     """Return the relative uncertainty of the pixel at a position."""
     row, column = pixel_at(x, y, uncertainty.shape[0], uncertainty.shape[1])
     return float(uncertainty[row, column])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_source(
     reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies
 ) -> None:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def solve_symmetric(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:
     """Return the solution of a symmetric 3×3 system, a = (xx, xy, xz, yy, yz, zz), and whether it is well posed."""
     c00, c01, c02 = a[3] * a[5] - a[4] * a[4], a[2] * a[4] - a[1] * a[5], a[1] * a[4] - a[2] * a[3]
@@ -28,7 +28,7 @@ def solve_symmetric(a: FloatArray, b: FloatArray) -> tuple[float, float, float, 
     return x, y, z, True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fit_plane(
     inverse: FloatArray,
     rays: FloatArray,
@@ -78,7 +78,7 @@ def fit_plane(
     return plane
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fit_normals(
     pixels: tuple[FloatArray, FloatArray, NDArray[np.bool_]],
     stretches: NDArray[np.int64],

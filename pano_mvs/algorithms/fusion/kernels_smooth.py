@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
+from pano_mvs.core.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -28,7 +28,7 @@ _MAX_OFF_CENTER = 0.3
 _MIN_NEIGHBOURS = 6
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def column_range(keys: IntArray, starts: IntArray, key: int) -> tuple[int, int]:
     """Return where the points of a cell and of those before and behind it begin and end; their keys are successive."""
     first = int(np.searchsorted(keys, key - 1))
@@ -38,7 +38,7 @@ def column_range(keys: IntArray, starts: IntArray, key: int) -> tuple[int, int]:
     return starts[first], starts[end]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, float, float]:
     """Return two unit vectors perpendicular to a normal and to each other."""
     x, y, z = float(normal[0]), float(normal[1]), float(normal[2])
@@ -54,7 +54,7 @@ def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, f
     return a, b, c, y * c - z * b, z * a - x * c, x * b - y * a
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def find_cells(points: NDArray[np.float32], least: NDArray[np.float32], edge: float, shape: IntArray) -> IntArray:
     """Return the key of the cell, (N,), of each point: cells have this edge, from 1 in each axis, and rows of cells.
 
@@ -73,7 +73,7 @@ def find_cells(points: NDArray[np.float32], least: NDArray[np.float32], edge: fl
     return keys
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sort_keys(keys: IntArray, most: int) -> tuple[IntArray, IntArray]:
     """Return keys (N,) from 0 to `most` in order, and their positions; the first of equals first (a radix sort)."""
     order, other_order = np.arange(len(keys)), np.empty(len(keys), np.int64)
@@ -96,7 +96,7 @@ def sort_keys(keys: IntArray, most: int) -> tuple[IntArray, IntArray]:
     return keys, order
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def find_starts(own: IntArray) -> tuple[IntArray, IntArray]:
     """Return the different keys (K,) of sorted keys (N,), and where each begins, (K + 1,), the last one ends."""
     count = 0
@@ -112,7 +112,7 @@ def find_starts(own: IntArray) -> tuple[IntArray, IntArray]:
     return keys, starts
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def gather_neighbours(cloud: Cloud, cells: Cells, cell: int, most: int, near: NDArray[np.float32]) -> int:
     """Write the points around a cell, in blocks of `BLOCK`, and return how many there are.
 
@@ -141,7 +141,7 @@ def gather_neighbours(cloud: Cloud, cells: Cells, cell: int, most: int, near: ND
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def weigh_block(
     near: NDArray[np.float32],
     first: int,
@@ -183,7 +183,7 @@ def weigh_block(
         weighed[i + _U(3) * block] = (x * vx + y * vy + z * vz) / radius
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"})  # so that the sums are vectorised
+@kernel(fastmath={"reassoc", "nsz"})  # so that the sums are vectorised
 def add_block(weighed: FloatArray, count: int, a: FloatArray, b: FloatArray) -> int:
     """Add weighed neighbours to the normal equations of the plane h + s u + t v; return how many have a weight."""
     used = 0
@@ -201,7 +201,7 @@ def add_block(weighed: FloatArray, count: int, a: FloatArray, b: FloatArray) -> 
     return used
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def find_heights(
     cloud: Cloud,
     radii: FloatArray,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def support_share(
     ranges: NDArray[np.float32],
     confirmed: NDArray[np.bool_],
@@ -36,7 +36,7 @@ def support_share(
     return count / (2 * radius + 1) ** 2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def find_supported(
     ranges: NDArray[np.float32],
     confirmed: NDArray[np.bool_],

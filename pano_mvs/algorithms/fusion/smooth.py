@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.bands import for_bands
 from pano_mvs.scene import PointCloud
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _PASSES = 2

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import (
     angle_between,
     geodesic_angle,
@@ -17,7 +18,6 @@ from pano_mvs.geometry import (
     ray_grid,
 )
 
-FloatArray = NDArray[np.float64]
 GreyImage = NDArray[np.uint8]
 
 REDUCED_HW = (128, 256)

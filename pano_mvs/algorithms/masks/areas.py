@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle
-
-Mask = NDArray[np.bool_]
 
 
 def area_labels(pixels: Mask) -> NDArray[np.int64]:

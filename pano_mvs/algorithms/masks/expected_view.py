@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
 # Ranges that agree within this share are of one surface.

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.channels import largest_channel
+from pano_mvs.core.arrays import Picture
 from pano_mvs.geometry import pad_panorama, ray_grid, rotate_panorama
 
-Picture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 _Compared: TypeAlias = "tuple[Plane, Plane, Plane]"
 

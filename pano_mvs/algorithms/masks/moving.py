@@ -14,13 +14,11 @@ from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated,
 from pano_mvs.algorithms.masks.expected_view import Expected, OtherView, expected_view
 from pano_mvs.algorithms.masks.people import person_at
 from pano_mvs.algorithms.masks.person_views import SeenPanorama
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
-
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 WIDTH = 512
 """Columns at which views are compared; larger ones have to be reduced."""

@@ -6,21 +6,19 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights
 from pano_mvs.algorithms.masks.person_below import people_below
 from pano_mvs.algorithms.masks.person_upright import upright_people
 from pano_mvs.algorithms.masks.person_views import MAP_HW, WIDTH, Look, Map, SeenPanorama, look, rolled
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
 
 __all__ = ["WIDTH", "people", "person_at"]
 
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 _DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 # An area is seen again in the middle of views of its own, this many times as wide.

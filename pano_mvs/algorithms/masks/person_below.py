@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
 from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, look, rolled
+from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import ray_grid
-
-Mask = NDArray[np.bool_]
 
 _DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 # Fields of view, and the rotations of each.

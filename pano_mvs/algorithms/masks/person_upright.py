@@ -7,16 +7,13 @@ from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
 from pano_mvs.algorithms.masks.person_network import SIDE_PX
 from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, rolled, stereographic_look
+from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.geometry import pixel_from_ray
-
-Mask = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 _SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 # The views in which people are looked for.

@@ -15,10 +15,9 @@ from pano_mvs.algorithms.masks.person_network import (
     person_presence,
     person_probability,
 )
+from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec
 
-Picture = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 MAP_HW = (256, 512)

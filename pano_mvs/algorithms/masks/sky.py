@@ -131,15 +131,30 @@ def sky_pixels(
     if not seeds.any():
         return np.zeros_like(valid)
     sky, colors = _grown(view, seeds, rng, walls=walls)
-    return sharpened_sky(sky, colors, picture) & valid
+    found = np.asarray(sharpened_sky(sky, colors, picture) & valid, np.bool_)
+    if not walls.any():
+        return found
+    surface = confirmed_parts(_nearest(found, sky.shape), _seen_to_move(view))
+    return np.asarray(found & ~_nearest(surface, valid.shape), np.bool_)
+
+
+def _seen_to_move(view: _View) -> Mask:
+    """Return the pixels whose ranges other views confirm under a parallax of more than one pixel."""
+    parallax_px = np.max([source.parallax_px for source in view.comparisons], axis=0)
+    return np.asarray(view.consistent & (parallax_px > 1), np.bool_)
+
+
+def _nearest(values: NDArray[Any], size_hw: tuple[int, ...]) -> NDArray[Any]:
+    """Return an image (H, W) at another size."""
+    rows, columns = (np.arange(new) * old // new for old, new in zip(values.shape, size_hw, strict=True))
+    return np.asarray(values[rows[:, None], columns])
 
 
 def _view(range_map: RangeMap, picture: Picture, valid: Mask, *, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:
     """Return the reference and its comparisons with the sources, at `WIDTH` columns or fewer."""
     small, small_valid = _reduced(picture, valid)
-    rows, columns = (np.arange(new) * old // new for new, old in zip(small_valid.shape, valid.shape, strict=True))
-    ranges = range_map.range[rows[:, None], columns]
-    consistent = range_map.confidence[rows[:, None], columns] >= CONSISTENT_CONFIDENCE[0]
+    ranges = _nearest(range_map.range, small_valid.shape)
+    consistent = _nearest(range_map.confidence, small_valid.shape) >= CONSISTENT_CONFIDENCE[0]
     small_sources = [(*_reduced(source, mask), pose) for source, mask, pose in sources]
     comparisons = tuple(
         compare_with_source(small, ranges, source, source_valid=mask, source_from_reference=pose)
@@ -163,6 +178,26 @@ def _contrast(picture: Picture) -> NDArray[np.int16]:
     padded = np.ascontiguousarray(pad_panorama(picture, 1))
     contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
     return np.asarray(largest_channel(contrast[1:-1, 1:-1]), np.int16)
+
+
+def confirmed_parts(sky: Mask, confirmed: Mask) -> Mask:
+    """Return the parts of a supposed sky, (H, W), that are a surface, because most of their ranges are confirmed.
+
+    The sky itself has single ranges by chance, and along its edges those of what is in front of it.
+
+    Args:
+        sky: (H, W) the supposed sky.
+        confirmed: (H, W) the pixels whose ranges other views confirm under a parallax.
+    """
+    labels, weights = area_labels(sky), pixel_weights(sky.shape)
+    sizes, known = (np.bincount(labels[part], weights[part], labels.size) for part in (sky, sky & confirmed))
+    core = _share_around(sky & confirmed) > 0.5
+    return sky & ((2 * known > sizes)[labels] | dilated(core, _CLOUD_RADIUS_PX))
+
+
+def _share_around(mask: Mask) -> NDArray[np.float64]:
+    """Return the share of the pixels around each pixel, (H, W), that a mask has."""
+    return box_sum(mask.astype(np.float64), _CLOUD_RADIUS_PX) / box_sum(np.ones(mask.shape), _CLOUD_RADIUS_PX)
 
 
 def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
@@ -233,8 +268,7 @@ def _clouds(view: _View) -> Mask:
     if far.any():  # these pixels know the exposure of the sky better than the ground does
         at_infinity, at_range = pixel_errors(view.picture, far, view.comparisons, area_at_infinity=True)
         far = (at_infinity <= _MAX_ERROR) & (at_range > at_infinity + _SOLID_MARGIN)
-    share = box_sum(far.astype(np.float64), _CLOUD_RADIUS_PX) / box_sum(np.ones(far.shape), _CLOUD_RADIUS_PX)
-    return np.asarray(share >= _CLOUD_SHARE)
+    return _share_around(far) >= _CLOUD_SHARE
 
 
 def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share: float = 0.0) -> bool:

@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.channels import largest_channel
 from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.frame_agreement import FrameAgreement, color_difference, frame_agreement
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.masks.masking import placed_mask
-
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 MIN_VIEWS = 3
 """With fewer views, chance agreement cannot be distinguished from content that moves with the camera."""

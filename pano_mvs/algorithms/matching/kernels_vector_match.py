@@ -10,12 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.core.kernels import kernel
 
 LANES: Final = REGISTER_BYTES // 4
 """Number of products in one register."""
@@ -147,7 +148,7 @@ def _match_tile(
     return signature, emit
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def compare_all(
     rows: NDArray[np.int16],
     packed: NDArray[np.int16],

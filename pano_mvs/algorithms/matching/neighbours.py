@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -189,7 +189,7 @@ def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescr
     return np.asarray(by_looks + (by_looks.max() + 1) * (matches.max() - matches), np.float64)
 
 
-def similarities(features: Sequence[Features], *, sample: int = 400) -> FloatArray:
+def similarities(features: Collection[Features], *, sample: int = 400) -> FloatArray:
     """Return the similarity of images, (N, N): matches of samples of their key points, then their VLAD vectors."""
     names = [str(number) for number in range(len(features))]
     descriptors = {name: vlad_descriptor(one, sample=sample) for name, one in zip(names, features, strict=True)}

@@ -51,7 +51,8 @@ def vlad_descriptor(
     largest = _whole(features, np.argsort(-features.sizes_rad, kind="stable")[:sample]).astype(np.int16)
     turned = _turned(_centered(features, strongest))
     if turned.shape[1] <= _CELL_BITS or not len(turned):
-        return GlobalDescriptor(np.zeros(_RESIDUAL_SIZE << _CELL_BITS, np.float32), largest)
+        length = min(_RESIDUAL_SIZE, max(turned.shape[1] - _CELL_BITS, 0)) << _CELL_BITS
+        return GlobalDescriptor(np.zeros(length, np.float32), largest)
     unit = turned / np.maximum(np.sqrt(np.sum(turned**2, axis=1, keepdims=True)), 1e-12)
     cell = (unit[:, :_CELL_BITS] > 0) @ (1 << np.arange(_CELL_BITS))
     residuals = unit[:, _CELL_BITS:][:, :_RESIDUAL_SIZE]

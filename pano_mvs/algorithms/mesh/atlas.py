@@ -8,9 +8,6 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.mesh.decimate import EXTRA_REMEDY
-from pano_mvs.core.errors import UsageError
-
 # Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
 PADDING_PX = 4
 _EXPECTED_UTILIZATION = 0.75
@@ -62,14 +59,8 @@ def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels
         faces: (F, 3), at least one.
         texels_per_unit: resolution of the texture: texels per scene unit.
         max_px: largest width and height of the texture; it lowers the resolution.
-
-    Raises:
-        UsageError: if xatlas is not installed.
     """
-    try:
-        xatlas = import_module("xatlas")
-    except ImportError as error:
-        raise UsageError(EXTRA_REMEDY) from error
+    xatlas = import_module("xatlas")
     corners = vertices.astype(np.float64)[faces]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     most = max_px * np.sqrt(_EXPECTED_UTILIZATION / max(area / 2, 1e-30))

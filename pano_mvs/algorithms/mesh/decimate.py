@@ -10,10 +10,6 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
-
-EXTRA_REMEDY = "textured meshes need an extra: pip install 'pano-mvs[mesh]'"
-
 Surface = tuple[NDArray[np.float32], NDArray[np.int32]]
 """Vertices (V, 3) and triangles (F, 3)."""
 
@@ -27,15 +23,9 @@ def decimated(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, triang
         vertices: (V, 3).
         faces: (F, 3).
         triangles: number of triangles, positive.
-
-    Raises:
-        UsageError: if fast-simplification is not installed.
     """
     if len(faces) > triangles:
-        try:
-            library = import_module("fast_simplification")
-        except ImportError as error:
-            raise UsageError(EXTRA_REMEDY) from error
+        library = import_module("fast_simplification")
         points, corners = library.simplify(
             np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32), target_count=triangles
         )

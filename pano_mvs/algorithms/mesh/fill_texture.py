@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from pano_mvs.algorithms.mesh.atlas import Texels
-
-FloatImage = NDArray[np.float32]
+from pano_mvs.core.arrays import FloatImage
 
 _GREY = 128.0
 _TEXELS_AT_ONCE = 1 << 20  # bounds the memory

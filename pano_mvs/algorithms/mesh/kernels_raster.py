@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import inlined, kernel
 
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -17,17 +18,17 @@ _MARGIN_PX = 1.0
 _DEGENERATE = 1e-12
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _pixel_bounds(a: Vector, b: Vector, c: Vector, height: int, width: int) -> tuple[int, int, int, int]:
     """Return rows [first, end) and columns [first, end) that contain a spherical triangle; columns are not wrapped.
 
@@ -61,7 +62,7 @@ def _pixel_bounds(a: Vector, b: Vector, c: Vector, height: int, width: int) -> t
     return first_row, end_row, first_column, end_column
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pixel_bounds(corners: FloatArray, size: tuple[int, int], bounds: NDArray[np.int32]) -> None:
     """Write the bounds of triangles (F, 3, 3) in camera coordinates: rows and columns [first, end), (F, 4).
 
@@ -79,7 +80,7 @@ def pixel_bounds(corners: FloatArray, size: tuple[int, int], bounds: NDArray[np.
         bounds[face, 0], bounds[face, 1], bounds[face, 2], bounds[face, 3] = _pixel_bounds(a, b, c, height, width)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def draw_triangles(
     corners: FloatArray,
     bounds: NDArray[np.int32],
@@ -123,7 +124,7 @@ def draw_triangles(
                     weights[row, column, 0], weights[row, column, 1] = e_b / total, e_c / total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def draw_charts(uv_px: FloatArray, triangle: NDArray[np.int32], weights: NDArray[np.float32]) -> None:
     """Write to each texel the triangle that contains its centre, and the weights of its second and third corner.
 

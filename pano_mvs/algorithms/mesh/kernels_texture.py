@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_from_ray
 
 FloatArray = NDArray[np.float64]
@@ -22,7 +22,7 @@ RANGE_TOLERANCE = 0.01
 SLOPE_PX = 2.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def look_at_texels(texels: TexelArrays, mesh: MeshArrays, view: ViewArrays, span: tuple[int, int], out: Looks) -> None:
     """Write the weight and the colours that a panorama gives to the texels of `span`, [first, end).
 

@@ -8,13 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatImage, Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
-
-FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # The second difference of 1 / range, relative to it, at the border of a surface; on a plane it is 0.
 _BORDER_STEP = 0.03

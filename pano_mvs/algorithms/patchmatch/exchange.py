@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.patchmatch.refine import SOURCE_REACH, reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-FloatImage = NDArray[np.float32]
 
 # Samples along each side of a window, two pixels apart; their weights and the noise as in `refine_range`.
 _WINDOW, _SIGMA_COLOR, _NOISE = 5, 25.0, 0.4

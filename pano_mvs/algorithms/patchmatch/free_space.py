@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.confidence import require_confidence
 from pano_mvs.algorithms.filters.consistency import compare_with_sources
@@ -21,14 +20,12 @@ from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import MaxHoleDeg
 from pano_mvs.algorithms.patchmatch.exchange import project_range_map
+from pano_mvs.core.arrays import FloatImage, Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
-
-FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
 _SAME_RAY_DEG = 0.7

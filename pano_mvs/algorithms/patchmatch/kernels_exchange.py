@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import locate_row
 from pano_mvs.algorithms.patchmatch.kernels_match import STRETCH, Sources, row_matrix
 from pano_mvs.algorithms.patchmatch.kernels_refine import Reference
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, pixel_at
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +23,7 @@ _LOW, _STEP = _U(65535), _F(1 / 256)
 _OUT = _F(-2)  # less than any correlation
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def land_nearest(
     places: FloatArray, ranges: NDArray[np.float32], first_row: int, nearest: FloatArray, pixels: NDArray[np.int64]
 ) -> None:
@@ -44,7 +44,7 @@ def land_nearest(
                 nearest[row, column], pixels[row, column] = places[2, i], first_row + i
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def land_points(
     ranges: NDArray[np.float32],
     grid: tuple[FloatArray, FloatArray],
@@ -70,7 +70,7 @@ def land_points(
         land_nearest(places, ranges[row], row * width, nearest, pixels)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def weigh_windows(
     grey: NDArray[np.float32],
     place: tuple[int, int, NDArray[np.int64], NDArray[np.int64]],
@@ -115,7 +115,7 @@ def weigh_windows(
             variances[i] += weight * value * value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def aim_samples(
     planes: NDArray[np.float32],
     columns: NDArray[np.int64],
@@ -148,7 +148,7 @@ def aim_samples(
             inverse[k, i] = level * across + dip * planes[1, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def place_samples(
     turns: NDArray[np.float32],
     inverse: NDArray[np.float32],
@@ -180,7 +180,7 @@ def place_samples(
         blend[1, i] = py - _F(row)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_samples(
     packed: NDArray[np.uint64],
     start: int,
@@ -212,7 +212,7 @@ def sum_samples(
         sums[2, i] += wb * centred[i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def correlate_pixels(
     rows: tuple[int, int],
     starts: NDArray[np.int64],

@@ -8,9 +8,9 @@ a time, in short separate loops (project, gather, blend, sum), as in the sweep.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip
 
 FloatArray = NDArray[np.float64]
@@ -34,7 +34,7 @@ STRETCH = 256
 """Number of pixels of a row that are computed together, so that their sums fit the cache."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def weigh_window(
     grey: NDArray[np.float32],
     place: Place,
@@ -80,7 +80,7 @@ def weigh_window(
             moments[1, i] += weight * value * value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def inverse_ranges(
     planes: NDArray[np.float32],
     azimuth: NDArray[np.float32],
@@ -96,7 +96,7 @@ def inverse_ranges(
         inverse[i] = level * across + dip * planes[1, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def project_samples(
     azimuth: NDArray[np.float32],
     first: int,
@@ -145,7 +145,7 @@ def project_samples(
         placed[i + _U(3 * STRETCH)] = y_scale * (level * t1 - y * (x * t0 + z * t2) / level) / (level_squared + y * y)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def gather_samples(
     packed: NDArray[np.uint64], start: int, index: NDArray[np.int32], patches: NDArray[np.uint64]
 ) -> None:
@@ -155,7 +155,7 @@ def gather_samples(
         patches[i] = packed[base + _U(index[i])]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_samples(
     patches: NDArray[np.uint64],
     placed: NDArray[np.float32],
@@ -214,7 +214,7 @@ def add_samples(
         sums[i + _U(17) * row] += v * wga
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def row_matrix(pose: FloatArray, elevation: float, matrix: NDArray[np.float32]) -> None:
     """Write the (3, 4) matrix that takes (sin θ, cos θ, 1, q) of a row to directions in a source of pose (3, 4)."""
     level, dip = np.cos(elevation), -np.sin(elevation)
@@ -225,7 +225,7 @@ def row_matrix(pose: FloatArray, elevation: float, matrix: NDArray[np.float32]) 
         matrix[a, 3] = _F(pose[a, 3])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_windows(
     planes: NDArray[np.float32],
     place: Place,

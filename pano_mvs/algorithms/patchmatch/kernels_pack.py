@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 # Parts of red, green and blue in 10,000; levels are in 1/256.
 _RED, _GREEN, _BLUE, _WHOLE, _FINE = 2126, 7152, 722, 10000, 256
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pack_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """Return all 2×2 patches of the grey levels of a picture, (H, W, 3) to (H + 1, W + 1), over the seam and the poles.
 

@@ -7,9 +7,9 @@ inverse range q. Around a pixel q = α + β u + γ v, with u in columns (widened
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import azimuth_from_x, elevation_from_y, wrapped_column, wrapped_row
 
 FloatArray = NDArray[np.float64]
@@ -22,7 +22,7 @@ _STRETCH = 128
 _MIN_WEIGHT, _MIN_SPREAD = 5.0, 0.25
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sines_of_columns(width: int) -> FloatArray:
     """Return the sine and the cosine of the azimuth of each column, (2, W)."""
     turned = np.empty((2, width))
@@ -32,7 +32,7 @@ def sines_of_columns(width: int) -> FloatArray:
     return turned
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _padded_rows(inverse: NDArray[np.float32], first: int, rows: int, pad: int) -> NDArray[np.float32]:
     """Return some rows of an image with `pad` columns more on either side, beyond the poles and the seam too."""
     height, width = inverse.shape
@@ -44,7 +44,7 @@ def _padded_rows(inverse: NDArray[np.float32], first: int, rows: int, pad: int) 
     return padded
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _weigh(
     values: FloatArray, k: int, u: float, v: float, reach: float, slopes: FloatArray, products: FloatArray
 ) -> None:
@@ -59,7 +59,7 @@ def _weigh(
         products[1, i] = rest * rest * value if inside else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_first(products: FloatArray, row: int, u: float, v: float, sums: FloatArray, first: int) -> None:
     """Add a row of `products`, alone and times u and v, to three rows of `sums` from `first` on."""
     p, s = _U(row), _U(first)
@@ -70,7 +70,7 @@ def _add_first(products: FloatArray, row: int, u: float, v: float, sums: FloatAr
         sums[s + _U(2), i] += value * v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_second(products: FloatArray, u: float, v: float, sums: FloatArray) -> None:
     """Add the weights times u², u v and v² to three rows of `sums`."""
     for i in range(_U(products.shape[1])):
@@ -80,7 +80,7 @@ def _add_second(products: FloatArray, u: float, v: float, sums: FloatArray) -> N
         sums[5, i] += products[0, i] * v * v
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _solve_slopes(sums: FloatArray, slopes: FloatArray) -> None:
     """Write the weighted means' planes (α, β, γ), (3, n), from the nine sums; ill posed ones stay as they are."""
     for i in range(_U(sums.shape[1])):
@@ -96,7 +96,7 @@ def _solve_slopes(sums: FloatArray, slopes: FloatArray) -> None:
             slopes[2, i] = gamma
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def weighted_slopes(
     values: FloatArray,
     offsets: NDArray[np.int64],
@@ -134,7 +134,7 @@ def weighted_slopes(
     _solve_slopes(sums, slopes)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fit_slopes(
     padded: NDArray[np.float32],
     place: tuple[int, int, int],
@@ -170,7 +170,7 @@ def fit_slopes(
     weighted_slopes(values, offsets, stretch, max_step, 0.0, slopes, scratch)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fit_planes(
     inverse: NDArray[np.float32],
     first: int,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.kernels_match import (
@@ -21,6 +20,7 @@ from pano_mvs.algorithms.patchmatch.kernels_match import (
     weigh_window,
 )
 from pano_mvs.algorithms.patchmatch.kernels_planes import sines_of_columns
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y
 
 FloatArray = NDArray[np.float64]
@@ -33,7 +33,7 @@ _U = np.uint64
 _MIN_CORRELATION = 0.2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def correlate_sources(
     sums: NDArray[np.float32],
     votes: NDArray[np.bool_],
@@ -50,7 +50,7 @@ def correlate_sources(
             correlations[s, i] = correlation if votes[s, i] else _F(-2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def least_of_best(correlations: NDArray[np.float32], i: int, held: NDArray[np.float32]) -> np.float32:
     """Return the least correlation of the better half of the sources that count (rounded up); 1 if there is none."""
     votes = 0
@@ -66,7 +66,7 @@ def least_of_best(correlations: NDArray[np.float32], i: int, held: NDArray[np.fl
     return held[(votes + 1) // 2 - 1] if votes else _F(2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_source(
     sums: NDArray[np.float32],
     i: int,
@@ -101,7 +101,7 @@ def add_source(
             entry += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def solve_first(a: FloatArray, b: FloatArray) -> float:
     """Return the first unknown of a positive definite 3×3 system, a = (xx, xy, xz, yy, yz, zz)."""
     c00, c01, c02 = a[3] * a[5] - a[4] * a[4], a[2] * a[4] - a[1] * a[5], a[1] * a[4] - a[2] * a[3]
@@ -110,7 +110,7 @@ def solve_first(a: FloatArray, b: FloatArray) -> float:
     return first
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def most_likely_steps(
     sums: NDArray[np.float32],
     correlations: NDArray[np.float32],
@@ -151,7 +151,7 @@ def most_likely_steps(
         steps[i] = _F(solve_first(normal, right))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def refine_rows(
     first_row: int,
     rows: int,

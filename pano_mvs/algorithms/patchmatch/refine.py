@@ -27,16 +27,13 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.patchmatch.view_weights import ViewWeights
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-FloatImage = NDArray[np.float32]
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 # Maximum of a refined range, relative to the farthest swept one.

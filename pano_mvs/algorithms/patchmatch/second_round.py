@@ -12,17 +12,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.support.supported import has_texture
 from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 def refine_plain_surfaces(

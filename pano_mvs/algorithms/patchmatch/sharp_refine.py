@@ -7,17 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.algorithms.plain_scale import with_coarser
 from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, reduced_range_map
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # After the reduced size, rounds at the panorama's own size place the edges.
 _FINAL_ROUNDS = 2

@@ -9,11 +9,9 @@ selection for unstructured multi-view stereo", 2016).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatImage
 from pano_mvs.geometry import pad_panorama
-
-FloatImage = NDArray[np.float32]
 
 # Standard deviation of the correlation, from 1, of a source that sees the surface.
 _SIGMA = 0.3

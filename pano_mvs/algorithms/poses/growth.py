@@ -108,20 +108,6 @@ def grown_models(
     return models
 
 
-def strongest_first(
-    pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
-) -> GrownModel:
-    """Return the model that grows from the pair with most matches, whether or not third images support it.
-
-    Where each image shares few points with all but one other, pairs of near images are better parts of a model than a
-    pair in the middle.
-    """
-    members = set(images)
-    edges = [edge for edge in pairs.geometries if members.issuperset(edge)]
-    edge = max(edges, key=lambda one: (len(pairs.geometries[one][0].view), one))
-    return _grown(pairs, images, edge, rank=0, adjust=adjust, confirmation=confirmation)
-
-
 def _corrected(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
     """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
     checks = correct_cameras(grown.model, confirmation)

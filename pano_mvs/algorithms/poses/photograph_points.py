@@ -23,10 +23,12 @@ class KnownPoints:
     Attributes:
         descriptors: (N, D).
         points_in_world: (N, 3) float64.
+        keypoints_idx: (N,) their positions among all key points of the panorama.
     """
 
     descriptors: NDArray[np.generic]
     points_in_world: NDArray[np.float64]
+    keypoints_idx: NDArray[np.intp]
 
 
 def has_sift(features: Features) -> bool:
@@ -56,4 +58,4 @@ def known_points(
         smooth = (np.abs(beside - ranges) <= _MAX_STEP * ranges).all(axis=0)
     keep = smooth & np.isfinite(ranges) & (range_map.confidence[y, x] >= min_confidence)
     points = cam_from_world.inverse().apply(features.bearings[keep] * ranges[keep, None])
-    return KnownPoints(features.descriptors[keep], points)
+    return KnownPoints(features.descriptors[keep], points, np.flatnonzero(keep))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Annotated, TypedDict
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle, strongest_first
+from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
@@ -40,9 +39,6 @@ def solve_scaled_translation(
     ] = "cauchy",
     kappa: Annotated[float, Setting("width of the paper's clusters of scale factors", gt=0)] = 0.01,
     adjust: Annotated[bool, Setting("adjust all cameras and points as the model grows")] = True,
-    join_rooms: Annotated[
-        bool, Setting("join groups that verified pairs connect through too few points for one camera at a time")
-    ] = False,
     load: Callable[[str], Picture] | None = None,
     rng: np.random.Generator,
 ) -> Poses:
@@ -62,8 +58,6 @@ def solve_scaled_translation(
         kappa: the paper's κ.
         adjust: whether to adjust all cameras and points together at intervals, which keeps errors from accumulating. If
             False, the poses are those of the chain, as in the paper.
-        join_rooms: whether to align whole groups that pairs connect, as with `find_bridges`. Groups whose joint the
-            images do not confirm are doubtful (see `joint_doubts`).
         load: returns the panorama and the mask of an image by its name; None leaves every decision to the pairs.
         rng: not used; part of the interface of pose solvers.
 
@@ -77,11 +71,7 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    settings = _Growth(adjust, confirmation, join_rooms)
-    models, reasons = settings.models(pairs, lambda group: grown_models(pairs, group, **settings.arguments)[0])
-    if join_rooms and _connected_but_apart(pairs, models):
-        parts, _ = settings.models(pairs, lambda group: strongest_first(pairs, group, **settings.arguments))
-        models = min(models, parts, key=_rank)
+    models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation)
     groups = [_finished(grown, adjust=adjust, confirmation=confirmation) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
@@ -98,62 +88,32 @@ def solve_scaled_translation(
     return join_groups(groups, order=names, rejected=rejected)
 
 
-@dataclass(frozen=True, eq=False)
-class _Growth:
-    """How models of all groups are grown and joined."""
+def _grown_and_joined(
+    pairs: Pairs, *, adjust: bool, confirmation: Confirmation | None
+) -> tuple[list[GrownModel], dict[int, str]]:
+    """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
-    adjust: bool
-    confirmation: Confirmation | None
-    join_rooms: bool
-
-    @property
-    def arguments(self) -> _GrowthArguments:
-        """The settings of the functions that grow a model."""
-        return {"adjust": self.adjust, "confirmation": self.confirmation}
-
-    def models(
-        self, pairs: Pairs, grow: Callable[[Collection[int]], GrownModel]
-    ) -> tuple[list[GrownModel], dict[int, str]]:
-        """Return the models of all groups, and the reasons for images that were refused at least once."""
-        models: list[GrownModel] = []
-        reasons: dict[int, str] = {}
-        waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
-        while waiting:
-            grown = grow(waiting.pop(0))
-            models.append(grown)
-            reasons |= grown.refused
-            left = {edge for edge in pairs.geometries if edge[0] in grown.refused and edge[1] in grown.refused}
-            waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
-        return self.joined(pairs, models) if self.join_rooms else models, reasons
-
-    def joined(self, pairs: Pairs, models: Sequence[GrownModel]) -> list[GrownModel]:
-        """Return models after joining those that the pairs between them align, the largest first.
-
-        Images that could not be added to any model are tried as models of one camera.
-        """
-        placed = {image for grown in models for image in grown.model.cameras}
-        alone = [image for image in range(len(pairs.names)) if image not in placed and pairs.partners[image]]
-        parts = [grown.model for grown in models]
-        parts += [PlacedModel(pairs, {image: Rigid3.identity()}) for image in alone]
-        found: list[GrownModel] = []
-        for model, numbers in join_models(parts) if len(parts) > 1 else [(part, (0,)) for part in parts]:
-            if len(numbers) == 1:
-                found += [models[number] for number in numbers if number < len(models)]
-                continue
-            settle(model, adjust=self.adjust, confirmation=self.confirmation)
-            found.append(GrownModel(model, {}, check_cameras(model, self.confirmation)))
-        return sorted(found, key=lambda grown: (-len(grown.model.cameras), min(grown.model.cameras)))
-
-
-def _connected_but_apart(pairs: Pairs, models: Sequence[GrownModel]) -> bool:
-    """Return whether some pair joins two models, or a model and an image without a pose."""
-    number = {image: idx for idx, grown in enumerate(models) for image in grown.model.cameras}
-    return any(number.get(a, -1) != number.get(b, -2) for a, b in pairs.geometries)
-
-
-def _rank(models: Sequence[GrownModel]) -> tuple[int, int]:
-    """Return the sort key of models of a capture: more images with a pose first, then fewer groups."""
-    return -sum(len(grown.model.cameras) for grown in models), len(models)
+    Images that could not be added to any model are tried as models of one camera when models are joined.
+    """
+    grown: list[GrownModel] = []
+    reasons: dict[int, str] = {}
+    waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
+    while waiting:
+        grown.append(grown_models(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)[0])
+        refused = grown[-1].refused
+        reasons |= refused
+        left = {edge for edge in pairs.geometries if edge[0] in refused and edge[1] in refused}
+        waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
+    placed = {image for one in grown for image in one.model.cameras}
+    alone = [PlacedModel(pairs, {image: Rigid3.identity()}) for image in range(len(pairs.names)) if image not in placed]
+    found: list[GrownModel] = []
+    for model, numbers in join_models([*(one.model for one in grown), *alone]) if grown else []:
+        if len(numbers) > 1:
+            settle(model, adjust=adjust, confirmation=confirmation)
+            found.append(GrownModel(model, {}, check_cameras(model, confirmation)))
+        elif numbers[0] < len(grown):
+            found.append(grown[numbers[0]])
+    return sorted(found, key=lambda one: (-len(one.model.cameras), min(one.model.cameras))), reasons
 
 
 def _finished(grown: GrownModel, *, adjust: bool, confirmation: Confirmation | None) -> Poses:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.mesh.atlas import Atlas
 from pano_mvs.algorithms.mesh.visibility import SurfaceView
-
-Picture = NDArray[np.uint8]
+from pano_mvs.core.arrays import Picture
 
 _ROWS_AT_ONCE = 256
 

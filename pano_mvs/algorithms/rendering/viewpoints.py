@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _OUTSIDE_AZIMUTH_RAD, _OUTSIDE_ELEVATION_RAD = np.deg2rad(35.0), np.deg2rad(42.0)
 _OUTSIDE_FOV_DEG, _INSIDE_FOV_DEG = 36.0, 90.0

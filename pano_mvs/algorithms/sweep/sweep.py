@@ -27,6 +27,7 @@ from pano_mvs.algorithms.sweep.preparation import (
 )
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS, SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.masks.masking import placed_mask
@@ -34,8 +35,6 @@ from pano_mvs.scene.range_map import RangeMap
 
 __all__ = ["SweepSettings", "sweep_range"]
 
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 # The rough sweep behind the match of exposures.
 _ROUGH_ROWS, _ROUGH_PLANES = 128, 48

@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
 _CHECKS = (16, 32, 64, 128)  # number of matches after which a hypothesis that lags too far behind is dropped
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _squared_error(e: FloatArray, p: FloatArray, q: FloatArray) -> tuple[float, float]:
     """Return the numerator and denominator of the squared Sampson error for an essential matrix."""
     x = e[0, 0] * p[0] + e[0, 1] * p[1] + e[0, 2] * p[2]
@@ -32,7 +33,7 @@ def _squared_error(e: FloatArray, p: FloatArray, q: FloatArray) -> tuple[float, 
     return squared, max(x * x + y * y + z * z + u * u + v * v + w * w - 2.0 * squared, 1e-300)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _essential_cost(
     essential: FloatArray, first: FloatArray, second: FloatArray, squared_threshold: float, limit: float, sigmas: float
 ) -> float:
@@ -53,7 +54,7 @@ def _essential_cost(
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def rank_essentials(
     essentials: FloatArray,
     first: FloatArray,
@@ -91,7 +92,7 @@ def rank_essentials(
         costs[row], best[row] = cost, n
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pose_residuals(
     rotation: FloatArray,
     t: FloatArray,
@@ -118,7 +119,7 @@ def pose_residuals(
         agreeing[idx] = residuals[idx] < threshold and (front or cosine > far)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pose_cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, threshold: float) -> float:
     """Return the cost of all matches for a pose; a match behind a camera costs 1."""
     far = math.cos(2.0 * threshold)
@@ -142,7 +143,7 @@ def pose_cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: Fl
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def direction_costs(
     rotated: FloatArray, second: FloatArray, directions: FloatArray, threshold: float, costs: FloatArray
 ) -> None:
@@ -187,7 +188,7 @@ def direction_costs(
         costs[n, 0], costs[n, 1] = forward, backward
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _rotation_of(essential: FloatArray, t: FloatArray, sign: float, rotation: FloatArray) -> None:
     """Write the rotation of E = ±[t]× R, made orthonormal row by row.
 
@@ -215,7 +216,7 @@ def _rotation_of(essential: FloatArray, t: FloatArray, sign: float, rotation: Fl
         r[2, column] = r[0, k] * r[1, m] - r[0, m] * r[1, k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def decompose_facing(
     essential: FloatArray, first: FloatArray, second: FloatArray, threshold: float, rotation: FloatArray, t: FloatArray
 ) -> None:
@@ -267,7 +268,7 @@ def decompose_facing(
             rotation[i, j] = rotations[chosen // 2, i, j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def count_chance(
     rotation: FloatArray,
     t: FloatArray,
@@ -297,7 +298,7 @@ def count_chance(
     return agreeing, drawn
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def best_turn(
     first: FloatArray, second: FloatArray, samples: NDArray[np.int64], squared_chord: float, rotation: FloatArray
 ) -> None:
@@ -314,11 +315,13 @@ def best_turn(
             rays = first if side == 0 else second
             a, b = rays[samples[n, 0]], rays[samples[n, 1]]
             frame = frames[side]
-            frame[0], frame[1] = a + b, a - b
+            for i in range(3):  # numba compiles expressions of arrays with all texts of their errors: 4 CPU-s
+                frame[0, i], frame[1, i] = a[i] + b[i], a[i] - b[i]
             for row in range(2):
                 length = math.sqrt(frame[row, 0] ** 2 + frame[row, 1] ** 2 + frame[row, 2] ** 2)
                 regular = regular and length > 1e-6
-                frame[row] /= max(length, 1e-300)
+                for i in range(3):
+                    frame[row, i] /= max(length, 1e-300)
             x, y = frame[0], frame[1]
             frame[2, 0] = x[1] * y[2] - x[2] * y[1]
             frame[2, 1] = x[2] * y[0] - x[0] * y[2]
@@ -344,4 +347,6 @@ def best_turn(
                 agreeing += 1
         if agreeing > most:
             most = agreeing
-            rotation[:] = turn
+            for i in range(3):
+                for j in range(3):
+                    rotation[i, j] = turn[i, j]

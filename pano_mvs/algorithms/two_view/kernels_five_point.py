@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ _SQUARES = _product_idx(_LINEAR, _LINEAR, _QUADRATIC)
 _CUBES = _product_idx(_QUADRATIC, _LINEAR, _CUBIC)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _null_space(first: FloatArray, second: FloatArray, basis: FloatArray) -> bool:
     """Write four orthonormal solutions of the five equations, (4, 9), by Householder reflections."""
     columns = np.empty((5, 9))
@@ -80,21 +81,21 @@ def _null_space(first: FloatArray, second: FloatArray, basis: FloatArray) -> boo
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_square(a: FloatArray, b: FloatArray, sign: float, out: FloatArray) -> None:
     for i in range(4):
         for j in range(4):
             out[_SQUARES[i, j]] += sign * a[i] * b[j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_cube(a: FloatArray, b: FloatArray, sign: float, out: FloatArray) -> None:
     for i in range(10):
         for j in range(4):
             out[_CUBES[i, j]] += sign * a[i] * b[j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def cubic_equations(basis: FloatArray, equations: FloatArray) -> None:
     """Write the coefficients (10, 20) of 2 E Eᵀ E − tr(E Eᵀ) E = 0 and det E = 0 in the monomials `_CUBIC`."""
     linear = np.empty((3, 3, 4))
@@ -127,7 +128,7 @@ def cubic_equations(basis: FloatArray, equations: FloatArray) -> None:
         _add_cube(minor, linear[0, i], 1.0, equations[9])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _eliminate(equations: FloatArray) -> bool:
     """Reduce the first ten columns to the identity as far as rows 4 to 9 need it; return False if they are singular."""
     for column in range(10):
@@ -155,7 +156,7 @@ def _eliminate(equations: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _coefficients_in_z(equations: FloatArray, table: FloatArray) -> None:
     """Write B(z), (3, 3, 5), ascending powers, with B (x, y, 1)ᵀ = 0: rows 4, 6, 8 less z times rows 5, 7, 9."""
     table[:] = 0.0
@@ -168,7 +169,7 @@ def _coefficients_in_z(equations: FloatArray, table: FloatArray) -> None:
                 table[n, which, power + 1] -= lower[start + size - 1 - power]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_determinant(table: FloatArray, polynomial: FloatArray) -> None:
     """Write det B(z), ascending powers, (11,)."""
     polynomial[:] = 0.0
@@ -184,7 +185,7 @@ def _add_determinant(table: FloatArray, polynomial: FloatArray) -> None:
                 polynomial[a + b] += minor[a] * table[n, 2, b]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _value(polynomial: FloatArray, degree: int, z: float) -> float:
     value: float = polynomial[degree]
     for power in range(degree - 1, -1, -1):
@@ -192,7 +193,7 @@ def _value(polynomial: FloatArray, degree: int, z: float) -> float:
     return value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _bracketed_root(polynomial: FloatArray, low: float, high: float, low_value: float) -> float:
     """Return the root between two points of different sign: Newton's method, bisection when it leaves the bracket."""
     z = 0.5 * (low + high)
@@ -215,7 +216,7 @@ def _bracketed_root(polynomial: FloatArray, low: float, high: float, low_value: 
     return z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sturm_chain(polynomial: FloatArray, chain: FloatArray) -> int:
     """Write the Sturm chain (polynomial, derivative, negated remainders); return its number of members.
 
@@ -244,7 +245,7 @@ def _sturm_chain(polynomial: FloatArray, chain: FloatArray) -> int:
     return _DEGREE + 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sign_changes(chain: FloatArray, members: int, z: float) -> int:
     changes = 0
     negative = _value(chain[0], _DEGREE, z) < 0.0
@@ -256,7 +257,7 @@ def _sign_changes(chain: FloatArray, members: int, z: float) -> int:
     return changes
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def roots_within_one(polynomial: FloatArray, roots: FloatArray) -> int:
     """Write the real roots in [-1, 1] where a polynomial of degree ten changes sign; return their number.
 
@@ -295,7 +296,7 @@ def roots_within_one(polynomial: FloatArray, roots: FloatArray) -> int:
     return found
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _write_essential(basis: FloatArray, table: FloatArray, z: float, essential: FloatArray) -> bool:
     """Write the matrix of norm √2 for a root z, with (x, y, 1) normal to the rows of B(z); return whether it exists."""
     rows = np.empty((3, 3))
@@ -323,7 +324,7 @@ def _write_essential(basis: FloatArray, table: FloatArray, z: float, essential: 
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def solve_five(
     first: FloatArray,
     second: FloatArray,
@@ -346,8 +347,8 @@ def solve_five(
     count = 0
     for n in range(len(samples)):
         for row in range(5):
-            p[row] = first[samples[n, row]]
-            q[row] = second[samples[n, row]]
+            for i in range(3):
+                p[row, i], q[row, i] = first[samples[n, row], i], second[samples[n, row], i]
         if not _null_space(p, q, basis):
             continue
         cubic_equations(basis, equations)

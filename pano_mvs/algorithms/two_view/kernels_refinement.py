@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _tangents(t: FloatArray, basis: FloatArray) -> None:
     """Write two orthonormal vectors that are normal to t, (2, 3)."""
     least = 0
@@ -31,7 +32,7 @@ def _tangents(t: FloatArray, basis: FloatArray) -> None:
     v[0], v[1], v[2] = t[1] * u[2] - t[2] * u[1], t[2] * u[0] - t[0] * u[2], t[0] * u[1] - t[1] * u[0]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, squared_scale: float) -> float:
     """Return Σ log(1 + r² / scale²), with one logarithm for the product of many factors."""
     total, factor = 0.0, 1.0
@@ -51,7 +52,7 @@ def _cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatA
     return total + math.log(factor)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _normal_equations(
     rotation: FloatArray,
     t: FloatArray,
@@ -103,7 +104,7 @@ def _normal_equations(
         hessian[i, i] += 1e-9 * trace
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _solve(hessian: FloatArray, gradient: FloatArray, step: FloatArray) -> bool:
     """Write the solution of H s = −g by Cholesky's factors of H, and return whether H is positive."""
     for i in range(5):
@@ -129,7 +130,7 @@ def _solve(hessian: FloatArray, gradient: FloatArray, step: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _move(
     rotation: FloatArray,
     t: FloatArray,
@@ -161,7 +162,7 @@ def _move(
         moved_t[i] /= length
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def refine_pose(
     rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, scale: float, max_iterations: int
 ) -> None:
@@ -193,8 +194,10 @@ def refine_pose(
         if not moved_cost < cost:
             return
         gain = cost - moved_cost
-        rotation[:] = moved_rotation
-        t[:] = moved_t
+        for i in range(3):
+            t[i] = moved_t[i]
+            for j in range(3):
+                rotation[i, j] = moved_rotation[i, j]
         cost = moved_cost
         if gain < 1e-10 * cost:
             return

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.image_files.decoding import decode_picture
 from pano_mvs.scene.masks.cropping import Crop
 from pano_mvs.scene.record import FilePart
-
-Mask = NDArray[np.bool_]
 
 _JPEG_START = b"\xff\xd8"
 _JPEG_THRESHOLD = 127  # compression turns black and white into greys

@@ -75,7 +75,11 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
     return max(_SOLVER_BYTES, painting)
 
 
-@stage("export.mesh_textured", memory=_memory)
+@stage(
+    "export.mesh_textured",
+    memory=_memory,
+    needs={"fast_simplification": "fast-simplification", "xatlas": "xatlas"},
+)
 def mesh_textured(
     cloud: One[PointCloud],
     ranges: All[RangeMap],

@@ -13,10 +13,12 @@ from pydantic import Field
 
 from pano_mvs.algorithms.faces.layout import default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import face_source
+from pano_mvs.algorithms.photograph_undistortion import undistorted_photograph
 from pano_mvs.api import (
     All,
     Context,
     Each,
+    FilePart,
     Files,
     One,
     Panorama,
@@ -28,11 +30,13 @@ from pano_mvs.api import (
 )
 from pano_mvs.core.paths import children
 from pano_mvs.geometry import PinholeView
+from pano_mvs.io.colmap.image_copies import write_picture
 from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, SplatFrames
 from pano_mvs.io.splats.manifest import ROOT, BundleView, manifest_document
 from pano_mvs.scene.files import group_file
+from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups, with_cameras
 from pano_mvs.scene.tracked_points import TrackedPoints
@@ -46,7 +50,34 @@ from pano_mvs.stages.exports.frame_files import (
     write_photographs,
     write_transforms,
 )
-from pano_mvs.stages.exports.pinhole_photographs import pinhole_photographs
+
+
+def pinhole_photographs(photographs: Photographs, ctx: Context) -> Photographs:
+    """Return photographs whose pictures have no distortion and are JPEGs; `.jpg` is added to their names.
+
+    The pictures have no EXIF, so that no program turns them: the poses are those of the pictures as stored.
+    """
+    folder = ctx.scratch / "pinhole"
+    folder.mkdir()
+    pictures, focals_px = [], []
+    for idx, file in enumerate(photographs.pictures):
+        picture, focal_px = undistorted_photograph(
+            decode_image(file.path, file.read_bytes()),
+            focal_px=float(photographs.focals_px[idx]),
+            radial=float(photographs.radials[idx]),
+        )
+        path = folder / f"{idx}.jpg"
+        write_picture(path, picture)
+        pictures.append(FilePart(path))
+        focals_px.append(focal_px)
+    return replace(
+        photographs,
+        names=tuple(f"{name}.jpg" for name in photographs.names),
+        focals_px=np.array(focals_px),
+        radials=np.zeros(len(photographs)),
+        pictures=tuple(pictures),
+    )
+
 
 _PHOTOGRAPHS = "faces/transforms_photographs.json"
 

@@ -20,7 +20,6 @@ from pano_mvs.algorithms.matching.neighbours import (
     retrieval_pairs,
 )
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
-from pano_mvs.algorithms.matching.preemptive import hopeless_reason
 from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.errors import UsageError
@@ -225,30 +224,3 @@ def test_numbers_of_neighbours_are_checked(looks: dict[str, GlobalDescriptor]) -
     for wrong in calls:
         with pytest.raises(UsageError, match="at least 1"):
             wrong()
-
-
-@pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_a_glance_tells_strangers_from_neighbours(metric: Literal["l2", "hamming"]) -> None:
-    rng = np.random.default_rng(4)
-
-    def draw(count: int) -> NDArray[Any]:
-        if metric == "l2":
-            return rng.integers(0, 200, size=(count, 64)).astype(np.float32)
-        return rng.integers(0, 256, size=(count, 32), dtype=np.uint8)
-
-    base = draw(600)
-    here = features(base, metric)
-    there = features(np.concatenate([base[:30], draw(570)]), metric)
-    stranger = features(draw(600), metric)
-    assert hopeless_reason(here, there, preemptive=200) == ""
-    reason = hopeless_reason(here, stranger, preemptive=200)
-    assert "200 strongest" in reason
-    assert hopeless_reason(here, stranger) == ""
-    assert hopeless_reason(here, replace(stranger, descriptors=base), preemptive=200) == ""
-
-
-def test_a_glance_at_everything_is_none() -> None:
-    """Where a picture has no more key points than the glance looks at, matching all costs the same."""
-    rng = np.random.default_rng(5)
-    a, b = (features(rng.integers(0, 200, size=(50, 16)).astype(np.float32)) for _ in range(2))
-    assert hopeless_reason(a, b, preemptive=50) == ""

@@ -76,7 +76,7 @@ def alive(monkeypatch: pytest.MonkeyPatch) -> weakref.WeakSet[Any]:
 
     def remembered(*args: Any, **kwargs: Any) -> KnownPoints:
         points = known_points(*args, **kwargs)
-        made.add(found := Remembered(points.descriptors, points.points_in_world))
+        made.add(found := Remembered(points.descriptors, points.points_in_world, points.keypoints_idx))
         return found
 
     monkeypatch.setattr(photograph_panoramas, "known_points", remembered)

@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners, winners_of
+from pano_mvs.algorithms.sweep.backends.opencv_backend import RunningWinner
 from pano_mvs.algorithms.sweep.backends.registry import (
     SWEEP_BACKENDS,
     backend_for,
     helper_backend,
     register_sweep_backend,
 )
-from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.preparation import SweepInput

@@ -183,7 +183,7 @@ def test_few_matches_are_refused_with_their_number() -> None:
     features = features_from_bearings(np.eye(3))
     view = verify_pair(features, features, np.zeros((3, 2), np.int32), rng=np.random.default_rng(0))
     assert not view
-    assert view.reason == "3 matches, 20 needed"
+    assert view.reason == "3 matches, 16 needed"
     assert view.candidates == 3
 
 

@@ -1,12 +1,11 @@
-"""Cameras of rooms that hardly see each other, without and with joining groups.
+"""Cameras of rooms that hardly see each other.
 
 Run it with `python -m tests.benchmarks.poses.rooms --seeds 0 1 2`.
 
 The captures are houses whose rooms see each other through doors only (`house_of_rooms`), the same houses with the first
 and the last room furnished alike ("twins"), and places with repeated structure (`tests.repeating.places`). Each is
-solved and verified three times: without joining, and with `matches.bridges` and `join_rooms`, without and with squeezed
-tiles. The table has the groups, the cameras that are right within their group (see `placements`), wrong, doubted, and
-wrong without being doubted, and CPU-seconds.
+solved and verified. The table has the groups, the cameras that are right within their group (see `placements`), wrong,
+doubted, and wrong without being doubted, and CPU-seconds.
 """
 
 from __future__ import annotations
@@ -14,12 +13,10 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.joining.bridges import find_bridges
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
@@ -36,7 +33,6 @@ Views = dict[tuple[str, str], TwoView]
 Truth = dict[str, Rigid3]
 
 KINDS = ("house", "twins", "turned", *REPEATS)
-WAYS = ("apart", "joined", "squeezed")
 
 
 def capture(kind: str, seed: int, width: int, folder: Path) -> tuple[Pictures, Truth]:
@@ -63,36 +59,26 @@ def _place(kind: str, seed: int) -> House | Scene:
     return House(seed=seed, twins=kind == "twins", turned=kind == "turned")
 
 
-def solved(pictures: Pictures, features: dict[str, Features], views: Views, *, way: str) -> Poses:
-    """Return verified poses without joining groups, or with it, then with or without squeezed tiles."""
+def solved(pictures: Pictures, features: dict[str, Features], views: Views) -> Poses:
+    """Return verified poses."""
 
     def load(name: str) -> Picture:
         return pictures[name], np.ones(pictures[name].shape[:2], np.bool_)
 
-    if way != "apart":
-        load_tiles = load if way == "squeezed" else None
-        found = find_bridges(features, views, rng=np.random.default_rng(SEED), load=load_tiles)
-        views = {**views, **found.two_views}
-    rng = np.random.default_rng(SEED)
-    poses = solve_scaled_translation(features, views, join_rooms=way != "apart", load=load, rng=rng)
+    poses = solve_scaled_translation(features, views, load=load, rng=np.random.default_rng(SEED))
     return verify_poses(poses, load, features=features, two_views=views)
 
 
-def rows(
-    kind: str, seed: int, *, width: int, folder: Path, ways: Sequence[str]
-) -> Iterator[tuple[str, list[int], float]]:
-    """Yield the numbers of a capture and the CPU-seconds for each way of solving it."""
+def row(kind: str, seed: int, *, width: int, folder: Path) -> tuple[list[int], float]:
+    """Return the numbers of a capture, and the CPU-seconds of solving it."""
     pictures, truth = capture(kind, seed, width, folder)
     features, views = matched(pictures)
-    for way in ways:
-        start = time.process_time()
-        poses = solved(pictures, features, views, way=way)
-        cpu_s = time.process_time() - start
-        placed = judge_placements(poses, truth)
-        right, wrong = int(placed.right.sum()), int((~placed.right).sum())
-        doubted = int(placed.doubted.sum())
-        unreported = len(placed.unreported)
-        yield way, [len(truth), len(poses.worlds), right, wrong, doubted, unreported], cpu_s
+    start = time.process_time()
+    poses = solved(pictures, features, views)
+    cpu_s = time.process_time() - start
+    placed = judge_placements(poses, truth)
+    right, wrong = int(placed.right.sum()), int((~placed.right).sum())
+    return [len(truth), len(poses.worlds), right, wrong, int(placed.doubted.sum()), len(placed.unreported)], cpu_s
 
 
 def main() -> None:
@@ -101,22 +87,20 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=["house", "twins", "colonnade"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--width", type=int, default=1024, help="width of the pictures in pixels")
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     parser.add_argument("--work", type=Path, help="folder for pictures; by default a temporary one")
     options = parser.parse_args()
-    print("place        seed way       views groups right wrong doubted unreported  CPU-s")
-    total = {way: np.zeros(6, int) for way in options.ways}
+    print("place        seed  views groups right wrong doubted unreported  CPU-s")
+    total = np.zeros(6, int)
     with tempfile.TemporaryDirectory() as temporary:
         for kind in options.kinds:
             for seed in options.seeds:
                 folder = options.work or Path(temporary)
-                for way, numbers, cpu_s in rows(kind, seed, width=options.width, folder=folder, ways=options.ways):
-                    views, groups, right, wrong, doubted, unreported = numbers
-                    total[way] += numbers
-                    label = f"{kind:12s} {seed:4d} {way:8s} {views:6d} {groups:6d} {right:5d}"
-                    print(f"{label} {wrong:5d} {doubted:7d} {unreported:10d} {cpu_s:6.1f}", flush=True)
-    for way, sums in total.items():
-        print(f"all, {way}: " + " ".join(map(str, sums)))
+                numbers, cpu_s = row(kind, seed, width=options.width, folder=folder)
+                views, groups, right, wrong, doubted, unreported = numbers
+                total += numbers
+                label = f"{kind:12s} {seed:4d} {views:6d} {groups:6d} {right:5d}"
+                print(f"{label} {wrong:5d} {doubted:7d} {unreported:10d} {cpu_s:6.1f}", flush=True)
+    print("all: " + " ".join(map(str, total)))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors, albedo_at
 from pano_mvs.testing.room import Room, render
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Rod, Surface
+from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Rod, Surface
 
 VIEWS_PER_ROOM = 10
 _LONG, _HALF_WIDE, _CEILING, _FLOOR = 6.0, 2.5, -1.3, 1.4

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pad_panorama
-
-FloatArray = NDArray[np.float64]
 
 
 def box_sum(values: FloatArray, radius: int) -> FloatArray:

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.channels import largest_channel
+from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-Mask = NDArray[np.bool_]
 
 _RADIUS = 2
 # Neighbours of one surface differ by less than this share of their range, and by fewer grey levels in every colour.

@@ -8,15 +8,15 @@ error anywhere on the sphere. Triggs et al., "Bundle Adjustment — A Modern Syn
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import angle_between
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _derivatives(
     rotations: FloatArray,
     centers: FloatArray,
@@ -57,7 +57,7 @@ def _derivatives(
         rows[k2, 9] = root * along
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _invert_symmetric(matrix: FloatArray, inverses: FloatArray, p: int) -> None:
     """Write the inverse of a symmetric positive definite (3, 3) matrix to inverses[p]."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
@@ -70,7 +70,7 @@ def _invert_symmetric(matrix: FloatArray, inverses: FloatArray, p: int) -> None:
     inverses[p, 1, 0], inverses[p, 2, 0], inverses[p, 2, 1] = i01 * scale, i02 * scale, i12 * scale
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_observation(
     rows: FloatArray,
     t: int,
@@ -106,7 +106,7 @@ def _add_observation(
     point_gradients[p, 2] += p2 * residual_0 + q2 * residual_1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _eliminate(
     start: int,
     stop: int,
@@ -162,7 +162,7 @@ def _eliminate(
                     band[column + j, at + 5] -= a5 * u + b5 * v + c5 * w
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def reduced_system(
     rotations: FloatArray,
     centers: FloatArray,
@@ -206,7 +206,7 @@ def reduced_system(
     return band, gradient, diagonal, couplings, inverses, point_gradients
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def moved_points(
     points: FloatArray,
     starts: NDArray[np.intp],
@@ -231,7 +231,7 @@ def moved_points(
     return moved
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def ray_errors(
     rotations: FloatArray,
     centers: FloatArray,

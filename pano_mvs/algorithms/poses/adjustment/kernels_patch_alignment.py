@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import pixel_from_ray
 
 FloatArray = NDArray[np.float64]
@@ -15,7 +15,7 @@ _ITERATIONS, _CONVERGED = 12, 0.003
 _MIN_CONTRAST = 0.5  # grey levels
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _cubic(t: float, weights: FloatArray) -> None:
     """Write the weights of cubic convolution (a = −1/2) of four neighbours, at a position t past the second."""
     weights[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
@@ -24,7 +24,7 @@ def _cubic(t: float, weights: FloatArray) -> None:
     weights[3] = t * t * (-0.5 + 0.5 * t)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sample(image: NDArray[np.float32], column: float, row: float, across: FloatArray, down: FloatArray) -> float:
     """Return the value at a position, in rows and columns of the array; overwrites the weights `across` and `down`."""
     left, top = int(np.floor(column)), int(np.floor(row))
@@ -39,7 +39,7 @@ def _sample(image: NDArray[np.float32], column: float, row: float, across: Float
     return value
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sample_patches(
     padded: NDArray[np.float32],
     pad_px: int,
@@ -68,7 +68,7 @@ def sample_patches(
                 patches[m, j, i] = _sample(padded, x_px - 0.5 + pad_px, y_px - 0.5 + pad_px, across, down)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _factorise(matrix: FloatArray) -> None:
     """Replace a symmetric positive definite matrix by its Cholesky factor L; entries above the diagonal stay."""
     size = len(matrix)
@@ -82,7 +82,7 @@ def _factorise(matrix: FloatArray) -> None:
             matrix[i, j] /= matrix[j, j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _substitute(factor: FloatArray, vector: FloatArray) -> None:
     """Replace a vector v by the solution of L Lᵀ x = v."""
     size = len(vector)
@@ -96,7 +96,7 @@ def _substitute(factor: FloatArray, vector: FloatArray) -> None:
         vector[i] /= factor[i, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _normalised(values: FloatArray, window: FloatArray, total: float) -> float:
     """Normalise values to weighted mean 0 and variance 1; return their original standard deviation."""
     mean = 0.0
@@ -113,7 +113,7 @@ def _normalised(values: FloatArray, window: FloatArray, total: float) -> float:
     return deviation
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _warped(patch: NDArray[np.float32], warp: FloatArray, size: int, margin: int, values: FloatArray) -> bool:
     """Write the inner size × size samples of a patch under an affine warp; return False if it leaves the patch."""
     outer = patch.shape[0]
@@ -131,7 +131,7 @@ def _warped(patch: NDArray[np.float32], warp: FloatArray, size: int, margin: int
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _prepare(
     reference: NDArray[np.float32],
     size: int,
@@ -165,7 +165,7 @@ def _prepare(
     return contrast
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _normal_matrix(columns: FloatArray, weights: FloatArray, stiffness: float, matrix: FloatArray) -> None:
     """Write Jᵀ W J plus the prior on the linear part of the warp."""
     for p in range(_PARAMETERS):
@@ -178,7 +178,7 @@ def _normal_matrix(columns: FloatArray, weights: FloatArray, stiffness: float, m
         matrix[p, p] += stiffness if p > 1 else 1e-9
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _largest_deviation(factor: FloatArray, unit: FloatArray) -> float:
     """Return the root of the largest eigenvalue of the shift's block of the inverse of L Lᵀ."""
     unit[:] = 0.0
@@ -193,7 +193,7 @@ def _largest_deviation(factor: FloatArray, unit: FloatArray) -> float:
     return deviation
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _compose(warp: FloatArray, step: FloatArray) -> bool:
     """Replace W by W ∘ Δ⁻¹, Δ x = (I + E) x + e with the step (e, E); return False if Δ folds the patch."""
     e00, e01, e10, e11 = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
@@ -210,7 +210,7 @@ def _compose(warp: FloatArray, step: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _align(
     target: NDArray[np.float32],
     size: int,
@@ -255,7 +255,7 @@ def _align(
     return correlation / total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def align_patches(
     patches: NDArray[np.float32],
     reference_idx: NDArray[np.intp],

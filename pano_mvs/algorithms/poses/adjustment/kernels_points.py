@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import angle_between
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _solved(matrix: FloatArray, vector: FloatArray, least: float, point: FloatArray) -> bool:
     """Write the solution of a symmetric (3, 3) system; return whether its smallest eigenvalue exceeds `least`.
 
@@ -38,7 +38,7 @@ def _solved(matrix: FloatArray, vector: FloatArray, least: float, point: FloatAr
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _nearest_point(
     centers: FloatArray,
     rays: FloatArray,
@@ -90,7 +90,7 @@ def _nearest_point(
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def triangulate(
     centers: FloatArray, rays: FloatArray, starts: NDArray[np.intp], least: float, max_error: float, rounds: int
 ) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_], FloatArray]:

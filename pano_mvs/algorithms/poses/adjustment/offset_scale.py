@@ -54,30 +54,32 @@ def estimate_offset_scale(bundle: Bundle, *, loss: Loss, scale_rad: float, neigh
     if bundle.offsets_m is None:
         raise UsageError("a bundle without offsets of its rays has no unit of length")
     held = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
-    derivatives = _derivatives(held.bundle)
+    derivatives = ray_derivatives(held.bundle)
+    assert held.bundle.offsets_m is not None
+    by_unit = -np.einsum("tij,tj->ti", derivatives.by_ray, held.bundle.offsets_m)
     try:
-        unexplained = _unexplained(held, derivatives)
+        own = unexplained(held, derivatives, by_unit)
     except LinAlgError:
         return OffsetScale(bundle.units_per_m, float("inf"))
-    information = float(np.sum(held.weights[:, None] * unexplained**2))
+    information = float(np.sum(held.weights[:, None] * own**2))
     if not information > 0:
         return OffsetScale(bundle.units_per_m, float("inf"))
-    step = -float(np.sum(held.weights[:, None] * unexplained * derivatives.residuals)) / information
+    step = -float(np.sum(held.weights[:, None] * own * derivatives.residuals)) / information
     return OffsetScale(bundle.units_per_m + step, float(np.sqrt(held.variance / information)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Derivatives:
-    """Residuals (T, 2), and their derivatives by camera (T, 2, 6), point (T, 2, 3) and units per metre (T, 2)."""
+class RayDerivatives:
+    """Residuals (T, 2), and their derivatives by ray (T, 2, 3), camera (T, 2, 6) and point (T, 2, 3)."""
 
     residuals: FloatArray
+    by_ray: FloatArray
     by_camera: FloatArray
     by_point: FloatArray
-    by_unit: FloatArray
 
 
-def _derivatives(bundle: Bundle) -> _Derivatives:
-    assert bundle.offsets_m is not None
+def ray_derivatives(bundle: Bundle) -> RayDerivatives:
+    """Return the residuals of a bundle on the tangent planes of its bearings, with their derivatives."""
     rays = bundle.rays_in_cam()
     lengths = np.linalg.norm(rays, axis=1)
     unit = rays / lengths[:, None]
@@ -87,22 +89,22 @@ def _derivatives(bundle: Bundle) -> _Derivatives:
     by_point = by_ray @ bundle.rotations[bundle.image_idx]
     # R ← exp(ω) R turns y = R (X − C), which is the ray and its origin together.
     by_turn = np.cross((rays + bundle.origins)[:, None], by_ray)
-    return _Derivatives(
-        residuals,
-        np.concatenate([by_turn, -by_point], axis=2),
-        by_point,
-        -np.einsum("tij,tj->ti", by_ray, bundle.offsets_m),
-    )
+    return RayDerivatives(residuals, by_ray, np.concatenate([by_turn, -by_point], axis=2), by_point)
 
 
-def _unexplained(held: HeldCameras, derivatives: _Derivatives) -> FloatArray:
-    """Return the part of the derivatives by the unit that no movement of cameras and points explains, (T, 2).
+def unexplained(held: HeldCameras, derivatives: RayDerivatives, by_parameter: FloatArray) -> FloatArray:
+    """Return the part of the derivatives by a parameter that no movement of cameras and points explains, (T, 2).
+
+    Args:
+        held: the system of the cameras.
+        derivatives: those of the bundle of the system.
+        by_parameter: (T, 2) derivatives of the residuals by the parameter.
 
     Raises:
         LinAlgError: if the system is singular.
     """
     bundle, system = held.bundle, held.system
-    weighted = held.weights[:, None] * derivatives.by_unit
+    weighted = held.weights[:, None] * by_parameter
     point_right = np.zeros((len(bundle.points), 3))
     np.add.at(point_right, bundle.point_idx, np.einsum("tij,ti->tj", derivatives.by_point, weighted))
     through_points = np.einsum("pij,pj->pi", system.inverses, point_right)
@@ -117,5 +119,5 @@ def _unexplained(held: HeldCameras, derivatives: _Derivatives) -> FloatArray:
     points = np.einsum("pij,pj->pi", system.inverses, point_right - coupled)
     explained = np.einsum("tij,tj->ti", derivatives.by_camera, cameras[bundle.image_idx])
     explained += np.einsum("tij,tj->ti", derivatives.by_point, points[bundle.point_idx])
-    unexplained: FloatArray = derivatives.by_unit - explained
-    return unexplained
+    remaining: FloatArray = by_parameter - explained
+    return remaining

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.elevation_range import ElevationRange, estimate_elevation_range
 from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
@@ -20,11 +21,13 @@ from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import LensRig
 from pano_mvs.scene import Poses
-from pano_mvs.scene.pose_groups import per_group
+from pano_mvs.scene.pose_groups import per_group, split_groups
 
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 3
+# Nine captures of full spheres are within 2.3 deviations; later rounds choose the observations that fit them.
+_RANGE_ROUNDS, _MIN_FIRST_STDS = 8, 3.0
 # The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
 _OFFSET_ROUNDS, _WIDE = 10, 4
@@ -86,6 +89,40 @@ def refine_poses(
     if rigs:
         return per_group(poses, lambda group: _refined_with_rigs(group, settings, rigs, load=load))
     return _refined_centrally(poses, settings, load=load)
+
+
+def fitted_elevation_range(poses: Poses, refined: Poses, *, loss: Loss, loss_scale_deg: float) -> ElevationRange | None:
+    """Return the elevations that the panoramas of the largest group cover, by its tracks; None without tracks.
+
+    If the rays of full spheres do not fit, the poses are refined again with the rays that fit better, until the range
+    stays the same.
+
+    Args:
+        poses: poses with tracks.
+        refined: the same, refined.
+        loss: as in `refine_poses`.
+        loss_scale_deg: as in `refine_poses`.
+    """
+    group, fitted = split_groups(poses)[0], split_groups(refined)[0]
+    neighbour = first_neighbour(fitted.centers)
+    if not neighbour or not len(fitted.track_point_idx):
+        return None
+    found = ElevationRange(90.0, -90.0, (0.0, 0.0))
+    for round_idx in range(_RANGE_ROUNDS):
+        step = estimate_elevation_range(
+            _bundle(fitted)[0], loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg)), neighbour=neighbour
+        )
+        found = found.then(step)
+        if step.deviations <= (1 if round_idx else _MIN_FIRST_STDS):
+            break
+        again = replace(
+            group,
+            rotations=fitted.rotations,
+            translations=fitted.translations,
+            track_bearings=found.bearings(group.track_bearings),
+        )
+        fitted = refine_poses(again, loss=loss, loss_scale_deg=loss_scale_deg)
+    return found
 
 
 @dataclass(frozen=True, slots=True)

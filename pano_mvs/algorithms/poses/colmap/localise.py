@@ -69,6 +69,7 @@ def localise_photograph(
     *,
     focal_px: float | None,
     patches: PhotographPatches | None = None,
+    learned: Mapping[str, NDArray[np.int32]] | None = None,
     candidates: Annotated[
         int, Setting("number of most similar panoramas to match each photograph with; 0: all", ge=0)
     ] = 20,
@@ -90,6 +91,7 @@ def localise_photograph(
         panoramas: key points with positions, by name.
         focal_px: focal length if it is known, None otherwise.
         patches: the photograph and the panoramas, to align patches; None: key points only.
+        learned: by panorama, matches (M, 2) that a network found: positions in `keypoints` and in the known points.
         candidates: number of most similar panoramas that are used; 0: all.
         min_inliers: minimum number of key points that agree with the pose.
         max_error_deg: maximum error of these.
@@ -98,7 +100,8 @@ def localise_photograph(
     if patches is not None and patches.too_narrow:
         return f"it is {size_hw[1]} × {size_hw[0]} pixels, which is too narrow to be compared with panoramas"
     panoramas = _similar(keypoints, panoramas, candidates)
-    each = {name: _matches(keypoints, known) for name, known in panoramas.items()}
+    by_network = learned or {}
+    each = {name: _matches(keypoints, known, learned=by_network.get(name)) for name, known in panoramas.items()}
     matches = _joined(each.values())
     if len(matches.pixels_px) < (min_inliers if patches is None else _FEW):
         return (
@@ -122,7 +125,7 @@ def localise_photograph(
     if isinstance(found, Localised | _Cropped) or patches is None:
         return found
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
-    singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO) for name in most]
+    singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO, learned=by_network.get(name)) for name in most]
     return search.confirmed([matches, *(one for one in singly if len(one.pixels_px) >= _FEW)], rng) or found
 
 
@@ -291,11 +294,19 @@ def _rigid(pose: Any) -> Rigid3:
     return Rigid3(pose.rotation.matrix(), np.array(pose.translation))
 
 
-def _matches(keypoints: PhotographKeypoints, known: KnownPoints, *, ratio: float = 0.8) -> _Matches:
-    """Return the matches of a photograph with one panorama."""
+def _matches(
+    keypoints: PhotographKeypoints,
+    known: KnownPoints,
+    *,
+    ratio: float = 0.8,
+    learned: NDArray[np.int32] | None = None,
+) -> _Matches:
+    """Return the matches of a photograph with one panorama, with those that a network found."""
     if min(len(keypoints.descriptors), len(known.descriptors)) < 2:
         return _joined([])
     matched = match_l2(keypoints.descriptors, known.descriptors, ratio=ratio)
+    if learned is not None:
+        matched = np.unique(np.concatenate([matched, learned]), axis=0)
     return _Matches(keypoints.pixels_px[matched[:, 0]], known.points_in_world[matched[:, 1]])
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
+from pano_mvs.algorithms.poses.frame.upside_down import upside_down_probability
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, up_from_lines
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
@@ -17,6 +18,9 @@ from pano_mvs.scene import Poses
 
 FloatArray = NDArray[np.float64]
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
+
+SURE = 0.8
+"""Probability from which a capture is taken to be upside down. Of upright ones that were measured, none reaches .01."""
 
 _UP = np.array([0.0, -1.0, 0.0])
 # Sensors of one rigid capture that differ by more than this did not measure gravity.
@@ -46,6 +50,8 @@ class Vertical:
         disagreement_deg: median angle between single readings and `up_in_world`; NaN if there is only one.
         reason: why the direction is unknown; "" if it is known.
         uncertainty_deg: standard deviation of `up_in_world`; NaN if unknown.
+        upside_down: probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on,
+            `up_in_world` is opposite to their up direction.
     """
 
     up_in_world: FloatArray
@@ -54,6 +60,7 @@ class Vertical:
     disagreement_deg: float = float("nan")
     reason: str = ""
     uncertainty_deg: float = float("nan")
+    upside_down: float = float("nan")
 
     def __bool__(self) -> bool:
         """Return whether the direction is known."""
@@ -75,7 +82,8 @@ def find_vertical(
         pictures: image name to a function that loads its panorama, for `lines`.
         evidence: "sensors" of the cameras; vertical "lines" in the pictures, or the "structure" of floors, ceilings and
             tables, within 20° of the cameras' mean up direction; the up directions of the "cameras" alone; or "auto":
-            the first of these, in this order, that can be used.
+            the first of these, in this order, that can be used. With "auto", a vertical that does not come from sensors
+            is turned around if the capture is upside down (see `pano_mvs.algorithms.poses.frame.upside_down`).
     """
     finders: dict[str, Callable[[], Vertical]] = {
         "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
@@ -87,9 +95,18 @@ def find_vertical(
     for find in finders.values() if evidence == "auto" else [finders[evidence]]:
         vertical = find()
         if vertical:
-            return vertical
+            return (
+                vertical if evidence != "auto" or vertical.source == "sensors" else _upright(vertical, poses, pictures)
+            )
         reasons.append(vertical.reason)
     return _unknown("; ".join(reasons))
+
+
+def _upright(vertical: Vertical, poses: Poses, pictures: Mapping[str, Picture] | None) -> Vertical:
+    """Return a vertical that points up even if the cameras were upside down."""
+    probability = upside_down_probability(poses, pictures or {}, vertical.up_in_world)
+    up = -vertical.up_in_world if probability >= SURE else vertical.up_in_world
+    return replace(vertical, up_in_world=up, upside_down=probability)
 
 
 def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]) -> Vertical:

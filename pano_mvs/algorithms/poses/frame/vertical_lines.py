@@ -131,6 +131,16 @@ def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
     return _refined(segments, best, contrast)
 
 
+def up_of_panorama(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> VerticalLines:
+    """Return the direction in the camera frame, within 20° of the camera's own up, that vertical lines point to.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        valid: (H, W) bool; masked (False) pixels have no lines.
+    """
+    return up_from_lines(find_segments({"": lambda: (image, valid)}, {"": np.eye(3)}, _UP), _UP)
+
+
 def directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
     """Return unit vectors (K, 3) on a grid of tilts of at most `half_deg` around `up`."""
     tilts = np.deg2rad(np.arange(-half_deg, half_deg + step_deg / 2, step_deg))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +16,13 @@ from pano_mvs.algorithms.poses.joining.cross_matches import (
 )
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
 from pano_mvs.algorithms.poses.joining.proposals import (
+    PairHypothesis,
     camera_proposals,
     least_costly,
-    level_proposals,
     pair_proposals,
     pivoted,
 )
-from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
+from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 
 FloatArray = NDArray[np.float64]
 
@@ -62,8 +62,7 @@ def align_models(
     rng: np.random.Generator,
     threshold_rad: float,
     has_scale: bool,
-    levels: tuple[FloatArray | None, FloatArray | None] = (None, None),
-    relative: Mapping[tuple[int, int], Rigid3] | None = None,
+    hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]] | None = None,
 ) -> Alignment | None:
     """Return the similarity of two models on which most of their matches agree; None if there is none.
 
@@ -76,13 +75,10 @@ def align_models(
         rng: draws the samples.
         threshold_rad: maximum error of an inlier.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
-        levels: level_from_world of each model, (3, 3), or None if it is not known (see `level_pairs`).
-        relative: second_from_first of pairs of images, |t| = 1, as further proposals.
+        hypotheses: relative poses of pairs of images, as further proposals.
     """
     proposals = camera_proposals(matches, rng=rng, threshold_rad=threshold_rad, has_scale=has_scale)
-    if levels[0] is not None and levels[1] is not None:
-        proposals += level_proposals(matches, (levels[0], levels[1]), rng=rng, threshold_rad=threshold_rad)
-    proposals += pair_proposals(matches, relative or {}, threshold_rad=threshold_rad)
+    proposals += pair_proposals(matches, hypotheses or {}, threshold_rad=threshold_rad)
     if not proposals:
         return None
     proposals = least_costly(proposals, matches, threshold_rad=threshold_rad, count=_PIVOTED)

@@ -1,116 +1,219 @@
-"""Join the models of groups that verified pairs connect, but through too few points for one camera at a time."""
+"""Join the models of groups, such as rooms that see each other through a door, by all matches between their images."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
+from pano_mvs.algorithms.poses.joining.cross_matches import (
+    CrossMatches,
+    match_errors,
+)
 from pano_mvs.algorithms.poses.joining.models import are_apart, cross_matches, joined_model
+from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
+from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
-from pano_mvs.geometry import Rigid3, geodesic_angle
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
+from pano_mvs.scene import TwoView
 
 _THRESHOLD_RAD = float(np.deg2rad(0.4))
-_MIN_WITNESSES, _MIN_SHARE, _MAX_LOG10_FALSE_ALARMS = 10, 0.5, -10.0
+_MAX_LOG10_FALSE_ALARMS = -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
-_MIN_OF_RIVAL = 0.5  # of the witnesses of an alignment; a rival with more makes it ambiguous
-_SAME_TURN_RAD = float(np.deg2rad(2.0))
+_SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
+_MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
+_OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # matches that the best alignment explains and a rival does not
+_PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
+_NEIGHBOURS = 5  # number of models with which each one is aligned
+
+Part = tuple[PlacedModel, tuple[int, ...]]
 
 
-def join_models(models: Sequence[PlacedModel]) -> list[tuple[PlacedModel, tuple[int, ...]]]:
-    """Return the models after joining those that their pairs align, each with the positions of its parts.
+def join_models(models: Sequence[PlacedModel]) -> list[Part]:
+    """Return the models after joining those that can be aligned, with the positions of their parts.
 
     An image is added to a growing model only if enough of its points are known there. A door may show too few of them
-    to any one image, but all pairs between two models together determine how these lie.
+    to any one image, and two images may share too few matches to be verified. But a model knows the ranges of its key
+    points, and the matches of all its images count together, verified or not: a match with a known point fixes two
+    angles instead of one, and seven numbers align two models with dozens of pairs (see `align_models`). Models are
+    joined if the matches determine the alignment, if these are far more than chance, and if no other alignment is
+    nearly as good. The most certain alignment is the first.
 
     Args:
         models: of the same pairs, without common images; the world of the largest part is kept.
     """
-    left: list[tuple[PlacedModel, tuple[int, ...]]] = [(model, (number,)) for number, model in enumerate(models)]
+    left: dict[int, Part] = {number: (model, (number,)) for number, model in enumerate(models)}
+    tried: dict[tuple[int, int], Alignment | None] = {}
     while True:
-        found = []
-        for b in range(len(left)):
-            for a in range(b):
-                large, small = sorted((a, b), key=lambda idx: (-len(left[idx][0].cameras), idx))
-                alignment = _alignment(left[large][0], left[small][0])
-                if alignment is not None:
-                    found.append((-alignment.witnesses, large, small, alignment))
-        if not found:
-            return left
-        _, large, small, alignment = min(found, key=lambda item: item[:3])
-        joined = joined_model(left[large][0], left[small][0], alignment.first_from_second)
-        joined.choose_again()
-        parts = tuple(sorted((*left[large][1], *left[small][1])))
-        left = [one for idx, one in enumerate(left) if idx not in (large, small)]
-        left.append((joined, parts))
+        for pair in _promising({number: model for number, (model, _) in left.items()}):
+            if pair not in tried:
+                tried[pair] = _certain_alignment(left[pair[0]][0], left[pair[1]][0])
+        usable = {pair: one for pair, one in tried.items() if one is not None and left.keys() >= {*pair}}
+        if not usable:
+            return list(left.values())
+        best = min(usable, key=lambda pair: (usable[pair].log10_false_alarms, pair))
+        (first, one), (second, other) = (left.pop(number) for number in best)
+        joined = joined_model(first, second, usable[best].first_from_second)
+        joined.verify_again()
+        left[len(models) + len(tried)] = joined, tuple(sorted((*one, *other)))
 
 
-def _alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
-    """Return the alignment of two models by the pairs between them; None if these do not determine it."""
-    relative, alignment = _aligned(first, second)
+def _promising(models: Mapping[int, PlacedModel]) -> Iterator[tuple[int, int]]:
+    """Yield pairs of models, the larger one first, at least one with several cameras, by the significance of pairs."""
+    number = {image: idx for idx, model in models.items() for image in model.cameras}
+    evidence: dict[tuple[int, int], float] = {}
+    compared = next(iter(models.values())).pairs.compared or {}
+    for (a, b), view in compared.items():
+        one, other = number.get(a), number.get(b)
+        if one is None or other is None or one == other or not len(view.all_matches_idx):
+            continue
+        if max(len(models[one].cameras), len(models[other].cameras)) > 1:
+            pair = _larger_first(models, one, other)
+            evidence[pair] = min(evidence.get(pair, np.inf), view.log10_false_alarms)
+    chosen = set()
+    for idx in models:
+        partners = sorted((pair for pair in evidence if idx in pair), key=lambda pair: (evidence[pair], pair))
+        chosen |= {*partners[:_NEIGHBOURS]}
+    yield from sorted(chosen)
+
+
+def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[int, int]:
+    return (a, b) if (len(models[a].cameras), -a) >= (len(models[b].cameras), -b) else (b, a)
+
+
+def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
+    """Return the alignment of two models by the matches between them; None if these do not determine it."""
+    views = _views_between(first, second)
+    matches = cross_matches(
+        first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
+    )
+    hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
+    has_scale = len(second.cameras) > 1
+    best = _aligned(matches, hypotheses, has_scale=has_scale)
     if (
-        alignment is None
-        or alignment.witnesses < _MIN_WITNESSES
-        or alignment.log10_false_alarms > _MAX_LOG10_FALSE_ALARMS
-        or alignment.inliers.mean() < _MIN_SHARE
-        or alignment.rotation_std_deg > _MAX_TURN_STD_DEG
-        or alignment.offset_std_deg > _MAX_OFFSET_STD_DEG
-        or alignment.scale_std > _MAX_SCALE_STD
-        or not _most_agree(alignment, relative)
-        or _has_rival(alignment, first, second)
+        best is None
+        or not _is_significant(best, first, second, views=views)
+        or best.rotation_std_deg > _MAX_TURN_STD_DEG
+        or best.offset_std_deg > _MAX_OFFSET_STD_DEG
+        or best.scale_std > _MAX_SCALE_STD
     ):
         return None
-    return alignment
+    # Where structure repeats, an alignment with another, similar place has matches of its own.
+    rest = matches[np.flatnonzero(~best.inliers)]
+    other = _aligned(rest, hypotheses, has_scale=has_scale)
+    if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
+        return best
+    return None if _is_rival(best, other, matches) else best
 
 
-def _has_rival(alignment: Alignment, first: PlacedModel, second: PlacedModel) -> bool:
-    """Return whether the runner-up geometries of the pairs put the second model elsewhere, nearly as well supported.
+def _is_significant(
+    alignment: Alignment,
+    first: PlacedModel,
+    second: PlacedModel,
+    *,
+    views: Mapping[Edge, TwoView],
+) -> bool:
+    """Return whether an alignment is more than chance, by the matches with known points or by verified pairs.
 
-    Where structure repeats, the pairs of two groups agree on several alignments, and the best one may be false.
+    The rotation and the direction of a verified pair are more than chance by themselves. What the pair leaves open, the
+    lengths, is determined by another verified pair that agrees, or by the ranges of the matches that are known. The
+    pairs that agree must outweigh those that do not.
     """
-    _, other = _aligned(first, second, runners_up=True)
-    if other is None or other.witnesses < _MIN_OF_RIVAL * alignment.witnesses:
+    joined = joined_model(first, second, alignment.first_from_second)
+    agreeing: list[float] = []
+    disagreeing: list[float] = []
+    has_length = False
+    for (i, j), view in views.items():
+        if view:
+            pose, _ = oriented(view, i, j)
+            relative = joined.cameras[j] @ joined.cameras[i].inverse()
+            turned = geodesic_angle(pose.rotation, relative.rotation)
+            off = angle_between(pose.translation, relative.translation)
+            agrees = bool(turned < _SAME_TURN_RAD and off < _SAME_DIRECTION_RAD)
+            (agreeing if agrees else disagreeing).append(-view.log10_false_alarms)
+            has_length |= agrees and _has_lengths((first, second), (i, j), view, similarity=alignment.first_from_second)
+    if sum(agreeing) < sum(disagreeing):
         return False
-    return are_apart((alignment.first_from_second, other.first_from_second), first, second)
+    return alignment.log10_false_alarms <= _MAX_LOG10_FALSE_ALARMS or len(agreeing) > 1 or has_length
+
+
+def _has_lengths(
+    models: tuple[PlacedModel, PlacedModel], pair: Edge, view: TwoView, *, similarity: Similarity3
+) -> bool:
+    """Return whether the matches of a pair determine its length in the unit of either model, as an alignment has it."""
+    centers = [model.cameras[image].center for model, image in zip(models, pair, strict=True)]
+    length = float(np.linalg.norm(similarity.apply(centers[1][None])[0] - centers[0]))
+    log10_alarms = 0.0
+    for (found, alarms), expected, model in zip(
+        _lengths(models, pair, view), (length, length / similarity.scale), models, strict=True
+    ):
+        if len(model.cameras) > 1:
+            if not abs(np.log(found / expected)) < _LENGTH:
+                return False
+            log10_alarms += alarms
+    return log10_alarms < _MAX_LOG10_OF_LENGTH
+
+
+def _views_between(first: PlacedModel, second: PlacedModel) -> dict[Edge, TwoView]:
+    """Return the most significant pairs of an image of either model, with the image of the first model first."""
+    compared = first.pairs.compared or {}
+    found = {
+        (i, j): compared[min(i, j), max(i, j)]
+        for i in first.cameras
+        for j in second.cameras
+        if (min(i, j), max(i, j)) in compared
+    }
+    ranked = sorted(found, key=lambda pair: (found[pair].log10_false_alarms, pair))
+    return {pair: found[pair] for pair in ranked[:_PAIRS]}
+
+
+def _hypotheses(models: tuple[PlacedModel, PlacedModel], pair: Edge, view: TwoView) -> list[PairHypothesis]:
+    """Return the relative poses of a pair of two models, verified or not, between the axes of their worlds."""
+    found = []
+    for geometry in (view, *view.alternatives):
+        if geometry:
+            pose, _ = oriented(geometry, *pair)
+            own, other = (model.cameras[image].rotation for model, image in zip(models, pair, strict=True))
+            lengths = [length if alarms < 0 else np.nan for length, alarms in _lengths(models, pair, geometry)]
+            turned = Rigid3(other.T @ pose.rotation @ own, other.T @ pose.translation)
+            found.append(PairHypothesis(turned, (lengths[0], lengths[1])))
+    return found
+
+
+def _lengths(
+    models: tuple[PlacedModel, PlacedModel], pair: Edge, view: TwoView
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the length of a pair's translation in the unit of either model, with log₁₀ of its false alarms."""
+    found = []
+    for model, (one, other) in zip(models, (pair, pair[::-1]), strict=True):
+        pose, matches = oriented(view, one, other)
+        p, q = (model.pairs.bearings[image][matches[:, side]] for side, image in enumerate((one, other)))
+        ranges = model.known_ranges(one)[matches[:, 0]]
+        found.append(significant_length(pose, p, q, known_ranges=ranges, rng=np.random.default_rng(0)))
+    return found[0], found[1]
 
 
 def _aligned(
-    first: PlacedModel, second: PlacedModel, *, runners_up: bool = False
-) -> tuple[dict[tuple[int, int], Rigid3], Alignment | None]:
-    """Return the relative poses of the pairs between two models in the worlds' axes, and the alignment by them.
-
-    Args:
-        first: a model.
-        second: another model.
-        runners_up: use the second geometry of each pair, of those that have one, instead of the best.
-    """
-    found, relative = {}, {}
-    for edge, geometries in first.pairs.geometries.items():
-        for one, other in (edge, edge[::-1]):
-            if one in first.cameras and other in second.cameras and len(geometries) > runners_up:
-                view, swapped = geometries[int(runners_up)].view, one > other
-                pose = Rigid3(view.rotation, view.direction)
-                pose = pose.inverse() if swapped else pose
-                turn = second.cameras[other].rotation.T
-                relative[one, other] = Rigid3(
-                    turn @ pose.rotation @ first.cameras[one].rotation, turn @ pose.translation
-                )
-                found[one, other] = view.matches_idx[:, ::-1] if swapped else view.matches_idx
-    matches = cross_matches(first, second, found) if found else None
-    if matches is None or not matches.known.any():
-        return relative, None
-    return relative, align_models(
-        matches,
-        rng=np.random.default_rng(0),
-        threshold_rad=_THRESHOLD_RAD,
-        has_scale=len(second.cameras) > 1,
-        relative=relative,
+    matches: CrossMatches, hypotheses: Mapping[Edge, Sequence[PairHypothesis]], *, has_scale: bool
+) -> Alignment | None:
+    if not matches.known.any():
+        return None
+    return align_models(
+        matches, rng=np.random.default_rng(0), threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses
     )
 
 
-def _most_agree(alignment: Alignment, relative: dict[tuple[int, int], Rigid3]) -> bool:
-    """Return whether most pairs between two models have the rotation of their alignment."""
-    turn = alignment.first_from_second.rotation.T
-    agreeing = [float(geodesic_angle(pose.rotation, turn)) < _SAME_TURN_RAD for pose in relative.values()]
-    return sum(agreeing) > len(agreeing) / 2
+def _is_rival(best: Alignment, other: Alignment, matches: CrossMatches) -> bool:
+    """Return whether another alignment is more than chance, and explains nearly as many matches of its own.
+
+    Matches without a known point are ignored, since many of them agree with any alignment.
+    """
+    if other.log10_false_alarms > 0:
+        return False
+    explained: NDArray[np.bool_] = match_errors(other.first_from_second, matches) < best.threshold_rad
+    own = int((best.inliers & ~explained & matches.known).sum())
+    others = int((explained & ~best.inliers & matches.known).sum())
+    return own < _OWN_OF_RIVAL * others + _MIN_OWN

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from pano_mvs.core.kernels import inlined, kernel
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _chord(x: float, y: float, z: float, ray: FloatArray, out: FloatArray) -> float:
     """Write the difference of a direction and a ray, and return the angle between them."""
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
@@ -20,7 +21,7 @@ def _chord(x: float, y: float, z: float, ray: FloatArray, out: FloatArray) -> fl
     return 2.0 * math.asin(min(half, 1.0))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def match_errors(
     similarity: FloatArray,
     centers: FloatArray,

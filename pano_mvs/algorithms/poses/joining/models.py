@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,8 @@ def cross_matches(
 def joined_model(first: PlacedModel, second: PlacedModel, first_from_second: Similarity3) -> PlacedModel:
     """Return the cameras, chosen geometries and ranges of two models in the world of the first one."""
     model = first.copy()
+    within = {edge: found for edge, found in second.pairs.geometries.items() if second.cameras.keys() >= {*edge}}
+    model.pairs = replace(first.pairs, geometries={**first.pairs.geometries, **within})
     scale, turn = first_from_second.scale, first_from_second.rotation
     for image, camera in second.cameras.items():
         center = first_from_second.apply(camera.center[None])[0]

@@ -1,8 +1,9 @@
-"""Similarities of two models that are worth refining: from single cameras, from level images, from pairs."""
+"""Similarities of two models that are worth refining: from single cameras, and from pairs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from pano_mvs.algorithms.poses.joining.cross_matches import (
     errors_and_residuals,
     parts_of,
 )
-from pano_mvs.algorithms.poses.joining.level_pairs import level_poses
 from pano_mvs.algorithms.poses.joining.three_points import candidate_poses
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 
@@ -58,42 +58,29 @@ def camera_proposals(
     return found
 
 
-def level_proposals(
-    matches: CrossMatches,
-    levels: tuple[FloatArray, FloatArray],
-    *,
-    rng: np.random.Generator,
-    threshold_rad: float,
-) -> list[FloatArray]:
-    """Return similarities from relative poses of two level images, one of each model.
+@dataclass(frozen=True, eq=False)
+class PairHypothesis:
+    """A relative pose of two images, one of each model, in the axes of the worlds.
 
-    Args:
-        matches: between the images of the two models.
-        levels: level_from_world of each model.
-        rng: draws the samples.
-        threshold_rad: Sampson error from which a match costs 1.
+    Attributes:
+        second_from_first: |t| = 1.
+        lengths: of the translation, in the unit of either model; NaN if the ranges of its matches do not determine it.
     """
-    found: list[FloatArray] = []
-    for cameras in np.unique(matches.cameras, axis=0):
-        pair = matches[np.flatnonzero((matches.cameras == cameras).all(axis=1))]
-        p, q = pair.rays[:, 0] @ levels[0].T, pair.rays[:, 1] @ levels[1].T
-        for pose in level_poses(p, q, rng=rng, threshold_rad=threshold_rad):
-            level = levels[0].T @ pose.rotation.T @ levels[1]
-            place = Rigid3.from_center(level.T, levels[0].T @ pose.center)
-            found.append(_with_lengths(place, pair.centers[0], matches, threshold_rad=threshold_rad))
-    return found
+
+    second_from_first: Rigid3
+    lengths: tuple[float, float]
 
 
 def pair_proposals(
-    matches: CrossMatches, relative: Mapping[tuple[int, int], Rigid3], *, threshold_rad: float
+    matches: CrossMatches, hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]], *, threshold_rad: float
 ) -> list[FloatArray]:
-    """Return similarities from relative poses of two images, one of each model, in the worlds' axes."""
+    """Return similarities from relative poses of two images, one of each model."""
     found: list[FloatArray] = []
-    for cameras, pose in relative.items():
+    for cameras, some in hypotheses.items():
         pair = np.flatnonzero((matches.cameras == cameras).all(axis=1))
         if len(pair):
             centers = matches.centers[pair[0]]
-            found.append(_with_lengths(pose, centers, matches, threshold_rad=threshold_rad))
+            found += [_with_lengths(one, centers, matches, threshold_rad=threshold_rad) for one in some]
     return found
 
 
@@ -141,15 +128,17 @@ def _rescaled(similarity: FloatArray, pivot: FloatArray, matches: CrossMatches, 
     return least_costly(found, matches, threshold_rad=2 * threshold_rad, count=1)[0]
 
 
-def _with_lengths(pose: Rigid3, centers: FloatArray, matches: CrossMatches, *, threshold_rad: float) -> FloatArray:
-    """Return the similarity with the relative pose of two cameras, at the distances with most agreement.
+def _with_lengths(
+    hypothesis: PairHypothesis, centers: FloatArray, matches: CrossMatches, *, threshold_rad: float
+) -> FloatArray:
+    """Return the similarity with the relative pose of two cameras and, if its lengths are unknown, the best ones.
 
     Matches with a point known in the first model depend on the distance in the unit of the first model alone, and
     likewise in the second.
     """
-    rotation, direction = pose.rotation.T, pose.center
-    lengths = []
-    for side in (0, 1):
+    rotation, direction = hypothesis.second_from_first.rotation.T, hypothesis.second_from_first.center
+    lengths = list(hypothesis.lengths)
+    for side in np.flatnonzero(np.isnan(lengths)):
         # Only matches of the one camera: the rest of its model is at distances that depend on both lengths.
         of_camera = np.abs(matches.centers[:, 1 - side] - centers[1 - side]).max(axis=1) < 1e-9
         known = matches[np.flatnonzero(of_camera & np.isfinite(matches.ranges[:, side]))]
@@ -158,7 +147,7 @@ def _with_lengths(pose: Rigid3, centers: FloatArray, matches: CrossMatches, *, t
         seen = known.points[None, :, side] - (centers[side] + _LENGTHS[:, None, None] * towards)
         cosine = np.sum((seen @ turn) * known.rays[:, 1 - side], axis=2) / np.linalg.norm(seen, axis=2)
         costs = np.minimum(2 * (1 - cosine) / (2 * threshold_rad) ** 2, 1.0).sum(axis=1)
-        lengths.append(float(_LENGTHS[int(np.argmin(costs))]) if len(known) else 1.0)
+        lengths[side] = float(_LENGTHS[int(np.argmin(costs))]) if len(known) else 1.0
     scale = lengths[0] / lengths[1]
     place = centers[0] + lengths[0] * direction
     return np.concatenate([rotation.ravel(), place - scale * rotation @ centers[1], [scale]])

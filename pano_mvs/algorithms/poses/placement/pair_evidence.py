@@ -10,17 +10,20 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.two_view.significance import log10_false_alarms
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
 FloatArray = NDArray[np.float64]
 
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-_MIN_RATIOS = 6
+MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
-_AGREEING, _MIN_AGREEING = 1.25, 0.4
+_AGREEING, MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
+_SHUFFLES = 50
+_TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
 # Standard deviation of the direction that is assumed for a geometry without one.
 _ALTERNATIVE_STD_DEG = 0.5
 
@@ -191,17 +194,55 @@ def _length(
     kappa: float,
 ) -> float:
     """Return the length of the translation that puts points at their known ranges; NaN if it is not determined."""
-    known = np.isfinite(known_ranges)
-    if known.sum() < _MIN_RATIOS:
+    known, unit, parallax = _known_and_unit_ranges(second_from_first, p, q, known_ranges=known_ranges)
+    if len(known) < MIN_RATIOS:
         return np.nan
-    p, q, known_ranges = p[known], q[known], known_ranges[known]
+    ratios = known / unit
+    length = estimate_scale(ratios, np.sin(parallax) ** 2, estimator=estimator, kappa=kappa)
+    agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
+    return length if agreeing >= max(MIN_RATIOS, MIN_AGREEING * len(ratios)) else np.nan
+
+
+def significant_length(
+    second_from_first: Rigid3, p: FloatArray, q: FloatArray, *, known_ranges: FloatArray, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the length of a translation that puts points at their known ranges, and log₁₀ of its false alarms.
+
+    A range of false matches is any known range over any other one in units of the translation, so that the chance of
+    agreeing with a length is measured on shuffled ranges, for each of several tolerances.
+
+    Args:
+        second_from_first: relative pose, |t| = 1.
+        p: (M, 3) unit rays of the matches in the first image.
+        q: (M, 3) in the second image.
+        known_ranges: (M,) ranges of the points from the first image, NaN where unknown.
+        rng: shuffles the ranges.
+    """
+    known, unit, parallax = _known_and_unit_ranges(second_from_first, p, q, known_ranges=known_ranges)
+    if len(known) < 2:
+        return np.nan, np.inf
+    length = estimate_scale(known / unit, np.sin(parallax) ** 2, estimator="cauchy", kappa=0.0)
+    off = np.abs(np.log(known / unit / length))
+    shuffled = np.abs(np.log(rng.permuted(np.tile(known, (_SHUFFLES, 1)), axis=1) / unit / length))
+    alarms = [
+        log10_false_alarms(
+            int((off < tolerance).sum()),
+            len(known),
+            chance=float((shuffled < tolerance).sum() + 1) / (shuffled.size + 1),
+            sample=1,
+            models_per_sample=len(_TOLERANCES),
+        )
+        for tolerance in _TOLERANCES
+    ]
+    return length, min(alarms)
+
+
+def _known_and_unit_ranges(
+    second_from_first: Rigid3, p: FloatArray, q: FloatArray, *, known_ranges: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the known ranges of the usable matches, those in units of the translation, and the parallaxes, (K,)."""
     unit_range, other_range = ranges_from_bearings(p, q, second_from_first)
     parallax = angle_between(p @ second_from_first.rotation.T, q)
     with np.errstate(invalid="ignore"):
-        usable = (unit_range > 0) & (other_range > 0) & (parallax > _MIN_ANGLE_RAD)
-    if usable.sum() < _MIN_RATIOS:
-        return np.nan
-    ratios = known_ranges[usable] / unit_range[usable]
-    length = estimate_scale(ratios, np.sin(parallax[usable]) ** 2, estimator=estimator, kappa=kappa)
-    agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
-    return length if agreeing >= max(_MIN_RATIOS, _MIN_AGREEING * len(ratios)) else np.nan
+        usable = (unit_range > 0) & (other_range > 0) & np.isfinite(known_ranges) & (parallax > _MIN_ANGLE_RAD)
+    return known_ranges[usable], unit_range[usable], parallax[usable]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
-from pano_mvs.algorithms.poses.placement.view_graph import Edge, consistent_edges
+from pano_mvs.algorithms.poses.placement.view_graph import Edge, consistent_edges, views_by_position
+from pano_mvs.algorithms.two_view.verification import verify_pose
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
@@ -43,14 +44,15 @@ class Pairs:
         geometries: (i, j), i < j, to the geometries of the pair, the heaviest first.
         estimator: how translation scale factors are estimated from the ratios of single features.
         kappa: the paper's κ.
-        compared: pairs (i, j), i < j, whose images a matcher has compared, with or without success; None: all.
+        compared: (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without
+            success; None: all, without matches.
     """
 
     features: Mapping[str, Features]
     geometries: Mapping[Edge, tuple[Geometry, ...]]
     estimator: ScaleEstimator = "cauchy"
     kappa: float = 0.01
-    compared: frozenset[Edge] | None = None
+    compared: Mapping[Edge, TwoView] | None = None
     names: tuple[str, ...] = field(init=False)
     bearings: tuple[FloatArray, ...] = field(init=False)
     partners: tuple[tuple[int, ...], ...] = field(init=False)
@@ -100,9 +102,7 @@ def pairs_of(
         (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
         for (a, b), view in consistent_edges(names, two_views).items()
     }
-    position = {name: idx for idx, name in enumerate(names)}
-    edges = (sorted((position[first], position[second])) for first, second in two_views)
-    return Pairs(features, geometries, estimator, kappa, frozenset((first, second) for first, second in edges))
+    return Pairs(features, geometries, estimator, kappa, views_by_position(names, two_views))
 
 
 @dataclass(eq=False)
@@ -279,6 +279,24 @@ class PlacedModel:
             agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
             for idx in np.flatnonzero(agrees):
                 self.chosen.setdefault(_edge(image, int(evidence.partner[idx])), int(evidence.rank[idx]))
+
+    def verify_again(self) -> None:
+        """Verify pairs of registered images that no geometry explains again, by the relative poses of their cameras.
+
+        Given the pose, fewer matches are more than chance than in a search for it (see `verify_pose`).
+        """
+        self.choose_again()
+        found = dict(self.pairs.geometries)
+        for edge, view in (self.pairs.compared or {}).items():
+            if edge in self.chosen or not self.cameras.keys() >= {*edge} or not len(view.all_matches_idx):
+                continue
+            first, second = (self.pairs.features[self.pairs.names[image]] for image in edge)
+            pose = self.cameras[edge[1]] @ self.cameras[edge[0]].inverse()
+            again = verify_pose(first, second, view.all_matches_idx, pose=pose, rng=np.random.default_rng(0))
+            if again:
+                found[edge] = (*found.get(edge, ()), *geometries_of(again, first.bearings, second.bearings))
+        self.pairs = replace(self.pairs, geometries=found)
+        self.choose_again()
 
     def learn_ranges(self) -> None:
         """Compute the ranges of all matches of the chosen geometries again."""

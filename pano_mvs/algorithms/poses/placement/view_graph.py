@@ -30,7 +30,7 @@ def consistent_edges(
     Returns:
         (first, second) positions in `names`, first < second, to the geometry second_from_first.
     """
-    edges = _edges_by_position(names, two_views)
+    edges = {edge: view for edge, view in views_by_position(names, two_views).items() if view}
     keys = list(edges)
     triangles = _triangles(keys)
     closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(max_loop_deg)
@@ -74,11 +74,12 @@ def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rig
     return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
 
 
-def _edges_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:
+def views_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:
+    """Return all pairs, verified or not, by positions (first, second), first < second, as second_from_first."""
     position = {name: idx for idx, name in enumerate(names)}
     edges: dict[Edge, TwoView] = {}
     for (first, second), view in two_views.items():
-        if view and first in position and second in position:
+        if first in position and second in position:
             edge = position[first], position[second]
             edges[min(edge), max(edge)] = view if edge[0] < edge[1] else _reversed(view)
     return dict(sorted(edges.items()))
@@ -87,7 +88,10 @@ def _edges_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str
 def _reversed(view: TwoView) -> TwoView:
     inverse = Rigid3(view.rotation, view.direction).inverse()
     matches: NDArray[np.int32] = view.matches_idx[:, ::-1]
-    best = replace(view, matches_idx=matches, rotation=inverse.rotation, direction=inverse.translation)
+    others = None if view.unverified_idx is None else view.unverified_idx[:, ::-1]
+    best = replace(
+        view, matches_idx=matches, rotation=inverse.rotation, direction=inverse.translation, unverified_idx=others
+    )
     return best.with_alternatives([_reversed(other) for other in view.alternatives])
 
 

@@ -7,12 +7,15 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.joints import joint_doubts
+from pano_mvs.algorithms.two_view.verification import MIN_MATCHES
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -77,7 +80,8 @@ def _verified(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    return with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation, given=not correct)
+    checked = with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation, given=not correct)
+    return with_unconfirmed_doubts(checked, features, inside)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -114,6 +118,48 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
         expected_shares=of_each(checks.expected) if checks.asked else None,
         doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )
+
+
+def with_unconfirmed_doubts(
+    poses: Poses, features: Mapping[str, Features], two_views: Mapping[tuple[str, str], TwoView]
+) -> Poses:
+    """Return poses of one group with doubts about cameras that learned matches with a single image place.
+
+    Networks also match equal doors, posters and windows of different rooms, and a false pair looks as good as a true
+    one. If removing a pair without enough matches of its own detector divides the group, no third image confirms the
+    pair; the smaller part is doubtful, or both parts of equal size.
+
+    Args:
+        poses: the poses.
+        features: key points by image name.
+        two_views: verified pairs of the group.
+    """
+    position = {name: idx for idx, name in enumerate(poses.names)}
+    pairs = [pair for pair, view in two_views.items() if view and {*pair} <= {*position}]
+    doubts = dict(poses.doubts)
+    for pair in pairs:
+        if not _rests_on_learned(two_views[pair], features[pair[0]], features[pair[1]]):
+            continue
+        edges = np.array([[position[name] for name in other] for other in pairs if other != pair]).reshape(-1, 2)
+        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(position),) * 2)
+        part = connected_components(links, directed=False)[1]
+        sides = [np.flatnonzero(part == part[position[name]]) for name in pair]
+        if part[position[pair[0]]] == part[position[pair[1]]]:
+            continue
+        fewest = min(map(len, sides))
+        for side, other in zip(sides, reversed(pair), strict=True):
+            for idx in side if len(side) == fewest else ():
+                reason = f"only learned matches with {other} place it, and no third image confirms them"
+                name = poses.names[idx]
+                doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
+    return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})
+
+
+def _rests_on_learned(view: TwoView, first: Features, second: Features) -> bool:
+    """Return whether a pair has learned matches, and too few others to verify it."""
+    own = np.array([len(first) - first.learned, len(second) - second.learned])
+    others = int((view.matches_idx < own).all(axis=1).sum())
+    return others < min(MIN_MATCHES, len(view.matches_idx))
 
 
 def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> Poses:

@@ -17,9 +17,8 @@ from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import CostWindow, box_mean
 from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_from_ray, ray_grid, sample_panorama
-
-FloatArray = NDArray[np.float64]
 
 
 def find_winners(work: SweepInput) -> Winners:

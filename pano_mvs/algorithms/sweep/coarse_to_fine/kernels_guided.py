@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
@@ -17,13 +16,14 @@ from pano_mvs.algorithms.sweep.numba.kernels_lookup import sample_row, vote_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I64, Guide, Lookup, Sweep
 from pano_mvs.algorithms.sweep.numba.kernels_source_cost import silence, source_cost, store_row
 from pano_mvs.algorithms.sweep.numba.kernels_warp import place_row
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import fast_azimuth, fast_dip
 
 _F = np.float32
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def inverse_row(guide: F32, shift: int, table: F32, per_plane: int, inverse: F32) -> None:
     """Look up the inverse ranges at `guide + shift`.
 
@@ -46,7 +46,7 @@ def inverse_row(guide: F32, shift: int, table: F32, per_plane: int, inverse: F32
         inverse[i] = before + (place - _F(entry)) * (after - before)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def project_guided_row(
     sin_cos_azimuth: F32, matrix: F32, offset: F32, translation: F32, inverse: F32, shape: I64, x_px: F32, y_px: F32
 ) -> None:
@@ -76,7 +76,7 @@ def project_guided_row(
         y_px[i] = fast_dip(y, np.sqrt(x * x + z * z)) * y_scale + y_middle
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift: int, found: Lookup) -> None:
     """Look up the rows `first` …, `shift` planes beyond the guide, in one source.
 
@@ -116,7 +116,7 @@ def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift:
         vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any]) -> None:
     """Compute the costs of one band at some planes on either side of the guide.
 

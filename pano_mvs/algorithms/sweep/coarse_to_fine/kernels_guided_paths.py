@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I16, U8, U16
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
@@ -53,7 +53,7 @@ class Front(NamedTuple):
     guides: I16
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _link(guides: I16, row: int, column: int, first: int, lines: int, before: I16, now: I16, barred: U16) -> None:
     """Find which guides of the pixels before are one surface with which of these; see `_step`."""
     layers = guides.shape[1]
@@ -66,7 +66,7 @@ def _link(guides: I16, row: int, column: int, first: int, lines: int, before: I1
                 barred[a, b, k] = _BARRED if abs(gap) > _ONE_SURFACE else _OPEN
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _near_steps(before: U16, p1: np.uint16, first: int, lines: int, nearby: U16) -> None:
     """Compute what each candidate would inherit along its own guide: from the same offset or, for P1, from the next."""
     layers, padded = before.shape[:2]
@@ -80,7 +80,7 @@ def _near_steps(before: U16, p1: np.uint16, first: int, lines: int, nearby: U16)
                 nearby[b, d, k] = stay if stay < near else near
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _step(
     costs: Costs,
     place: tuple[int, int],
@@ -117,7 +117,7 @@ def _step(
                     total[row, voxel, column + k] = _H(total[row, voxel, column + k] + paths[a, d + _U(1), first + k])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def follow_guided_strip(
     volume: U8,
     total: U16,
@@ -169,7 +169,7 @@ def follow_guided_strip(
             _step(costs, (row, 0), (direct, lines - direct), fronts[0], fronts[1], nearby, barred, i >= 0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def follow_guided_rows(
     volume: U8, total: U16, guides: I16, penalties: U16, p1: np.uint16, first: int, lines: int, warm: int
 ) -> None:
@@ -205,7 +205,7 @@ def follow_guided_rows(
                 total[first + j, d, x] = _H(total[first + j, d, x] + sums[x, d, j])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def cheapest_candidates(total: NDArray[Any], guides: F32, first: int, planes: int, position: F32, costs: F32) -> None:
     """Find the cheapest candidate of each pixel of some rows, and what is around it.
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _INFINITE = np.float32(np.inf)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _means(positions: F32, y: int, x: int, side: int, middle: float, layers: F32) -> None:
     """Write the means of what is nearer than `middle` around a pixel and of the rest; the same if nothing is nearer."""
     below = above = _F(0)
@@ -28,7 +28,7 @@ def _means(positions: F32, y: int, x: int, side: int, middle: float, layers: F32
     layers[0, y, x] = below / _F(count) if count else layers[1, y, x]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def split_layers(positions: F32, radius: int, least_gap: float, layers: F32) -> None:
     """Separate the two surfaces around each pixel where they meet.
 
@@ -51,7 +51,7 @@ def split_layers(positions: F32, radius: int, least_gap: float, layers: F32) -> 
             _means(positions, y, x, side, middle, layers)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def adopt_candidates(found: F32, costs: F32, radius: int, least_gap: float, layer: F32) -> None:
     """Replace a guide around candidates that are cheaper, by the mean of those around that agree with the cheapest.
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
+from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 _H = np.uint16
 _HALF = np.uint16(128)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _add_weighted(weights: U16, costs: U8, first: int, total: U16) -> None:
     """Add weights times costs, from `first` on, to the total, all of a row."""
     start = _U(first)
@@ -20,7 +20,7 @@ def _add_weighted(weights: U16, costs: U8, first: int, total: U16) -> None:
         total[i] = _H(total[i] + _H(weights[i] * _H(costs[start + i])))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _average_row(costs: U8, columns: I64, weights: U16, row: int, padded: U8, total: U16, result: U8) -> None:
     """Average a row, (W,), around the sphere along itself; `padded` and `total` are scratch."""
     width = costs.shape[0]
@@ -35,7 +35,7 @@ def _average_row(costs: U8, columns: I64, weights: U16, row: int, padded: U8, to
         result[i] = np.uint8(total[i] >> _H(8))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _row_beyond(rows: U8, row: int, at_pole: bool, result: U8) -> None:
     """Write the row that follows beyond the first or last one: half a turn further on beyond a pole, else the same."""
     turn = rows.shape[1] // 2 if at_pole else 0
@@ -44,7 +44,7 @@ def _row_beyond(rows: U8, row: int, at_pole: bool, result: U8) -> None:
     result[width - turn :] = rows[row, :turn]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def average_planes(
     volume: U8, first: int, count: int, columns: I64, along: U16, across: U16, at_poles: tuple[bool, bool]
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.costs.kernels_constants import SAD
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
@@ -20,9 +19,10 @@ from pano_mvs.algorithms.sweep.numba.kernels_sad import (
 from pano_mvs.algorithms.sweep.numba.kernels_source_cost import silence, source_cost, store_row
 from pano_mvs.algorithms.sweep.numba.kernels_winner import PLANES_AT_ONCE, update_winners
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import PIXELS
+from pano_mvs.core.kernels import kernel
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, planes: I32) -> None:
     """Compute the costs of one band at all depth hypotheses, into the volume or straight into the winners.
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import CENSUS_PIXELS, HAS_VECTOR, census_block
+from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def count_census_row(
     reference: U8, reference_row: int, warped: U8, warped_row: int, offsets: I64, pad: int, disagree: U8
 ) -> None:

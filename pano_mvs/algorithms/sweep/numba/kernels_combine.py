@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, Combination
+from pano_mvs.core.kernels import inlined, kernel
 
 _F = np.float32
 _U = np.uint64
@@ -16,7 +16,7 @@ ENOUGH = 1 - 1e-5
 _FEW, _BLOCK = 8, 256
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, all_vote: bool, result: F32) -> None:
     """Combine the sources' costs of one row, infinite where a source is not valid.
 
@@ -61,12 +61,12 @@ def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, 
         result[i] = total / _F(used) if used else neutral
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _in_order(a: np.float32, b: np.float32) -> tuple[np.float32, np.float32]:
     return (a, b) if a < b else (b, a)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _mean_of_cheapest(
     held: NDArray[np.float32], share: float, most: int, neutral: np.float32, result: NDArray[np.float32]
 ) -> None:
@@ -112,7 +112,7 @@ def _mean_of_cheapest(
         result[i] = total / _F(used) if used > 0.5 else neutral
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _combine_few(costs: F32, row: int, share: float, most: int, neutral: np.float32, result: F32) -> None:
     """Do what `combine_row` does for up to eight sources without weights, of which at most four count."""
     held = np.full(_FEW * _BLOCK, np.inf, np.float32)
@@ -125,7 +125,7 @@ def _combine_few(costs: F32, row: int, share: float, most: int, neutral: np.floa
         _mean_of_cheapest(held, share, most, neutral, result[first : first + count])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sort_sources(costs: F32, row: int) -> None:
     """Sort the costs of one row over the sources, each pixel on its own."""
     for last in range(costs.shape[0] - 1, 0, -1):
@@ -137,7 +137,7 @@ def _sort_sources(costs: F32, row: int) -> None:
                 costs[b, row, i] = q if p < q else p
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _mean_of_first(costs: F32, row: int, used: int, result: F32) -> None:
     result[:] = _F(0)
     for k in range(used):
@@ -147,7 +147,7 @@ def _mean_of_first(costs: F32, row: int, used: int, result: F32) -> None:
         result[i] /= _F(used)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _combine_weighted(costs: F32, y: int, combination: Combination, picture_row: int, result: F32) -> None:
     weights, share, most = combination.weights, combination.share, combination.max_count
     sources = costs.shape[0]

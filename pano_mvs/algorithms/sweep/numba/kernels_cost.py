@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def census_row(
     reference: U8, reference_row: int, warped: U8, warped_row: int, offsets: I64, pad: int, disagree: U8
 ) -> None:
@@ -44,7 +44,7 @@ def census_row(
                 disagree[i] = np.uint8(disagree[i] + np.uint8(differs))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: int, pad: int, total: U16) -> None:
     """Add |reference − warped| of one row of one colour to `total`, (W,) uint16."""
     r, w, first = _U(reference_row), _U(warped_row), _U(pad)
@@ -53,7 +53,7 @@ def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: in
         total[i] = np.uint16(total[i] + np.uint16(abs(difference)))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def average_row(column_sums: I32, reach: int, pad: int, share: np.float32, scratch: I32, means: F32) -> None:
     """Write sums of 2 reach + 1 neighbouring columns, times `share`; see `box_rows`."""
     sums, first = column_sums, _U(pad - reach)
@@ -83,7 +83,7 @@ def average_row(column_sums: I32, reach: int, pad: int, share: np.float32, scrat
         means[i] = _F(np.int32(scratch[right + i] - scratch[left - _U(1) + i])) * share
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I32, prefix: I32, means: F32) -> None:
     """Average costs over windows of 2 radius + 1 rows by 2 reach + 1 columns, in O(1) each.
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.costs.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
+from pano_mvs.core.kernels import inlined, kernel
 
 _I = np.int16
 _U = np.uint64
 _LARGEST_LEVEL, _LARGEST_GRADIENT = _I(MAX_COLOR_COST // 3), _I(MAX_GRADIENT_COST // 3)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def gradient_row(
     reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
 ) -> None:
@@ -35,7 +35,7 @@ def gradient_row(
         total[i] = np.uint16(np.int32(total[i]) + abs(across) + abs(down))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sad_gradient_row(
     reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
 ) -> None:
@@ -60,7 +60,7 @@ def sad_gradient_row(
         total[i] = np.uint16(color + min(np.int32(gradient[i]), np.int32(MAX_GRADIENT_COST)))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def census_gradient_row(
     reference: U8,
     reference_row: int,
@@ -105,6 +105,6 @@ def census_gradient_row(
         total[i] = np.uint16(census + np.uint16(np.uint16(GREY_WEIGHT) * np.uint16(grey)))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _step(a: np.uint8, b: np.uint8) -> np.int16:
     return _I(_I(a) - _I(b))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_project import (
     EVERY,
@@ -18,12 +17,13 @@ from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U
 from pano_mvs.algorithms.sweep.numba.kernels_sad import add_sampled_differences
 from pano_mvs.algorithms.sweep.numba.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, blend_grey_block, sample_rgb_block
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sample_planes(
     packed: U32,
     starts: I64,
@@ -48,7 +48,7 @@ def _sample_planes(
             blend_row(patches, weight_x, weight_y, flat, at)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _blend_blocks(patches: U32, weight_y: I32, weight_x: I32, out: U8, out_at: int) -> None:
     """Do what `blend_row` does; the last block overlaps the one before it."""
     if HAS_VECTOR:  # a constant: without it the block is not compiled, which is impossible on other processors
@@ -59,7 +59,7 @@ def _blend_blocks(patches: U32, weight_y: I32, weight_x: I32, out: U8, out_at: i
         blend_grey_block(patches, weight_y, weight_x, _U(last), out, _U(out_at + last))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _sample_rgb(
     colors: U64, start: int, index: I32, weight_y: I32, weight_x: I32, warped: U8, row: int, pad: int
 ) -> None:
@@ -76,7 +76,7 @@ def _sample_rgb(
         sample_rgb_block(colors, base, index, weight_y, weight_x, _U(last), flat, _U(out_at + last), step)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def warp_band(
     first: int,
     height: int,
@@ -137,7 +137,7 @@ def warp_band(
         vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sample_row(
     packed: U32,
     colors: U64,
@@ -174,7 +174,7 @@ def sample_row(
         wrap_row(warped[c, row], index.shape[0], pad)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def vote_row(valid: U8, start: int, first_masked: int, after_masked: int, index: I32, votes: U8, row: int) -> None:
     """Write whether the patches at `index`, (W,), are valid to a row of `votes`; nothing if all of the source's are.
 

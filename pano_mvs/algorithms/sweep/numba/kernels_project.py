@@ -9,10 +9,10 @@ rolled picture then has the same positions, and the inner loops have no border.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, F64, I64, U8
 from pano_mvs.algorithms.sweep.numba.kernels_warp import project_row
+from pano_mvs.core.kernels import inlined, kernel
 
 _F = np.float32
 _U = np.uint64
@@ -26,7 +26,7 @@ _MAX_THIRD_PX = _F(1)
 _LOWEST_PICTURE = 128
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def ray_row(y: int, height: int, pose: F64, virtual_range: float, matrix: F32, offset: F32) -> None:
     """Compute what takes (sin θ, cos θ) of row y, which may lie beyond a pole, into the source; see `project_row`."""
     elevation = np.pi * (0.5 - (y + 0.5) / height)
@@ -37,7 +37,7 @@ def ray_row(y: int, height: int, pose: F64, virtual_range: float, matrix: F32, o
         offset[a] = _F(dip * pose[a, 1] + pose[a, 3] / virtual_range)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+@inlined
 def _across(step: np.float32, turn: np.float32) -> np.float32:
     """Return a difference of columns the short way around."""
     half = _F(turn * _F(0.5))
@@ -45,7 +45,7 @@ def _across(step: np.float32, turn: np.float32) -> np.float32:
     return step + turn if step < -half else step
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fit_group(knots: F32, first: int, height: int, turn: np.float32, curve: F32, rough: U8) -> None:
     """Fit cubics through the exact rows `first` to `first` + 3, and see where they are too bent for that.
 
@@ -77,7 +77,7 @@ def fit_group(knots: F32, first: int, height: int, turn: np.float32, curve: F32,
         rough[i] = np.uint8((abs(curve[0, 2, i]) > largest) | (abs(curve[1, 2, i]) > largest))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def rough_runs(rough: U8, runs: I64) -> int:
     """Write the runs of blocks of columns that need exact positions, (·, 2) int64 start and stop; return how many."""
     width = rough.shape[0]
@@ -97,7 +97,7 @@ def rough_runs(rough: U8, runs: I64) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def replace_rough(rough: U8, exact: F32, start: int, stop: int, x_px: F32, y_px: F32) -> None:
     """Take the exact positions, (2, W), of the rough columns, and of no others: blocks must not show in the result."""
     for i in range(_U(start), _U(stop)):
@@ -105,7 +105,7 @@ def replace_rough(rough: U8, exact: F32, start: int, stop: int, x_px: F32, y_px:
         y_px[i] = exact[1, i] if rough[i] else y_px[i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def follow_curve(knots: F32, first: int, curve: F32, step: float, x_px: F32, y_px: F32) -> None:
     """Evaluate the cubics `step` exact rows after `first`, at most 3; writes x_px and y_px, (W,) float32."""
     k = _U(first)
@@ -118,13 +118,13 @@ def follow_curve(knots: F32, first: int, curve: F32, step: float, x_px: F32, y_p
         y_px[i] = knots[1, k, i] + t * curve[1, 0, i] + u * curve[1, 1, i] + v * curve[1, 2, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def knot_rows(rows: int) -> int:
     """Return how many exact rows a band of `rows` needs; at least four."""
     return max(-(-(rows - 1) // EVERY) + 1, 4)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def project_knots(
     first: int, height: int, sin_cos_azimuth: F32, pose: F64, virtual_range: float, shape: I64, knots: F32
 ) -> None:

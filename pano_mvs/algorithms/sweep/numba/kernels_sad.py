@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_combine import ENOUGH
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16, U32, U64, Combination
 from pano_mvs.algorithms.sweep.numba.kernels_warp import wrap_row
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, difference_rgb_block
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
 _MAX_DIFFERENCE = 3 * 255
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def one_box_serves(sources: int, combination: Combination, box_radius: int, pad: int) -> bool:
     """Return whether the mean of all sources counts, whose differences can then be added before they are averaged.
 
@@ -28,7 +28,7 @@ def one_box_serves(sources: int, combination: Combination, box_radius: int, pad:
     return len(combination.weights) == 0 and used == sources and fits
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def interleave_rows(reference: U8, first: int, rows: int, pad: int) -> U32:
     """Return rows `first` … of (3, H + 2 pad, W + 2 pad) uint8, without the margin, as R | G << 8 | B << 16."""
     width = reference.shape[2] - 2 * pad
@@ -40,7 +40,7 @@ def interleave_rows(reference: U8, first: int, rows: int, pad: int) -> U32:
     return pixels
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_sampled_differences(
     colors: U64,
     start: int,
@@ -74,7 +74,7 @@ def add_sampled_differences(
             )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_differences(reference: U8, first: int, warped: U8, pad: int, pixel_costs: U16) -> None:
     """Add what a warped source, (C, rows, W + 2 pad) uint8, differs by from the reference's rows `first` …."""
     width = pixel_costs.shape[1] - 2 * pad
@@ -83,7 +83,7 @@ def add_differences(reference: U8, first: int, warped: U8, pad: int, pixel_costs
             difference_row(reference[c], first + j, warped[c], j, pad, pixel_costs[j, pad : pad + width])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def average_differences(pixel_costs: U16, reach: I64, radius: int, pad: int, scratch: I32, means: F32) -> None:
     """Average costs over the box; the margins of `pixel_costs` are written first. See `box_rows`."""
     for j in range(pixel_costs.shape[0]):
@@ -96,7 +96,7 @@ def average_differences(pixel_costs: U16, reach: I64, radius: int, pad: int, scr
             means[j, i] = _F(pixel_costs[j, _U(pad) + i])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def divide_row(sums: F32, count: int, result: F32) -> None:
     """Write sums / count, both (W,) float32."""
     for i in range(_U(result.shape[0])):

@@ -13,11 +13,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, step_lines
+from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 _H = np.uint16
@@ -28,7 +28,7 @@ DRIFTS = (0, 1, -1)
 """Columns by which the paths of each direction move in a step."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def look_up_penalties(channels: U8, table: U16, steps: I64, first: int, penalties: U16) -> None:
     """Do what `penalties.step_penalties` does for several directions.
 
@@ -99,7 +99,7 @@ class Sums(NamedTuple):
     first_after: int
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def step_plain(
     costs: PathCosts,
     place: tuple[int, int],
@@ -160,7 +160,7 @@ def step_plain(
         least[way, first + k] = scratch[1, k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _step_vector(
     costs: PathCosts,
     place: tuple[int, int],
@@ -208,7 +208,7 @@ def _step_vector(
             step_lines(volume, voxels, p1, penalties, one_pixel, state, least, one_at, counted, sums.before, sums.after)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _step_row(
     costs: PathCosts,
     row: int,
@@ -240,7 +240,7 @@ def _step_row(
         done += lines
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _take_front(front: Front, column: int, lines: int, state: U16, least: U16) -> None:
     """Copy where the paths have come to in some columns, which may go around the seam several times."""
     depth, width = front.paths.shape[1:]
@@ -261,7 +261,7 @@ def state_columns(strip: int, steps: int) -> int:
     return strip + 2 * steps + 2 * LINES
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def follow_block(
     costs: PathCosts,
     front: Front,

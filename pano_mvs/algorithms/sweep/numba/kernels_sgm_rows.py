@@ -7,12 +7,12 @@ second time, it is followed only until it carries what it did the first time: fr
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_planes import SIDE, step_planes, turn_bytes, turn_sums
+from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 _H = np.uint16
@@ -21,7 +21,7 @@ _BLOCK = 32  # columns of which all planes fit the nearest cache
 _COMPARED = 8  # after how many pixels it is tried whether a path carries what it did before
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _turn_row(volume: U8, y: int, costs: U8) -> None:
     """Write row y of a volume, (H, D, W), pixel by pixel, into (W, P)."""
     _, depth, width = volume.shape
@@ -43,7 +43,7 @@ def _turn_row(volume: U8, y: int, costs: U8) -> None:
                 costs[x, d] = volume[row, d, x]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _turn_sums(paths: U16, sums: U16, y: int) -> None:
     """Write the sum of both directions, (2, W + 2, P), into row y of (·, D, W or more)."""
     depth, step = sums.shape[1:]
@@ -66,7 +66,7 @@ def _turn_sums(paths: U16, sums: U16, y: int) -> None:
                 sums[row, d, x] = _H(paths[0, x, d] + paths[1, x, d])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def step_pixel(
     costs: U8,
     paths: U16,
@@ -120,7 +120,7 @@ def step_pixel(
     return least
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _close_circle(
     costs: U8,
     paths: U16,
@@ -139,7 +139,8 @@ def _close_circle(
         now = width - 1 - i if way == 1 else i
         compared = i % _COMPARED == _COMPARED - 1
         if compared:
-            earlier[:] = paths[way, now]
+            for d in range(_U(len(earlier))):
+                earlier[d] = paths[_U(way), _U(now), d]
         floor = step_pixel(costs, paths, way, before, now, penalties[now], floor, p1, barred, scratch)
         if compared:
             different = 0
@@ -150,7 +151,7 @@ def _close_circle(
         before = now
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def follow_rows(volume: U8, penalties: U16, p1: np.uint16, rows: tuple[int, int], sums: U16, first_sums: int) -> None:
     """Follow both paths of some rows around the sphere and write the sum of their costs.
 
@@ -171,7 +172,8 @@ def follow_rows(volume: U8, penalties: U16, p1: np.uint16, rows: tuple[int, int]
     scratch = np.full((2, depth + 2), _OUTSIDE, np.uint16)
     for y in range(rows[0], rows[0] + rows[1]):
         _turn_row(volume, y, costs)
-        paths[:, width] = barred
+        for d in range(_U(padded)):
+            paths[0, width, d] = paths[1, width, d] = barred[d]
         scratch[:, 1 : depth + 1] = 0
         right, left = penalties[0, y], penalties[1, y]
         floor_right, floor_left = _H(0), _H(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.costs.kernels_constants import CENSUS, CENSUS_GRADIENT, SAD_GRADIENT, ZNCC
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
@@ -12,12 +11,13 @@ from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16, Sweep
 from pano_mvs.algorithms.sweep.numba.kernels_warp import wrap_row
 from pano_mvs.algorithms.sweep.numba.kernels_zncc import zncc_rows
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def pixel_cost_row(
     cost: int,
     census_weight: int,
@@ -60,7 +60,7 @@ def pixel_cost_row(
             difference_row(reference[c], reference_row, warped[c], warped_row, pad, total)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch: I32, means: F32) -> None:
     """Compare a band of the reference with a warped source and average over the box.
 
@@ -97,7 +97,7 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
             means[j, i] = _F(pixel_costs[j, _U(pad) + i])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def silence(votes: U8, halo: int, costs: F32) -> None:
     """Make costs, (rows, W), infinite where a source is not valid; `votes` has `halo` rows more on either side."""
     for j in range(costs.shape[0]):
@@ -105,7 +105,7 @@ def silence(votes: U8, halo: int, costs: F32) -> None:
             costs[_U(j), i] = costs[_U(j), i] if votes[_U(j + halo), i] else _F(np.inf)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def store_row(costs: F32, scale: float, voxels: U8) -> None:
     """Bring costs to the scale of the volume, 0 to 255, rounded; (W,) float32 to (W,) uint8."""
     for i in range(_U(costs.shape[0])):

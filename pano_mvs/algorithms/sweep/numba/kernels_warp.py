@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U32
+from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import fast_azimuth, fast_dip
 
 _F = np.float32
@@ -24,7 +24,7 @@ UNIT, HALFWAY_SHIFT, SHIFT = 16384, 6, 22
 HALFWAY_ROUND, ROUND = 1 << (HALFWAY_SHIFT - 1), 1 << (SHIFT - 1)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def project_row(
     sin_cos_azimuth: F32, matrix: F32, offset: F32, shape: I64, start: int, stop: int, x_px: F32, y_px: F32
 ) -> None:
@@ -54,7 +54,7 @@ def project_row(
         y_px[i] = fast_dip(y, np.sqrt(x * x + z * z)) * y_scale + y_middle
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def place_row(x_px: F32, y_px: F32, shape: I64, index: I32, weight_x: I32, weight_y: I32) -> None:
     """Turn positions among packed patches into an index and integer weights.
 
@@ -83,7 +83,7 @@ def place_row(x_px: F32, y_px: F32, shape: I64, index: I32, weight_x: I32, weigh
         weight_y[i] = np.int32(np.int32(UNIT) + lower * np.int32(65535))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def gather_row(packed: U32, start: int, index: I32, patches: U32) -> None:
     """Fetch the 2×2 patches, packed as four bytes, at `start + index`; all (W,) but `packed`."""
     base = _U(start)
@@ -91,7 +91,7 @@ def gather_row(packed: U32, start: int, index: I32, patches: U32) -> None:
         patches[i] = packed[base + _U(index[i])]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def blend_row(patches: U32, weight_x: I32, weight_y: I32, out: U8, out_at: int) -> None:
     """Blend 2×2 patches bilinearly into `out[out_at:out_at + W]`, uint8, rounded.
 
@@ -114,7 +114,7 @@ def blend_row(patches: U32, weight_x: I32, weight_y: I32, out: U8, out_at: int) 
         out[_U(out_at) + i] = np.uint8(blended + np.int32(128))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def wrap_row(row: NDArray[Any], width: int, pad: int) -> None:
     """Fill the `pad` entries on either side of `row[pad:pad + width]` over the seam."""
     for i in range(pad):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import U16
@@ -21,6 +20,7 @@ from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_winner import (
     STATES,
     take_planes,
 )
+from pano_mvs.core.kernels import kernel
 
 __all__ = [
     "AFTER",
@@ -40,7 +40,7 @@ PLANES_AT_ONCE = 8
 """After how many planes the running state, larger than a band's costs, is best brought up to date."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update_plain(
     costs: NDArray[Any],
     start: int,
@@ -91,7 +91,7 @@ def update_plain(
             state[EARLIER, row, i] = earlier
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def update_winners(
     costs: NDArray[Any], start: int, count: int, plane: int, state: NDArray[Any], y: int, planes: NDArray[Any]
 ) -> None:
@@ -117,7 +117,7 @@ def update_winners(
     update_plain(costs, start, count, plane, state, y, planes, whole)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def winners_of_rows(total: U16, first: int, state: U16, planes: U16) -> None:
     """Find the winners of some rows of a volume.
 

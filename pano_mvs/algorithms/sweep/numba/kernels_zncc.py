@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
+from pano_mvs.core.kernels import kernel
 
 _F = np.float32
 _U = np.uint64
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def zncc_rows(
     first: int, reference: U8, warped: U8, reach: I64, radius: int, pad: int, products: U16, scratch: I32, means: F32
 ) -> None:
@@ -39,9 +39,9 @@ def zncc_rows(
     for k in range(3):
         _multiply(pairs[k][0], pairs[k][1], products)
         box_rows(products, reach, radius, pad, scratch[0], scratch[1], sums[k])
-    products[:] = ours
+    _copy(ours, products)
     box_rows(products, reach, radius, pad, scratch[0], scratch[1], sums[3])
-    products[:] = warped
+    _copy(warped, products)
     box_rows(products, reach, radius, pad, scratch[0], scratch[1], means)
     noise = _F(ZNCC_NOISE_VARIANCE)
     for y in range(_U(rows)):
@@ -52,7 +52,14 @@ def zncc_rows(
             means[y, i] = _F(1) - min(max(rho, _F(-1)), _F(1))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
+def _copy(one: U8, products: U16) -> None:
+    for j in range(_U(products.shape[0])):
+        for i in range(_U(products.shape[1])):
+            products[j, i] = np.uint16(one[j, i])
+
+
+@kernel
 def _multiply(one: U8, other: U8, products: U16) -> None:
     for j in range(_U(products.shape[0])):
         for i in range(_U(products.shape[1])):

@@ -211,3 +211,54 @@ def test_points_without_level_surfaces_have_no_layers(count: int) -> None:
         layers = sharpest_up(points, np.zeros((3, 3)), UP)
         assert not layers
         np.testing.assert_array_equal(layers.up, UP)
+
+
+def place(*, ceiling: int, floor: int, textured: bool) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A panorama whose upper and lower half have a grey level each; the lower half may have texture."""
+    picture = np.full((128, 256, 3), ceiling, np.uint8)
+    noise = np.random.default_rng(0).normal(0, 30 if textured else 0, (64, 256, 1))
+    picture[64:] = np.clip(floor + noise, 0, 255)
+    return picture, np.ones(picture.shape[:2], np.bool_)
+
+
+def above_a_floor(cameras: int = 4) -> Poses:
+    """Upright cameras above a floor of sparse points, without a ceiling."""
+    poses = capture_poses(cameras, seed=0, tilt_deg=0.0)
+    points = np.random.default_rng(1).uniform((-2, FLOOR_Y, -2), (2, FLOOR_Y, 2), (200, 3))
+    return with_points(poses, points)
+
+
+@pytest.mark.parametrize(("ceiling", "floor", "textured"), [(220, 120, True), (120, 120, True), (30, 200, True)])
+def test_upright_captures_stay_upright(ceiling: int, floor: int, textured: bool) -> None:
+    poses = above_a_floor()
+    pictures = {name: lambda: place(ceiling=ceiling, floor=floor, textured=textured) for name in poses.names}
+    vertical = find_vertical(poses, pictures=pictures)
+    assert vertical.upside_down < 0.01
+    assert angle_deg(vertical.up_in_world, UP) < 1
+
+
+def turned_over(poses: Poses) -> Poses:
+    """The same cameras, held upside down, in the same world."""
+    over = np.diag([-1.0, -1.0, 1.0])
+    return replace(poses, rotations=over @ poses.rotations, translations=poses.translations @ over.T)
+
+
+def test_a_capture_that_is_upside_down_is_turned_around() -> None:
+    poses = turned_over(above_a_floor())
+    picture, valid = place(ceiling=220, floor=120, textured=True)
+    pictures = {name: lambda: (np.ascontiguousarray(picture[::-1, ::-1]), valid) for name in poses.names}
+    vertical = find_vertical(poses, pictures=pictures)
+    assert vertical.upside_down > 0.8
+    assert angle_deg(vertical.up_in_world, UP) < 1
+    level, _ = level_poses(poses, pictures=pictures)
+    assert np.median(level.points_in_world[:, 1]) > 0  # the floor is below the cameras
+    kept = find_vertical(poses, pictures=pictures, evidence="cameras")
+    assert angle_deg(kept.up_in_world, -UP) < 1
+
+
+def test_sensors_are_believed_against_the_pictures() -> None:
+    poses = above_a_floor()
+    picture, valid = place(ceiling=220, floor=120, textured=True)
+    pictures = {name: lambda: (np.ascontiguousarray(picture[::-1, ::-1]), valid) for name in poses.names}
+    sensors = dict.fromkeys(poses.names, tuple(UP))
+    assert angle_deg(find_vertical(poses, sensors, pictures).up_in_world, UP) < 1

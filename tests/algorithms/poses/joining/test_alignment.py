@@ -1,4 +1,4 @@
-"""Poses from three points, errors of matches between models, and level relative poses."""
+"""Poses from three points, and errors of matches between models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, errors_and_residuals, match_errors, vector_of
-from pano_mvs.algorithms.poses.joining.level_pairs import level_from_world, level_poses
 from pano_mvs.algorithms.poses.joining.three_points import candidate_poses, poses_from_three
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle, rotation_from_rotvec
 
@@ -42,29 +41,6 @@ def test_finds_the_pose_among_mostly_false_matches() -> None:
     assert float(geodesic_angle(best.rotation, pose.rotation)) < 1e-3
     assert float(np.linalg.norm(best.center - pose.center)) < 0.01
     assert candidate_poses(points[:5], bearings[:5], rng=rng, threshold_rad=0.005) == []
-
-
-def test_level_images_need_few_true_matches() -> None:
-    rng = np.random.default_rng(6)
-    tilt = rotation_from_rotvec(np.deg2rad([0.7, 0, -0.5]))
-    pose = Rigid3(tilt @ rotation_from_rotvec((0.0, 2.1, 0.0)), _unit(np.array([0.9, 0.05, -0.4])))
-    points = 3 * rng.normal(size=(160, 3))
-    p, q = _unit(points), _unit(pose.apply(points))
-    q[20:] = q[20:][rng.permutation(140)]
-    best = level_poses(p, q, rng=rng, threshold_rad=0.005)[0]
-    assert float(geodesic_angle(best.rotation, pose.rotation)) < np.deg2rad(0.5)
-    assert float(angle_between(best.translation, pose.translation)) < np.deg2rad(2)
-    assert level_poses(p[:3], q[:3], rng=rng, threshold_rad=0.005) == []
-
-
-def test_cameras_that_are_not_upright_have_no_level() -> None:
-    heading = rotation_from_rotvec((0.0, 1.0, 0.0))
-    tilted = rotation_from_rotvec((0.3, 0.0, 0.0))
-    level = level_from_world([tilted, heading @ tilted])
-    assert level is not None
-    assert np.allclose(level @ (tilted.T @ (0, -1, 0)), (0, -1, 0))
-    assert level_from_world([np.eye(3), rotation_from_rotvec((1.0, 0.0, 0.0))]) is None
-    assert level_from_world([np.eye(3), rotation_from_rotvec((np.pi, 0.0, 0.0))]) is None
 
 
 def _drawn(count: int = 60) -> tuple[Similarity3, CrossMatches]:

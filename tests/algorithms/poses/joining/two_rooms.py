@@ -34,15 +34,16 @@ def room_poses(*, turned: bool = False) -> dict[str, Rigid3]:
     return poses
 
 
-def room_features(poses: dict[str, Rigid3], *, door: int, own: int = 220) -> dict[str, Features]:
+def room_features(poses: dict[str, Rigid3], *, door: int, own: int = 220, door_seed: int = 7) -> dict[str, Features]:
     """Return the key points of all cameras: those of the own room, and some of the other one seen through the door.
 
     Args:
         poses: cam_from_world by name.
         door: number of points of either room that the cameras of the other room see too.
         own: number of points of each room.
+        door_seed: of the points behind the door and of the descriptors.
     """
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(door_seed)
     points = np.concatenate([_room_points(rng, -2.0, own), _room_points(rng, 2.0, own)])
     through = np.concatenate([_door_points(rng, -3.0, door), _door_points(rng, 3.0, door)])
     descriptors = rng.integers(0, 120, (len(points) + len(through), 64)).astype(np.float32)
@@ -65,14 +66,12 @@ def room_features(poses: dict[str, Rigid3], *, door: int, own: int = 220) -> dic
     return features
 
 
-def verified_inside(features: dict[str, Features]) -> dict[tuple[str, str], TwoView]:
-    """Return the pairs of the capture, of which only those within a room have a geometry."""
+def matched(features: dict[str, Features]) -> dict[tuple[str, str], TwoView]:
+    """Return all pairs of the capture."""
     return {
         (a, b): verify_pair(
             features[a], features[b], match_features(features[a], features[b]), rng=np.random.default_rng(1)
         )
-        if a[0] == b[0]
-        else TwoView.failed("rooms apart", candidates=20)
         for a, b in combinations(features, 2)
     }
 

@@ -1,0 +1,1 @@
+"""Key points and matches by neural networks."""

@@ -1,0 +1,154 @@
+"""Key points of the network ALIKED on level views of a panorama (Zhao et al., "ALIKED", IEEE TIM 2023)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.sampling import sample_view
+from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, Array, Networks
+from pano_mvs.algorithms.learned.tiles import FOCAL_PX, level_tiles
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import PinholeView, pixel_from_ray
+from pano_mvs.scene import Features
+
+FloatArray = NDArray[np.float64]
+
+# Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
+_RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
+
+
+@checks_settings
+def extract_aliked(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    *,
+    up: FloatArray,
+    max_keypoints: MaxKeypoints = 3000,
+    threshold: Annotated[float, Setting("minimum score of a key point", ge=0, le=1)] = 0.01,
+    networks: Networks = PACKAGED,
+) -> Features:
+    """Extract the ALIKED key points of a panorama on six level views around the horizon.
+
+    Views are level because the descriptors do not tolerate a large roll. Key points that two views share are one. The
+    last digits of the network's results differ between processors, so descriptors are rounded.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        mask: (H, W) bool; masked (False) pixels have no key points.
+        up: (3,) direction of the zenith in the camera frame.
+        max_keypoints: maximum number of key points, spread evenly over the sphere.
+        threshold: minimum score.
+        networks: the network files and what executes them.
+
+    Raises:
+        UsageError: if a network file or the provider is missing.
+    """
+    tiles = level_tiles(up)
+    size_hw = (image.shape[0], image.shape[1])
+    found = []
+    for number, tile in enumerate(tiles):
+
+        def kept(pixels: FloatArray, number: int = number, tile: PinholeView = tile) -> NDArray[np.bool_]:
+            bearings = tile.bearings_from_pixels(pixels)
+            # Those nearer to the middle of another view are found there.
+            nearest = np.argmax([bearings @ other.view_from_cam[2] for other in tiles], axis=0)
+            return np.asarray(mask[_pixels_of(bearings, size_hw)] & (nearest == number))
+
+        one = described_tile(
+            sample_view(image, tile, interpolation=cv2.INTER_LINEAR), kept, threshold=threshold, networks=networks
+        )
+        bearings = tile.bearings_from_pixels(one.pixels_px)
+        found.append((bearings, one.descriptors, one.scores, image[_pixels_of(bearings, size_hw)]))
+    bearings, descriptors, scores, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    keep = distinct_keypoints(bearings, scores, radius_rad=_RADIUS_PX / FOCAL_PX / 2)
+    keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]
+    return Features(
+        bearings=bearings[keep],
+        descriptors=np.rint(DESCRIPTOR_NORM * descriptors[keep]).astype(np.float32),
+        sizes_rad=np.full(len(keep), 2 * _RADIUS_PX / FOCAL_PX, np.float32),
+        scores=scores[keep],
+        colors_rgb=colors[keep],
+        metric="l2",
+        size_hw=size_hw,
+        learned=len(keep),
+        up=(float(up[0]), float(up[1]), float(up[2])),
+    )
+
+
+class DescribedTile(NamedTuple):
+    """Key points of a square picture: pixels (N, 2), (0, 0) its corner; unit descriptors (N, 128); scores (N,)."""
+
+    pixels_px: FloatArray
+    descriptors: Array
+    scores: Array
+
+
+def described_tile(
+    picture: NDArray[np.uint8],
+    kept: Callable[[FloatArray], NDArray[np.bool_]],
+    *,
+    threshold: float,
+    networks: Networks,
+) -> DescribedTile:
+    """Return the key points of a picture of 512 × 512 pixels.
+
+    Args:
+        picture: (512, 512, 3) uint8 RGB.
+        kept: says which of the pixels (N, 2) of key points are described and returned.
+        threshold: minimum score.
+        networks: the network files and what executes them.
+    """
+    planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32)
+    score, *maps = networks.load("aliked_detector.onnx")(image=planes / np.float32(255))
+    pixels, scores = maxima_of_scores(score[0, 0], threshold)
+    keep = np.flatnonzero(kept(pixels + 0.5))
+    named = {f"features{level}": one for level, one in enumerate(maps)}
+    descriptors = networks.load("aliked_descriptor.onnx")(**named, pixels=pixels[keep].astype(np.float32))[0]
+    return DescribedTile(pixels[keep] + 0.5, descriptors, scores[keep])
+
+
+def joined(first: Features, learned: Features) -> Features:
+    """Return the key points of another detector followed by those of `extract_aliked`.
+
+    Raises:
+        UsageError: if the descriptors of the first are not 128 numbers, as those of SIFT are.
+    """
+    if first.metric != "l2" or first.descriptors.shape[1] != learned.descriptors.shape[1]:
+        raise UsageError("learned key points can only be added to those of features.sift_tangent")
+    names = ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
+    arrays = {name: np.concatenate([getattr(first, name), getattr(learned, name)]) for name in names}
+    return Features(**arrays, metric="l2", size_hw=first.size_hw, learned=len(learned), up=learned.up)
+
+
+def maxima_of_scores(score: Array, threshold: float) -> tuple[FloatArray, Array]:
+    """Return the pixels (N, 2), (0, 0) the first one's centre, and scores (N,) of a map's maxima, as DKD of ALIKED."""
+    around = np.ones((2 * _RADIUS_PX + 1, 2 * _RADIUS_PX + 1), np.uint8)
+    peaks = score == cv2.dilate(score, around)
+    # A maximum may also be lower than a neighbour that another maximum suppresses.
+    for _ in range(_ROUNDS):
+        suppressed = cv2.dilate(peaks.astype(np.uint8), around) > 0
+        rest = np.where(suppressed, np.float32(0), score)
+        peaks |= (rest == cv2.dilate(rest, around)) & ~suppressed
+    peaks &= score > threshold
+    peaks[:_RADIUS_PX] = peaks[-_RADIUS_PX:] = False
+    peaks[:, :_RADIUS_PX] = peaks[:, -_RADIUS_PX:] = False
+    y, x = np.nonzero(peaks)
+    offsets = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
+    patches = score[(y[:, None] + offsets)[:, :, None], (x[:, None] + offsets)[:, None, :]].astype(np.float64)
+    weights = np.exp((patches - patches.max(axis=(1, 2), keepdims=True)) / _TEMPERATURE)
+    weights /= weights.sum(axis=(1, 2), keepdims=True)
+    shift = np.stack([(weights * offsets).sum(axis=(1, 2)), (weights * offsets[:, None]).sum(axis=(1, 2))], axis=1)
+    return np.stack([x, y], axis=1) + shift, score[y, x]
+
+
+def _pixels_of(bearings: FloatArray, size_hw: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the row and the column of a panorama's pixels that show bearings (N, 3)."""
+    x, y = np.floor(pixel_from_ray(bearings, size_hw)).astype(np.intp).T
+    return np.minimum(y, size_hw[0] - 1), x % size_hw[1]

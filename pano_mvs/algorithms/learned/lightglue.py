@@ -1,0 +1,169 @@
+"""Matches of the network LightGlue between level views of two panoramas (Lindenberger et al., ICCV 2023).
+
+The network sees the key points of a view of either panorama: their descriptors and where they are. Layer by layer it
+compares them within a view and across; it stops once it is sure of nearly all, and drops those that cannot match.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
+from pano_mvs.algorithms.learned.tiles import COUNT, level_tiles
+from pano_mvs.algorithms.matching.brute_force import match_l2
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.scene import Features
+
+LAYERS = 9
+# Of the network, as published: shares of confident key points at which it stops, and of hopeless ones that it drops.
+_DEPTH_CONFIDENCE, _WIDTH_CONFIDENCE = 0.95, 0.99
+
+
+@checks_settings
+def match_learned(
+    first: Features,
+    second: Features,
+    *,
+    min_score: Annotated[float, Setting("minimum probability of a match", ge=0, le=1)] = 0.1,
+    max_views: Annotated[int, Setting("number of pairs of views that are compared, those most alike", ge=1, le=36)] = 5,
+    networks: Networks = PACKAGED,
+) -> NDArray[np.int32]:
+    """Match the ALIKED key points of two panoramas.
+
+    Args:
+        first: key points of the first image; only the learned ones are matched.
+        second: key points of the second image.
+        min_score: minimum probability of a match.
+        max_views: how many of the 36 pairs of views are compared, those with the most similar descriptors.
+        networks: the network files and what executes them.
+
+    Returns:
+        (M, 2) int32 positions in the first and second image, one to one, by ascending position in the first.
+
+    Raises:
+        UsageError: if both images have key points but no learned ones, or a network file or the provider is missing.
+    """
+    if len(first) and len(second) and not (first.learned or second.learned):
+        raise UsageError("matches.lightglue needs the key points of features.aliked: add that stage before it")
+    if min(first.learned, second.learned) < 2:
+        return np.zeros((0, 2), np.int32)
+    sides = [Side.of(features) for features in (first, second)]
+    glue = LightGlue(networks)
+    best: dict[tuple[int, int], float] = {}
+    for one, other in _alike(sides[0], sides[1], max_views):
+        (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
+        matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
+        for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
+            best[int(i), int(j)] = max(best.get((int(i), int(j)), 0.0), float(score))
+    return _one_to_one(best, offsets=[len(features) - features.learned for features in (first, second)])
+
+
+class LightGlue:
+    """The network, layer by layer."""
+
+    def __init__(self, networks: Networks) -> None:
+        """Load its files; see `Networks.load`."""
+        self._start, self._layer, self._end = (
+            networks.load(f"lightglue_{part}.onnx") for part in ("start", "layer", "end")
+        )
+
+    def match(
+        self, first: Sequence[Array], second: Sequence[Array], *, min_score: float
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return the matches (M, 2) of two views and their probabilities (M,).
+
+        Args:
+            first: unit descriptors (N, 128) and positions (N, 2), −1 … 1 from edge to edge, of the first view.
+            second: those of the second view.
+            min_score: minimum probability.
+        """
+        states = [self._start(descriptors=descriptors, positions=places) for descriptors, places in (first, second)]
+        kept = [np.arange(len(features)) for features, _ in states]
+        counts = [len(one) for one in kept]
+        matchable = [np.zeros(0, np.float32)] * 2
+        number = 0
+        for number in range(LAYERS):
+            if min(len(one) for one in kept) == 0:
+                return np.zeros((0, 2), np.intp), np.zeros(0, np.float32)
+            (one, one_encoding), (other, other_encoding) = states
+            *features, judged, judged_too = self._layer(
+                layer=np.array(number),
+                first=one,
+                second=other,
+                first_encoding=one_encoding,
+                second_encoding=other_encoding,
+            )
+            matchable = [judged[:, 1], judged_too[:, 1]]
+            states = [[features[0], one_encoding], [features[1], other_encoding]]
+            if number == LAYERS - 1:
+                break
+            sure = 0.8 + 0.1 * float(np.exp(-4.0 * number / LAYERS))
+            confident = [judged[:, 0] >= sure, judged_too[:, 0] >= sure]
+            dropped = sum(counts) - sum(len(one) for one in kept)
+            if dropped + sum(int(one.sum()) for one in confident) > _DEPTH_CONFIDENCE * sum(counts):
+                break
+            for side in (0, 1):
+                keep = np.flatnonzero((matchable[side] > 1 - _WIDTH_CONFIDENCE) | ~confident[side])
+                kept[side] = kept[side][keep]
+                states[side] = [states[side][0][keep], states[side][1][:, keep]]
+        chance = np.exp(self._end(layer=np.array(number), first=states[0][0], second=states[1][0])[0])
+        chance *= matchable[0][:, None] * matchable[1]
+        nearest = chance.argmax(axis=1)
+        score = chance[np.arange(len(chance)), nearest]
+        mutual = np.flatnonzero((chance.argmax(axis=0)[nearest] == np.arange(len(chance))) & (score > min_score))
+        return np.stack([kept[0][mutual], kept[1][nearest[mutual]]], axis=1), score[mutual]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """The learned key points of a panorama in its level views.
+
+    Attributes:
+        descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
+        places: (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them.
+    """
+
+    descriptors: Array
+    places: Array
+
+    @classmethod
+    def of(cls, features: Features) -> Side:
+        """Return the learned key points of a panorama."""
+        learned = slice(len(features) - features.learned, None)
+        tiles = level_tiles(np.array(features.up))
+        places = [tile.pixels_from_rays(features.bearings[learned]) / (TILE_PX / 2) - 1 for tile in tiles]
+        inside = [tile.contains((place + 1) * (TILE_PX / 2)) for tile, place in zip(tiles, places, strict=True)]
+        views = [np.where(seen[:, None], place, np.nan) for seen, place in zip(inside, places, strict=True)]
+        return cls(features.descriptors[learned].astype(np.float32), np.array(views, np.float32))
+
+    def inside(self, view: int) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return the key points in a view, their unit descriptors and their places in it."""
+        idx = np.flatnonzero(~np.isnan(self.places[view, :, 0]))
+        return idx, self.descriptors[idx] / np.float32(DESCRIPTOR_NORM), self.places[view, idx]
+
+
+def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
+    """Return the pairs of views with the most descriptors that are each other's nearest."""
+    nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
+    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
+    counts = seen[0].astype(np.int64) @ seen[1].astype(np.int64).T
+    order = np.argsort(-counts, axis=None, kind="stable")[:most]
+    return [(int(idx) // COUNT, int(idx) % COUNT) for idx in order]
+
+
+def _one_to_one(scores: dict[tuple[int, int], float], offsets: list[int]) -> NDArray[np.int32]:
+    """Return the most probable matches of which none share a key point."""
+    used: tuple[set[int], set[int]] = (set(), set())
+    chosen = []
+    for i, j in sorted(scores, key=lambda pair: (-scores[pair], pair)):
+        if i not in used[0] and j not in used[1]:
+            used[0].add(i)
+            used[1].add(j)
+            chosen.append((i + offsets[0], j + offsets[1]))
+    return np.array(sorted(chosen), np.int32).reshape(-1, 2)

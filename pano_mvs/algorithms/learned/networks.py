@@ -1,0 +1,145 @@
+"""The neural networks ALIKED and LightGlue as ONNX files, and their execution by ONNX Runtime.
+
+The files come with the package; `tools/export_networks.py` writes them. Another folder may hold files of the same names
+with the same inputs and outputs, for example with weights of one's own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.paths import is_file
+
+Provider: TypeAlias = Literal["cpu", "cuda", "coreml", "directml"]
+Array: TypeAlias = NDArray[np.float32]
+
+TILE_PX = 512
+"""Width and height of the pictures that the detector reads."""
+DESCRIPTOR_NORM = 512
+"""Length of stored descriptors, whose components are whole numbers as those of SIFT, so that products are exact."""
+
+# By the digests, other files mean other code, so that no result of the old ones is taken from a cache.
+DIGESTS: Mapping[str, str] = {
+    "aliked_detector.onnx": "15ed9b8558d2b2bc28a4a9fb75f0dca5e0b67c25cb2d94913f90bc7fdc1b6583",
+    "aliked_descriptor.onnx": "b3811721d037c420df9bb5c0a63bc670224989d0884d793b5a3b333626243b57",
+    "lightglue_start.onnx": "255a4061f4821ea1cf414c8928644035e0f5c90028ce1268c07b4dd2ce7be19a",
+    "lightglue_layer.onnx": "f937cacf2ac4f5d38d495bfbe6a420f7dc60408e020d4af2996ba4543816010d",
+    "lightglue_end.onnx": "03faf1bc8da5de44ea7bab0e8abdf3d309a43a84cce97a44c89831f57524897a",
+}
+_PACKAGED = Path(__file__).parent / "models"
+_PROVIDERS: Mapping[Provider, str] = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+}
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Where the networks are read from and what executes them.
+
+    Attributes:
+        models: folder with one's own files, named as in `DIGESTS`; None takes those of the package.
+        provider: what ONNX Runtime executes them with.
+    """
+
+    models: Path | None = None
+    provider: Provider = "cpu"
+
+    def load(self, file: str) -> Network:
+        """Return a network, loaded once per process.
+
+        Raises:
+            UsageError: if the file is missing or damaged, or the provider is not installed.
+        """
+        path = self._path(file)
+        return Network(_session(path, path.stat().st_mtime_ns, self.provider))
+
+    def check(self) -> None:
+        """Check all files and the provider, so that nothing is computed in vain.
+
+        Raises:
+            UsageError: if a file is missing, damaged or has other inputs or outputs than that of the package, or the
+                provider is not installed.
+        """
+        for file in DIGESTS:
+            self._path(file)
+            if self == PACKAGED:
+                continue
+            expected, found = PACKAGED.load(file).interface, self.load(file).interface
+            if found != expected:
+                raise UsageError(
+                    f"{self.models}: {file} must have {', '.join(expected)}, but has {', '.join(found)}. "
+                    "tools/export_networks.py writes such files"
+                )
+
+    def _path(self, file: str) -> Path:
+        path = (_PACKAGED if self.models is None else self.models) / file
+        if not is_file(path):
+            remedy = "Install pano-mvs again" if self.models is None else "tools/export_networks.py writes all files"
+            raise UsageError(f"{path}: this network is missing. {remedy}")
+        if self.models is None and _digest(path, path.stat().st_mtime_ns) != DIGESTS[file]:
+            raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
+        return path
+
+
+PACKAGED = Networks()
+
+
+class Network:
+    """A network that is ready to run.
+
+    It runs on one thread, since the engine computes as many units at once as there are cores, and its results do not
+    depend on their number.
+    """
+
+    def __init__(self, session: Any) -> None:
+        """Wrap a session of ONNX Runtime."""
+        self._session = session
+
+    @property
+    def interface(self) -> list[str]:
+        """The names and numbers of axes of the inputs and outputs."""
+        ends = (*self._session.get_inputs(), *self._session.get_outputs())
+        return [f"{one.name} ({len(one.shape)} axes)" for one in ends]
+
+    def __call__(self, **inputs: NDArray[np.generic]) -> list[Array]:
+        """Return the outputs in their order."""
+        outputs: list[Array] = self._session.run(None, inputs)
+        return outputs
+
+
+@lru_cache
+def _digest(path: Path, _changed_ns: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@lru_cache
+def _session(path: Path, _changed_ns: int, provider: Provider) -> Any:
+    runtime = importlib.import_module("onnxruntime")  # takes a tenth of a second, which no other stage should pay
+    available = runtime.get_available_providers()
+    if _PROVIDERS[provider] not in available:
+        usable = [name for name, theirs in _PROVIDERS.items() if theirs in available]
+        raise UsageError(
+            f"provider {provider!r} is not in the installed ONNX Runtime, which has {', '.join(usable)}. Install the "
+            "package of ONNX Runtime that has it, or use provider: cpu"
+        )
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    names = list(dict.fromkeys([_PROVIDERS[provider], _PROVIDERS["cpu"]]))
+    try:
+        return runtime.InferenceSession(path, options, providers=names)
+    except Exception as error:  # its errors have no common base
+        raise UsageError(f"{path}: ONNX Runtime cannot load this network, which may be damaged: {error}") from error

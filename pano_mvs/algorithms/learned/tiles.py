@@ -1,0 +1,29 @@
+"""Level pinhole views around a panorama, in which the networks look for key points and match them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.learned.networks import TILE_PX
+from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors
+
+FloatArray = NDArray[np.float64]
+
+COUNT, FOV_DEG = 6, 80.0
+_UP = np.array([0.0, -1.0, 0.0])
+FOCAL_PX = TILE_PX / 2 / float(np.tan(np.deg2rad(FOV_DEG) / 2))
+
+
+def level_tiles(up: FloatArray) -> tuple[PinholeView, ...]:
+    """Return the views, side by side around the horizon, of a camera that sees the zenith in direction `up` (3,)."""
+    level_from_cam = rotation_from_two_vectors(up, _UP)
+    center = np.full(2, TILE_PX / 2)
+    return tuple(PinholeView(side @ level_from_cam, FOCAL_PX, center, (TILE_PX, TILE_PX)) for side in _sides())
+
+
+@lru_cache
+def _sides() -> tuple[FloatArray, ...]:
+    return tuple(rotation_from_rotvec(np.array([0.0, 2 * np.pi * number / COUNT, 0.0])) for number in range(COUNT))

@@ -1,0 +1,79 @@
+"""Whether a capture is upside down, from what is usual above and below the horizon.
+
+Light comes from above. Floors, furniture and the ground have more texture than ceilings and the sky. And people take
+the panoramas of a capture at one height above a floor, so that sparse points lie in a sharper layer below the cameras
+than above them. None of this holds everywhere: a black ceiling is darker than its floor, a painted one has more
+texture. So each difference is bounded, and one model weighs them, whose coefficients `tests/benchmarks/poses/
+upside_down.py` fits to captures that are upright.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
+from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
+from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
+
+_UP = np.array([0.0, -1.0, 0.0])
+_SIZE_HW = (256, 512)
+_MAX_PICTURES = 24
+# Pictures are compared between these elevations: beyond furniture, up to the tripod.
+_BAND_DEG = (55.0, 80.0)
+# Fitted: where each difference is bounded, and its weight in the log-odds.
+_SCALES = np.array([0.33, 1.27, 1.38])
+_WEIGHTS = np.array([3.5, -3.8, -3.0])
+PRIOR_LOG_ODDS = float(np.log(0.01 / 0.99))
+"""One capture in a hundred is taken to be upside down."""
+
+
+def upside_down_probability(poses: Poses, pictures: Mapping[str, Picture], up: FloatArray) -> float:
+    """Return how likely it is that a direction points down, in [0, 1].
+
+    Args:
+        poses: registered images and their sparse points.
+        pictures: image name to a function that loads its panorama; one is in memory at a time.
+        up: (3,) unit vector, the up direction in the world according to the cameras.
+    """
+    log_odds = float(np.tanh(differences_below(poses, pictures, up) / _SCALES) @ _WEIGHTS) + PRIOR_LOG_ODDS
+    return 1 / (1 + float(np.exp(-log_odds)))
+
+
+def differences_below(poses: Poses, pictures: Mapping[str, Picture], up: FloatArray) -> FloatArray:
+    """Return how much brighter, richer in texture, and more like a floor a place is below the cameras than above, (3,).
+
+    The first two are differences of mean logarithms over the directions 55–80° below and above the horizon of at most
+    24 evenly chosen panoramas, 0 without pictures; the third of the number of points in the sharpest level surface.
+
+    Args:
+        poses: as in `upside_down_probability`, as the other two.
+        pictures: image name to a function that loads its panorama.
+        up: (3,) unit vector.
+    """
+    names = [idx for idx, name in enumerate(poses.names) if name in pictures]
+    chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), _MAX_PICTURES)).astype(int))
+    seen = [_in_picture(pictures[poses.names[names[idx]]]()[0], poses.rotations[names[idx]] @ up) for idx in chosen]
+    floor, ceiling = (floor_below(poses.points_in_world, poses.centers, towards) for towards in (up, -up))
+    pictured = np.mean(seen, axis=0) if seen else np.zeros(2)
+    return np.array([*pictured, np.log1p(floor.points) - np.log1p(ceiling.points)])
+
+
+def _in_picture(image: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
+    """Return the differences of brightness and texture, (2,)."""
+    small = cv2.resize(image, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
+    level = rotate_panorama(small, rotation_from_two_vectors(up_in_cam, _UP))
+    # Logarithms of noise in black and of grain in plain surfaces say nothing.
+    brightness = np.log(level.mean(axis=2) / 255 + 0.05)
+    cosine = np.hypot(*np.moveaxis(ray_grid(_SIZE_HW)[..., ::2], -1, 0))
+    across = (np.roll(brightness, -1, axis=1) - np.roll(brightness, 1, axis=1)) / cosine
+    texture = np.log(np.hypot(across, 2 * np.gradient(brightness, axis=0)) + 0.01)
+    weights = cosine * ((cosine < np.cos(np.radians(_BAND_DEG[0]))) & (cosine > np.cos(np.radians(_BAND_DEG[1]))))
+    weights[_SIZE_HW[0] // 2 :] = 0
+    return np.array([((part[::-1] - part) * weights).sum() / weights.sum() for part in (brightness, texture)])

@@ -1,0 +1,207 @@
+"""Lay the planes of a place into the range map of one view.
+
+Each pixel gets one of the planes, or none: a labelling by filtered costs (C. Rhemann et al., "Fast cost-volume
+filtering for visual correspondence and beyond", CVPR 2011). The cost of a plane is the deviation of the pixel's own
+range from it, which counts little where nothing was matched; the guided filter spreads it within areas of one colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.guided import guided_values
+from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.structure.view import FloatArray, Mask, Picture, on_grid, plane_ranges, stride_of
+from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.structure import Structure
+
+# What a pixel without a plane costs, where 1 is a range that is not on the plane.
+_NO_PLANE = 0.6
+_RADIUS, _EPSILON = 8, 8.0
+# Weights of the own ranges of precise, confirmed, weak and filled pixels.
+_WEIGHTS = 1.0, 0.5, 0.3, 0.03
+# Planes with less of the sphere are not laid.
+_MIN_AREA = 0.003
+_SOURCES = 4
+
+
+@checks_settings
+def lay_structure(
+    range_map: RangeMap,
+    guide: Picture,
+    structure: Structure,
+    *,
+    cam_from_world: Rigid3,
+    sources: Sequence[RangeMap],
+    source_poses: Sequence[Rigid3],
+    group: int = 0,
+    valid: Mask | None = None,
+    textured_error: Annotated[
+        float, Setting("maximum relative error of a confirmed pixel with texture that is moved", gt=0, le=1)
+    ] = 0.015,
+    plain_error: Annotated[float, Setting("the same of a pixel without texture", gt=0, le=1)] = 0.08,
+) -> tuple[RangeMap, float]:
+    """Move pixels to the planes of a place that they show.
+
+    Args:
+        range_map: (H, W) with even W, the full sphere.
+        guide: (H, W, 3) RGB panorama.
+        structure: planes in the world.
+        cam_from_world: pose of the view.
+        sources: range maps of other views; a pixel is not moved to where one of them sees through the plane.
+        source_poses: cam_from_world of each.
+        group: of the poses of the view.
+        valid: (H, W) pixels that may have a range; None: all.
+        textured_error: maximum relative error of a confirmed pixel with texture that is moved.
+        plain_error: the same of a confirmed pixel without texture. Other pixels without texture move any distance.
+
+    Returns:
+        The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
+        whose place another view confirms, are consistent (confidence 128 or more).
+    """
+    planes = np.flatnonzero(structure.group_idx == group)
+    size = range_map.range.shape[0], range_map.range.shape[1]
+    stride = stride_of(size)
+    rays = ray_grid(size) @ cam_from_world.rotation
+    textured = has_texture(guide)
+    tolerance = np.where(textured & (range_map.confidence >= CONSISTENT_CONFIDENCE[0]), textured_error, plain_error)
+    on_planes = [
+        plane_ranges(
+            rays,
+            cam_from_world.center,
+            normal=structure.normals_in_world[idx],
+            offset=float(structure.offsets[idx]),
+        )
+        for idx in planes
+    ]
+    coarse_rays, coarse_planes = on_grid(rays, stride), [on_grid(ranges, stride) for ranges in on_planes]
+    label = _labels(
+        coarse_planes,
+        on_grid(range_map.range, stride),
+        on_grid(range_map.confidence, stride),
+        textured=on_grid(textured, stride),
+        tolerance=on_grid(tolerance, stride),
+        guide=cv2.resize(guide, _grid_wh(size, stride), interpolation=cv2.INTER_AREA),
+    )
+    places = cam_from_world.center + coarse_rays * _chosen(coarse_planes, label)[..., None]
+    agree, seen_through = _seen_by_others(places, sources[:_SOURCES], source_poses[:_SOURCES], error=plain_error)
+    label, agree = _enlarged(np.where(seen_through, -1, label), size), _enlarged(agree, size) > 0
+    laid = _chosen(on_planes, label)
+    with np.errstate(invalid="ignore"):
+        near = np.abs(range_map.range / laid - 1) <= tolerance
+    matched = range_map.confidence >= WEAK_CONFIDENCE[0]
+    unsure = np.where(textured, ~matched, range_map.confidence < CONSISTENT_CONFIDENCE[0])
+    moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
+    kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
+    confidence = np.select(
+        [near & matched & agree, near & matched, agree],
+        [np.maximum(range_map.confidence, np.uint8(CONSISTENT_CONFIDENCE[0])), kept, np.uint8(WEAK_CONFIDENCE[1])],
+        np.uint8(FILLED_CONFIDENCE[1]),
+    )
+    result = with_ranges(
+        range_map,
+        np.where(moved, laid, range_map.range).astype(np.float32),
+        np.where(moved, confidence, range_map.confidence),
+    )
+    moved &= result.valid
+    return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
+        (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
+    )
+
+
+def _grid_wh(size_hw: tuple[int, int], stride: int) -> tuple[int, int]:
+    """Return columns and rows of the grid of `on_grid`."""
+    rows, columns = (len(range(stride // 2, length, stride)) for length in size_hw)
+    return columns, rows
+
+
+def _labels(
+    on_planes: Sequence[FloatArray],
+    ranges: NDArray[np.float32],
+    confidence: NDArray[np.uint8],
+    *,
+    textured: Mask,
+    tolerance: FloatArray,
+    guide: Picture,
+) -> NDArray[np.int16]:
+    """Return the position in `on_planes` of the plane of each pixel of the grid, (h, w), −1 for none."""
+    confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
+    weak = confidence >= WEAK_CONFIDENCE[0]
+    weight = np.select([confirmed & textured, confirmed, weak], _WEIGHTS[:3], _WEIGHTS[3])
+    area = pixel_solid_angle(confidence.shape[:2])[:, None] / (4 * np.pi)
+    best, label = np.full(ranges.shape, _NO_PLANE), np.full(ranges.shape, -1, np.int16)
+    for number, on_plane in enumerate(on_planes):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            error = np.abs(np.log(ranges / on_plane)) / tolerance
+        if not (area * ((error < 1) & weak)).sum() >= _MIN_AREA:
+            continue
+        unknown = np.isfinite(on_plane) & ~np.isfinite(ranges)
+        cost = np.where(unknown, 0.5, np.minimum(np.nan_to_num(error, nan=1.0), 1.0))
+        filtered, _ = guided_values(cost, weight, guide.astype(np.float64), radius=_RADIUS, epsilon=_EPSILON)
+        better = (filtered < best) & np.isfinite(on_plane)
+        best[better], label[better] = filtered[better], number
+    return label
+
+
+def _chosen(on_planes: Sequence[FloatArray], label: NDArray[np.int16]) -> FloatArray:
+    """Return the range on each pixel's plane, NaN without one."""
+    chosen = np.full(label.shape, np.nan)
+    for number, ranges in enumerate(on_planes):
+        here = label == number
+        chosen[here] = ranges[here]
+    return chosen
+
+
+def _seen_by_others(
+    places: FloatArray, sources: Sequence[RangeMap], poses: Sequence[Rigid3], *, error: float
+) -> tuple[Mask, Mask]:
+    """Return where a confirmed range of another view agrees with places (h, w, 3), and where one is clearly behind."""
+    agree, through = np.zeros(places.shape[:2], np.int64), np.zeros(places.shape[:2], np.int64)
+    known = np.isfinite(places).all(axis=-1)
+    for source, pose in zip(sources, poses, strict=True):
+        size = source.range.shape[0], source.range.shape[1]
+        in_source = pose.apply(places[known])
+        distance = np.linalg.norm(in_source, axis=-1)
+        column, row = np.floor(pixel_from_ray(in_source / distance[:, None], size)).astype(np.int64).T
+        row, column = np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)
+        confirmed = source.confidence[row, column] >= CONSISTENT_CONFIDENCE[0]
+        seen = source.range[row, column] / distance
+        agree[known] += confirmed & (np.abs(seen - 1) < error)
+        through[known] += confirmed & (seen > 1 + error)
+    return np.asarray(agree > 0), np.asarray(through > agree)
+
+
+def _described(
+    range_map: RangeMap,
+    moved: Mask,
+    structure: Structure,
+    *,
+    planes: NDArray[np.intp],
+    label: NDArray[np.int16],
+    rotation: FloatArray,
+) -> RangeMap:
+    """Return the range map with the normals and the uncertainty of the planes where pixels are on one."""
+    plane = planes[label[moved]]
+    normals, uncertainty = range_map.normals_in_cam, range_map.uncertainty
+    if normals is not None:
+        normals = normals.copy()
+        normals[moved] = (structure.normals_in_world[plane] @ rotation.T).astype(np.float16)
+    if uncertainty is not None:
+        uncertainty = uncertainty.copy()
+        uncertainty[moved] = structure.uncertainties[plane].astype(np.float16)
+    return replace(range_map, normals_in_cam=normals, uncertainty=uncertainty)
+
+
+def _enlarged(pixels: NDArray[np.generic], size_hw: tuple[int, int]) -> NDArray[np.int16]:
+    """Return pixels of the grid at full resolution."""
+    return np.asarray(cv2.resize(pixels.astype(np.int16), size_hw[::-1], interpolation=cv2.INTER_NEAREST), np.int16)

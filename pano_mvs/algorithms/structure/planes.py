@@ -1,0 +1,252 @@
+"""Find the level and upright planes of a place in the range maps of all views, with y down along gravity.
+
+Planes are drawn from single points (level planes) or pairs of points of one view (upright planes), the one that most of
+the remaining points support is kept, and its points are removed (sequential RANSAC). Then the lines where upright
+planes meet level ones place them: see `creases`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.structure.creases import PLAIN_WEIGHT, ScenePlane, placed_by_creases
+from pano_mvs.algorithms.structure.view import FloatArray, Mask, PlaneView
+from pano_mvs.scene.range_map import WEAK_CONFIDENCE
+
+_DRAWN_POINTS, _LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 6000, 64, 200, 5
+_SCORED_POINTS = 4000
+# A point without texture counts for this share of a precise one in the support of a plane.
+_PLAIN_SUPPORT = 0.5
+_ALONG_NORMAL = 0.7
+_LEAST_COSINE = 0.03
+_LEAST_UNCERTAINTY = 0.002
+# Cosines of the angles between the two points that a plane is drawn from.
+_PAIR_COSINES = 0.9, 0.9985
+_UP = np.array([0.0, -1.0, 0.0])
+
+
+def find_planes(
+    views: Sequence[PlaneView], *, rng: np.random.Generator, max_relative_error: float, min_share: float
+) -> list[ScenePlane]:
+    """Return the planes of one group of views, whose world has y down along gravity; level planes first.
+
+    Args:
+        views: of one group.
+        rng: draws points and planes.
+        max_relative_error: of the ranges of points on a plane.
+        min_share: least support of a plane, in spheres: 1 if it filled one view.
+    """
+    points = _drawn_points(views, rng)
+    if points is None:
+        return []
+    least = min_share * 4 * np.pi
+    planes = [
+        plane
+        for normal in (_UP, -_UP)
+        for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
+    ]
+    planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
+    return placed_by_creases(views, planes, max_relative_error=max_relative_error)
+
+
+@dataclass(eq=False)
+class _Points:
+    """Points of all views: positions, centres of their cameras, rays, normals (N, 3 each); `left` are still free."""
+
+    xyz: FloatArray
+    centers: FloatArray
+    rays: FloatArray
+    normals: FloatArray
+    ranges: FloatArray
+    precise: Mask
+    uncertainty: FloatArray
+    view: NDArray[np.int64]
+    weight: FloatArray
+    left: Mask
+
+    def errors(self, normal: FloatArray, offset: float, chosen: NDArray[np.intp]) -> FloatArray:
+        """Return the relative errors of ranges of some points if they were on a plane; NaN if it is grazing."""
+        cosine = self.rays[chosen] @ normal
+        cosine = np.where(np.abs(cosine) < _LEAST_COSINE, np.nan, cosine)
+        return np.asarray((offset - self.centers[chosen] @ normal) / cosine / self.ranges[chosen] - 1)
+
+    def on(self, normal: FloatArray, offset: float, chosen: NDArray[np.intp], *, tolerance: float) -> Mask:
+        """Return which of some points are on a plane, and face its front."""
+        with np.errstate(invalid="ignore"):
+            near = np.abs(self.errors(normal, offset, chosen)) < tolerance
+        return np.asarray(near & (self.normals[chosen] @ normal > _ALONG_NORMAL))
+
+    def fit_weights(self, normal: FloatArray, chosen: NDArray[np.intp]) -> FloatArray:
+        """Return the weights of some points in the fit of a plane: inverse variances of their distances to it."""
+        height = np.abs((self.xyz[chosen] - self.centers[chosen]) @ normal)
+        std = np.maximum(self.uncertainty[chosen], _LEAST_UNCERTAINTY) * height
+        share = np.where(self.precise[chosen], 1.0, PLAIN_WEIGHT)
+        return np.asarray(self.weight[chosen] * share / np.maximum(std, 1e-12) ** 2)
+
+    def take(self, plane: ScenePlane, tolerance: float) -> None:
+        """Remove the points of a plane from those that are left."""
+        every = np.arange(len(self.xyz))
+        self.left &= ~self.on(plane.normal, plane.offset, every, tolerance=2 * tolerance)
+
+
+def _drawn_points(views: Sequence[PlaneView], rng: np.random.Generator) -> _Points | None:
+    """Return points drawn by their weights, which are equal afterwards; None if there is none."""
+    parts = [_points_of(view, number) for number, view in enumerate(views)]
+    arrays = {name.name: np.concatenate([getattr(part, name.name) for part in parts]) for name in fields(_Points)}
+    weight = arrays["weight"]
+    total = float(weight.sum())
+    if total <= 0:
+        return None
+    count = min(_DRAWN_POINTS * len(views), int(np.count_nonzero(weight)))
+    chosen = rng.choice(len(weight), count, p=weight / total, replace=False)
+    drawn = {name: array[chosen] for name, array in arrays.items()}
+    return replace(_Points(**drawn), weight=np.full(count, total / count))
+
+
+def _points_of(view: PlaneView, number: int) -> _Points:
+    normals = _normals(view)
+    seen = np.isfinite(view.ranges) & (view.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(normals).all(axis=-1)
+    rays, ranges, precise = view.rays[seen], view.ranges[seen], view.precise[seen]
+    center = view.cam_from_world.center
+    return _Points(
+        xyz=center + rays * ranges[:, None],
+        centers=np.broadcast_to(center, rays.shape),
+        rays=rays,
+        normals=normals[seen],
+        ranges=ranges,
+        precise=precise,
+        uncertainty=view.uncertainty[seen],
+        view=np.full(len(ranges), number),
+        weight=view.area[seen] * np.where(precise, 1.0, _PLAIN_SUPPORT),
+        left=np.ones(len(ranges), np.bool_),
+    )
+
+
+def _normals(view: PlaneView, step: int = 3) -> FloatArray:
+    """Return normals (h, w, 3) in the world, towards the camera, from ranges a few pixels apart; NaN if unknown."""
+    points = view.rays * view.ranges[..., None]
+    across = np.roll(points, -step, axis=1) - np.roll(points, step, axis=1)
+    down = np.full_like(points, np.nan)
+    down[step:-step] = points[2 * step :] - points[: -2 * step]
+    normals = np.cross(across, down)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        behind = np.sum(normals * view.rays, axis=-1, keepdims=True) > 0
+    return np.asarray(np.where(behind, -normals, normals))
+
+
+def _level_planes(
+    points: _Points, normal: FloatArray, *, rng: np.random.Generator, tolerance: float, least: float
+) -> list[ScenePlane]:
+    """Return the planes with a vertical normal, those with most support first, and take their points."""
+    found: list[ScenePlane] = []
+    while True:
+        free = np.flatnonzero(points.left & (points.normals @ normal > _ALONG_NORMAL))
+        if not len(free):
+            return found
+        drawn = rng.choice(free, _LEVEL_DRAWS)
+        offsets = points.xyz[drawn] @ normal
+        support = [
+            points.weight[free][points.on(normal, offset, free, tolerance=tolerance)].sum() for offset in offsets
+        ]
+        best = int(np.argmax(support))
+        if support[best] < least:
+            return found
+        offset = float(offsets[best])
+        for _ in range(_FIT_ROUNDS):
+            inliers = free[points.on(normal, offset, free, tolerance=tolerance)]
+            offset = _weighted_median(points.xyz[inliers] @ normal, points.fit_weights(normal, inliers))
+        found.append(_described(points, normal, offset, tolerance=tolerance, is_level=True))
+        points.take(found[-1], tolerance)
+
+
+def _upright_planes(points: _Points, *, rng: np.random.Generator, tolerance: float, least: float) -> list[ScenePlane]:
+    """Return the planes with a horizontal normal, and take their points."""
+    found: list[ScenePlane] = []
+    while True:
+        free = np.flatnonzero(points.left & (np.abs(points.normals[:, 1]) < np.sqrt(1 - _ALONG_NORMAL**2)))
+        best, drawn = least, None
+        some = free[:: max(1, len(free) // _SCORED_POINTS)]
+        share = len(some) / max(len(free), 1)
+        for normal, offset in _drawn_upright(points, free, rng):
+            support = float(points.weight[some][points.on(normal, offset, some, tolerance=tolerance)].sum()) / share
+            if support > best:
+                best, drawn = support, (normal, offset)
+        if drawn is None:
+            return found
+        normal, offset = drawn
+        for _ in range(_FIT_ROUNDS):
+            inliers = free[points.on(normal, offset, free, tolerance=tolerance)]
+            normal, offset = _fitted_upright(points, inliers, normal=normal, offset=offset)
+        found.append(_described(points, normal, offset, tolerance=tolerance, is_level=False))
+        points.take(found[-1], tolerance)
+        if found[-1].support < least:  # a fit that lost its points would be found again
+            points.left[free[points.on(*drawn, free, tolerance=tolerance)]] = False
+            found.pop()
+
+
+def _drawn_upright(points: _Points, free: NDArray[np.intp], rng: np.random.Generator) -> list[tuple[FloatArray, float]]:
+    """Return upright planes through two points of one view that are a few degrees to 25° apart."""
+    if len(free) < 2:
+        return []
+    found = []
+    for first in rng.choice(free, _UPRIGHT_DRAWS):
+        others = free[points.view[free] == points.view[first]]
+        cosine = points.rays[others] @ points.rays[first]
+        others = others[(cosine > _PAIR_COSINES[0]) & (cosine < _PAIR_COSINES[1])]
+        if not len(others):
+            continue
+        x, _, z = points.xyz[rng.choice(others)] - points.xyz[first]
+        length = np.hypot(x, z)
+        if length == 0:
+            continue
+        normal = np.array([-z, 0.0, x]) / length
+        normal = -normal if normal @ points.rays[first] > 0 else normal
+        if normal @ points.normals[first] > _ALONG_NORMAL:
+            found.append((normal, float(points.xyz[first] @ normal)))
+    return found
+
+
+def _fitted_upright(
+    points: _Points, inliers: NDArray[np.intp], *, normal: FloatArray, offset: float
+) -> tuple[FloatArray, float]:
+    """Return an upright plane after one step of reweighted least squares with Cauchy weights."""
+    if len(inliers) < 3:
+        return normal, offset
+    weights = points.fit_weights(normal, inliers)
+    errors = np.abs(points.errors(normal, offset, inliers))
+    weights = weights / (1 + (errors / max(1.5 * float(np.median(errors)), 1e-9)) ** 2)
+    plan = points.xyz[inliers][:, [0, 2]]
+    mean = weights @ plan / weights.sum()
+    centred = plan - mean
+    _, vectors = np.linalg.eigh((centred * weights[:, None]).T @ centred)
+    fitted = np.array([vectors[0, 0], 0.0, vectors[1, 0]])
+    fitted = fitted if fitted @ normal > 0 else -fitted
+    return fitted, float(mean @ fitted[[0, 2]])
+
+
+def _described(points: _Points, normal: FloatArray, offset: float, *, tolerance: float, is_level: bool) -> ScenePlane:
+    """Return a plane with its support, and the scatter of the points on it."""
+    every = np.flatnonzero(points.left)
+    inliers = every[points.on(normal, offset, every, tolerance=tolerance)]
+    errors = np.abs(points.errors(normal, offset, inliers))
+    precise = points.precise[inliers]
+    scatter = _weighted_median(errors, np.where(precise, 1.0, PLAIN_WEIGHT)) if len(inliers) else tolerance
+    return ScenePlane(
+        normal,
+        offset,
+        support=float(points.weight[inliers].sum()),
+        precise_support=float(points.weight[inliers][precise].sum()),
+        uncertainty=max(scatter, _LEAST_UNCERTAINTY),
+        is_level=is_level,
+    )
+
+
+def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])

@@ -1,0 +1,97 @@
+"""What the search for planes reads of one view, on a coarse grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+Value = TypeVar("Value", bound=np.generic)
+
+_ROWS = 256
+# Planes at a more grazing angle than this cosine are not assigned to pixels.
+_GRAZING = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneView:
+    """A view on every n-th row and column, so that about 256 rows remain.
+
+    Attributes:
+        load: returns the panorama, (H, W, 3) RGB at full resolution.
+        cam_from_world: its pose.
+        rays: (h, w, 3) unit rays in the world.
+        ranges: (h, w), NaN is invalid.
+        confidence: (h, w).
+        uncertainty: (h, w) relative standard deviation of the ranges.
+        precise: (h, w) confirmed pixels with texture.
+        area: (h, w) solid angle.
+    """
+
+    load: Callable[[], Picture]
+    cam_from_world: Rigid3
+    rays: FloatArray
+    ranges: FloatArray
+    confidence: NDArray[np.uint8]
+    uncertainty: FloatArray
+    precise: Mask
+    area: FloatArray
+
+
+def stride_of(size_hw: tuple[int, int]) -> int:
+    """Return n of the grid of a panorama of a size."""
+    return max(1, size_hw[0] // _ROWS)
+
+
+def on_grid(pixels: NDArray[Value], stride: int) -> NDArray[Value]:
+    """Return the pixels of the grid, (h, w, ...), of (H, W, ...)."""
+    return pixels[stride // 2 :: stride, stride // 2 :: stride]
+
+
+def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world: Rigid3) -> PlaneView:
+    """Return what the search for planes reads of a view.
+
+    Args:
+        range_map: (H, W), the full sphere.
+        load: returns the panorama, (H, W, 3) RGB.
+        cam_from_world: its pose.
+    """
+    size = range_map.range.shape
+    stride = stride_of((size[0], size[1]))
+    rays = on_grid(ray_grid((size[0], size[1])), stride) @ cam_from_world.rotation
+    confidence = on_grid(range_map.confidence, stride)
+    uncertainty = np.full(confidence.shape, UNCONFIRMED_UNCERTAINTY)
+    if range_map.uncertainty is not None:
+        known = on_grid(range_map.uncertainty, stride).astype(np.float64)
+        uncertainty = np.where(np.isnan(known), uncertainty, known)
+    area = np.broadcast_to(pixel_solid_angle((size[0], size[1]))[:, None] * stride**2, size)
+    return PlaneView(
+        load,
+        cam_from_world,
+        rays,
+        on_grid(range_map.range, stride).astype(np.float64),
+        confidence,
+        uncertainty,
+        on_grid(has_texture(load()), stride) & (confidence >= CONSISTENT_CONFIDENCE[0]),
+        on_grid(area, stride),
+    )
+
+
+def plane_ranges(rays: FloatArray, center: FloatArray, *, normal: FloatArray, offset: float) -> FloatArray:
+    """Return the range along rays (..., 3) from a centre (3,) to n · X = offset; NaN where its front is not seen."""
+    cosine = rays @ normal
+    height = offset - center @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where((cosine < -_GRAZING) & (height < 0), height / cosine, np.nan))

@@ -1,0 +1,67 @@
+"""Relative poses of upright images: a heading and a direction, from two matches for each heading."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
+from pano_mvs.algorithms.two_view.redirection import direction_candidates
+from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
+from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+
+_HEADINGS_RAD = np.deg2rad(np.arange(0.0, 360.0, 2.0))
+_DIRECTIONS = 100
+_TILT_RAD = float(np.deg2rad(0.6))  # allows for the tilt of the cameras and for the steps between headings
+_SAME_HEADING_RAD = float(np.deg2rad(3.0))
+_MIN_MATCHES = 6
+
+
+def upright_poses(
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float, count: int = 4
+) -> list[Rigid3]:
+    """Return relative poses of two upright images, |t| = 1, best first.
+
+    With a known vertical, a heading and two matches determine a relative pose, so that one true match in ten is enough
+    to find it, where five matches at random would hardly ever all be true. The poses are refined without the
+    assumption, so a slight tilt does not matter.
+
+    Args:
+        first: (M, 3) unit rays in the first image.
+        second: (M, 3) in the second.
+        rng: draws the matches.
+        threshold_rad: Sampson error from which a match costs 1 after refinement.
+        count: maximum number of poses.
+    """
+    if len(first) < _MIN_MATCHES:
+        return []
+    wide_rad = max(_TILT_RAD, threshold_rad)
+    rough: list[tuple[float, Rigid3]] = []
+    for heading in _HEADINGS_RAD:
+        rotation = rotation_from_rotvec(np.array([0.0, heading, 0.0]))
+        directions, costs = direction_candidates(
+            rotation, first, second, rng=rng, threshold_rad=wide_rad, count=_DIRECTIONS
+        )
+        if len(directions):
+            best = int(np.argmin(costs))
+            rough.append((float(costs[best]), Rigid3(rotation, directions[best])))
+    poses: list[Rigid3] = []
+    for _, pose in sorted(rough, key=lambda item: item[0]):
+        if len(poses) == count:
+            break
+        if all(float(geodesic_angle(pose.rotation, other.rotation)) > _SAME_HEADING_RAD for other in poses):
+            poses.append(pose)
+    refined = [_settled(pose, first, second, threshold_rad=threshold_rad) for pose in poses]
+    costs = facing_costs(refined, first, second, threshold_rad=threshold_rad)
+    return [refined[idx] for idx in np.argsort(costs, kind="stable")]
+
+
+def _settled(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3:
+    for widen in (3.0, 2.0, 1.0):
+        near = agreement(pose, first, second, threshold_rad=widen * threshold_rad)[1]
+        if near.sum() < 2 * _MIN_MATCHES:
+            break
+        pose = refine_relative_pose(pose, first[near], second[near], scale_rad=0.5 * widen * threshold_rad)
+    return pose

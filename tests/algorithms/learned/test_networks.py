@@ -1,0 +1,214 @@
+"""The networks on ONNX Runtime: the same results as on PyTorch, on any sphere, from whole files only."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.sampling import sample_view
+from pano_mvs.algorithms.learned import networks
+from pano_mvs.algorithms.learned.aliked import extract_aliked, maxima_of_scores
+from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
+from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
+from pano_mvs.algorithms.learned.photographs import match_photograph, view_of_photograph
+from pano_mvs.algorithms.learned.tiles import level_tiles
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import (
+    PinholeView,
+    angle_between,
+    ray_grid,
+    roll_panorama,
+    rotate_panorama,
+    rotation_from_rotvec,
+)
+from pano_mvs.scene import Features
+
+UP = np.array([0.0, -1.0, 0.0])
+SIZE = (512, 1024)
+
+
+@pytest.fixture(scope="module")
+def by_torch() -> Mapping[str, Any]:
+    """What PyTorch found on two pictures, written by tools/export_networks.py."""
+    return dict(np.load(Path(__file__).parent / "by_torch.npz"))
+
+
+@pytest.fixture(scope="module")
+def panorama(by_torch: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """A full sphere of the first picture: a cube whose level sides show it turned by quarters."""
+    rays = ray_grid(SIZE)
+    side = np.rint(np.arctan2(rays[..., 0], rays[..., 2]) / (np.pi / 2)).astype(int) % 4
+    azimuth = np.arctan2(rays[..., 0], rays[..., 2]) - side * np.pi / 2
+    x = np.tan((azimuth + np.pi) % (2 * np.pi) - np.pi)
+    y = -rays[..., 1] / np.hypot(rays[..., 0], rays[..., 2])
+    pixels = [np.clip((value / 2.2 + 0.5) * TILE_PX, 0, TILE_PX - 1).astype(int) for value in (y, x)]
+    pictures = np.stack([np.rot90(by_torch["picture0"], number) for number in range(4)])
+    return np.asarray(pictures[side, pixels[0], pixels[1]], np.uint8)
+
+
+@pytest.fixture(scope="module")
+def found(panorama: NDArray[np.uint8]) -> Features:
+    return extract_aliked(panorama, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_key_points_and_descriptors_are_those_of_pytorch(by_torch: Mapping[str, Any], number: int) -> None:
+    image = (by_torch[f"picture{number}"].astype(np.float32) / 255).transpose(2, 0, 1)[None]
+    score, *maps = PACKAGED.load("aliked_detector.onnx")(image=image)
+    pixels, strengths = maxima_of_scores(score[0, 0], 0.01)
+    expected = by_torch[f"pixels{number}"]
+    strongest = pixels[np.argsort(-strengths)[:1100]]
+    distances = np.linalg.norm(expected[:, None] - strongest, axis=2).min(axis=1)
+    assert np.mean(distances < 0.05) > 0.97
+    named = {f"features{level}": one for level, one in enumerate(maps)}
+    descriptors = PACKAGED.load("aliked_descriptor.onnx")(**named, pixels=expected[::16])[0]
+    cosines = (descriptors * by_torch[f"descriptors{number}"]).sum(axis=1)
+    assert np.median(cosines) > 0.999
+    assert np.quantile(cosines, 0.05) > 0.98
+
+
+def test_matches_are_those_of_pytorch(by_torch: Mapping[str, Any]) -> None:
+    """PyTorch ran all layers without dropping key points; stopping early loses few matches."""
+    seen = []
+    for number in (0, 1):
+        image = (by_torch[f"picture{number}"].astype(np.float32) / 255).transpose(2, 0, 1)[None]
+        _, *maps = PACKAGED.load("aliked_detector.onnx")(image=image)
+        pixels = by_torch[f"pixels{number}"]
+        named = {f"features{level}": one for level, one in enumerate(maps)}
+        descriptors = PACKAGED.load("aliked_descriptor.onnx")(**named, pixels=pixels)[0]
+        seen.append((descriptors, (pixels / (TILE_PX / 2) - 1).astype(np.float32)))
+    matches, scores = LightGlue(PACKAGED).match(seen[0], seen[1], min_score=0.1)
+    ours, theirs = {(int(i), int(j)) for i, j in matches}, {(int(i), int(j)) for i, j in by_torch["matches"]}
+    assert len(ours & theirs) > 0.9 * len(theirs)
+    assert len(ours - theirs) < 0.1 * len(theirs)
+    assert scores.min() > 0.1
+    nothing = np.zeros((0, 128), np.float32), np.zeros((0, 2), np.float32)
+    assert len(LightGlue(PACKAGED).match(nothing, seen[1], min_score=0.1)[0]) == 0
+
+
+def test_level_tiles_cover_the_horizon_and_follow_the_zenith() -> None:
+    turn = rotation_from_rotvec([0.3, 1.0, -0.2])
+    tiles = level_tiles(turn @ UP)
+    azimuth = np.linspace(-np.pi, np.pi, 50)
+    for elevation in np.deg2rad([-30.0, 0.0, 30.0]):
+        level = [
+            np.sin(azimuth) * np.cos(elevation),
+            np.full(50, -np.sin(elevation)),
+            np.cos(azimuth) * np.cos(elevation),
+        ]
+        rays = np.stack(level, axis=1) @ turn.T
+        assert np.any([tile.contains(tile.pixels_from_rays(rays)) for tile in tiles], axis=0).all()
+    for tile in tiles:
+        assert tile.view_from_cam[1] @ (turn @ UP) == pytest.approx(-1)
+
+
+def turned(features: Features, other: Features, new_from_old: NDArray[np.float64]) -> tuple[int, float]:
+    """Return the number of matches with a turned camera, and the share of them that shows the same place."""
+    matches = match_learned(features, other)
+    off = angle_between(features.bearings[matches[:, 0]] @ new_from_old.T, other.bearings[matches[:, 1]])
+    return len(matches), float(np.mean(off < np.deg2rad(0.5)))
+
+
+def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8], found: Features) -> None:
+    """No view's centre is where it was, and what was on the seam is not."""
+    rolled, new_from_old = roll_panorama(panorama, 200)
+    other = extract_aliked(rolled, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
+    count, right = turned(found, other, new_from_old)
+    assert count > 700
+    assert right > 0.97
+    near_seam = found.bearings @ np.array([0.0, 0.0, -1.0]) > np.cos(np.deg2rad(15))
+    matched = match_learned(found, other, max_views=12)[:, 0]
+    assert np.mean(near_seam[matched]) > 0.7 * np.mean(near_seam)
+
+
+def test_a_tilted_camera_is_levelled_by_its_zenith(panorama: NDArray[np.uint8], found: Features) -> None:
+    tilt = rotation_from_rotvec([0.5, 0.0, -0.6])
+    picture = rotate_panorama(panorama, tilt)
+    other = extract_aliked(picture, np.ones(SIZE, np.bool_), up=tilt @ UP, max_keypoints=1500)
+    count, right = turned(found, other, tilt)
+    assert count > 600
+    assert right > 0.97
+
+
+def test_a_photograph_matches_where_the_panorama_shows_the_same(panorama: NDArray[np.uint8], found: Features) -> None:
+    """A portrait picture of 300 × 400 pixels, 10° off level, across the seam."""
+    turn = rotation_from_rotvec([0.1, 0.0, 0.17]) @ rotation_from_rotvec([0.0, 3.0, 0.0])
+    view = PinholeView(turn, 300.0, np.array([150.0, 200.0]), (400, 300))
+    photograph = view_of_photograph(sample_view(panorama, view))
+    matches = match_photograph(photograph, found)
+    expected = view.pixels_from_rays(found.bearings[matches[:, 1]])
+    off_px = np.linalg.norm(photograph.pixels_px[matches[:, 0]] - expected, axis=1)
+    assert len(matches) > 50
+    assert np.mean(off_px < 3) > 0.9
+    blank = view_of_photograph(np.zeros((30, 40, 3), np.uint8))
+    assert len(match_photograph(blank, found)) == 0
+
+
+def test_the_record_is_valid_and_leaves_out_masked_pixels(panorama: NDArray[np.uint8], found: Features) -> None:
+    found.check()
+    assert found.learned == len(found) == 1500
+    assert np.all(found.descriptors == np.rint(found.descriptors))
+    assert np.linalg.norm(found.descriptors, axis=1) == pytest.approx(networks.DESCRIPTOR_NORM, rel=0.01)
+    mask = np.ones(SIZE, np.bool_)
+    mask[:, 400:600] = False
+    rest = extract_aliked(panorama, mask, up=UP)
+    azimuth = np.arctan2(rest.bearings[:, 0], rest.bearings[:, 2]) / (2 * np.pi) + 0.5
+    assert not np.any((azimuth > 400 / 1024) & (azimuth < 600 / 1024))
+
+
+def test_a_plain_panorama_has_no_key_points() -> None:
+    plain = extract_aliked(np.full((*SIZE, 3), 90, np.uint8), np.ones(SIZE, np.bool_), up=UP, threshold=0.1)
+    plain.check()
+    assert len(plain) == 0
+
+
+def test_key_points_of_other_stages_cannot_be_matched(found: Features) -> None:
+    others = replace(found, learned=0)
+    with pytest.raises(UsageError, match=r"features\.aliked"):
+        match_learned(others, others)
+    assert match_learned(found, others).shape == (0, 2)  # an image without texture
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    with resources.as_file(resources.files("pano_mvs.algorithms.learned") / "models") as folder:
+        shutil.copytree(folder, tmp_path / "models")
+    return tmp_path / "models"
+
+
+def test_files_of_ones_own_are_used_and_checked(copied: Path) -> None:
+    Networks(models=copied).check()
+    file = copied / "lightglue_start.onnx"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:2000])
+    with pytest.raises(UsageError, match=r"lightglue_start\.onnx.*damaged"):
+        Networks(models=copied).check()
+    shutil.copy(copied / "lightglue_end.onnx", file)
+    with pytest.raises(UsageError, match=r"lightglue_start\.onnx must have descriptors"):
+        Networks(models=copied).check()
+    file.unlink()
+    with pytest.raises(UsageError, match=r"lightglue_start\.onnx: this network is missing"):
+        Networks(models=copied).check()
+
+
+def test_a_damaged_file_of_the_package_is_reported(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = copied / next(iter(DIGESTS))
+    content = bytearray(file.read_bytes())
+    content[1000] ^= 1
+    file.write_bytes(content)
+    monkeypatch.setattr(networks, "_PACKAGED", copied)
+    with pytest.raises(UsageError, match="damaged"):
+        PACKAGED.check()
+
+
+def test_a_provider_that_is_not_installed_is_reported() -> None:
+    with pytest.raises(UsageError, match="'directml' is not in the installed ONNX Runtime, which has cpu"):
+        Networks(provider="directml").check()

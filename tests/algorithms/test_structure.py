@@ -1,0 +1,127 @@
+"""Planes of a place: walls whose ranges are biased stand where their edges are, and what is not a wall stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.structure.lay import lay_structure
+from pano_mvs.algorithms.structure.structure import find_structure
+from pano_mvs.core.errors import ContractError
+from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.structure import Structure
+from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
+
+SIZE = (128, 256)
+HALF = (3.0, 1.4, 2.5)
+CENTERS = ((0.4, -0.3, 0.2), (-0.6, -0.1, 0.5), (0.1, -0.2, -0.8))
+Picture = NDArray[np.uint8]
+
+
+class Box:
+    """Views of a box: plain walls of different greys whose ranges are 3 % too large, and a textured exact floor."""
+
+    def __init__(self) -> None:
+        self.truth: dict[str, NDArray[np.float32]] = {}
+        self.walls: dict[str, NDArray[np.bool_]] = {}
+        self.maps: dict[str, RangeMap] = {}
+        self.pictures: dict[str, Picture] = {}
+        self.cams: dict[str, Rigid3] = {}
+        noise = np.random.default_rng(3)
+        for number, center in enumerate(CENTERS):
+            name = f"{number}.png"
+            ranges, normals = box_range(SIZE, HALF, center)
+            wall, floor = np.abs(normals[..., 1]) < 0.5, normals[..., 1] < -0.5
+            greys = np.select([normals[..., 0] > 0.5, normals[..., 0] < -0.5, wall], [200.0, 170.0, 225.0], 120.0)
+            greys = np.where(floor, noise.integers(20, 100, SIZE), greys)
+            self.truth[name], self.walls[name] = ranges, wall
+            self.pictures[name] = np.repeat(greys[..., None], 3, axis=-1).astype(np.uint8)
+            edge = wall & has_texture(self.pictures[name])
+            self.maps[name] = as_map(np.where(wall, 1.03 * ranges, ranges), np.where(edge, SEEN, TRUSTED))
+            self.cams[name] = Rigid3.from_center(np.eye(3), center)
+
+    def structure(self, frame: str = "y down") -> Structure:
+        poses = Poses.without_points(self.cams, frame=frame, scale="", metric=True)
+        return find_structure(poses, self.maps, self.pictures.__getitem__, rng=np.random.default_rng(0))
+
+    def laid(self, structure: Structure, name: str = "0.png", **changes: Any) -> RangeMap:
+        others = [other for other in self.maps if other != name]
+        given: dict[str, Any] = {"range_map": self.maps[name], "sources": [self.maps[other] for other in others]}
+        given |= changes
+        return lay_structure(
+            given["range_map"],
+            self.pictures[name],
+            structure,
+            cam_from_world=self.cams[name],
+            sources=given["sources"],
+            source_poses=[self.cams[other] for other in others],
+        )[0]
+
+
+@pytest.fixture(scope="module")
+def box() -> Box:
+    return Box()
+
+
+@pytest.fixture(scope="module")
+def planes(box: Box) -> Structure:
+    return box.structure()
+
+
+def test_edges_place_walls_whose_ranges_are_biased(planes: Structure) -> None:
+    planes.check()
+    expected = np.concatenate([sign * np.eye(3) for sign in (1.0, -1.0)])
+    for normal in expected:
+        cosine = planes.normals_in_world @ normal
+        nearest = int(np.argmax(cosine))
+        assert cosine[nearest] > np.cos(np.radians(0.5))
+        assert planes.offsets[nearest] == pytest.approx(-np.abs(normal) @ HALF, rel=0.01)
+    assert len(planes) == 6
+
+
+def test_pixels_move_to_the_walls_that_they_show(box: Box, planes: Structure) -> None:
+    result = box.laid(planes)
+    result.check()
+    error = np.abs(result.range / box.truth["0.png"] - 1)
+    assert np.mean(error < 0.01) > 0.97
+    assert (result.confidence[box.walls["0.png"]] >= 128).mean() > 0.8
+
+
+def test_what_stands_before_a_wall_stays(box: Box, planes: Structure) -> None:
+    own = box.maps["0.png"]
+    area = np.zeros(SIZE, np.bool_)
+    area[60:70, 100:120] = True
+    before = replace(own, range=np.where(area, 0.7 * own.range, own.range).astype(np.float32))
+    np.testing.assert_array_equal(box.laid(planes, range_map=before).range[area], before.range[area])
+
+
+def test_a_plane_is_not_laid_where_another_view_sees_through_it(box: Box, planes: Structure) -> None:
+    """The others see 2.5 times as far through the wall ahead, as through a door."""
+    ahead = ray_grid(SIZE)[..., 2] > 0.5
+    others = [
+        replace(box.maps[name], range=np.where(ahead, 2.5 * box.truth[name], box.maps[name].range).astype(np.float32))
+        for name in ("1.png", "2.png")
+    ]
+    middle = ray_grid(SIZE)[..., 2] > 0.98
+    result = box.laid(planes, sources=others)
+    np.testing.assert_array_equal(result.range[middle], box.maps["0.png"].range[middle])
+
+
+def test_without_gravity_there_are_no_planes(box: Box) -> None:
+    structure = box.structure(frame="the first registered camera")
+    assert len(structure) == 0
+    np.testing.assert_array_equal(box.laid(structure).range, box.maps["0.png"].range)
+
+
+def test_a_structure_is_checked() -> None:
+    wrong = Structure(np.array([[0.0, 2.0, 0.0]]), np.ones(1), np.ones(1), np.zeros(1, np.int32))
+    with pytest.raises(ContractError, match="unit length"):
+        wrong.check()
+    with pytest.raises(ContractError, match="not positive"):
+        Structure(np.array([[0.0, 1.0, 0.0]]), np.ones(1), np.zeros(1), np.zeros(1, np.int32)).check()

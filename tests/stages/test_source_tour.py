@@ -1,0 +1,71 @@
+"""Virtual tours of cube tiles are read as panoramas, whatever program wrote them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.faces.cube import CUBE
+from pano_mvs.core.errors import InputError
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.geometry import ray_grid
+from pano_mvs.io.images.tours import list_scenes
+from pano_mvs.stages.source_tour import TourParams, list_tour, tour
+from tests.io.images.tours import LAYOUTS, NAMES, color_of, face_of, write, write_tour
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scenes_become_panoramas_with_the_front_in_the_middle(tmp_path: Path, layout: str) -> None:
+    params = TourParams.model_validate({"path": write_tour(tmp_path / "tour", layout)})
+    items = list(list_tour(params))
+    assert [Path(item.name).stem.removesuffix(".tiles") for item in items] == ["1-hall", "2-room"]
+    assert all(len(item.files) == 24 for item in items), "the finest level has four tiles in each face"
+    for number, item in enumerate(items):
+        scratch = tmp_path / str(number)
+        scratch.mkdir()
+        panorama = tour(item, params, Context(np.random.default_rng(0), scratch, 1))
+        panorama.check()
+        assert panorama.size_hw == (128, 256)
+        difference = panorama.load().astype(int) - color_of(ray_grid((128, 256)), number)
+        assert np.abs(difference).max() <= 6
+        assert np.abs(difference).mean() < 1
+
+
+@pytest.mark.parametrize("form", ["{scene}_{face}", "{scene}/{face}", "{scene}/{name}", "tiles/{scene}.{name}"])
+def test_six_files_are_a_scene(tmp_path: Path, form: str) -> None:
+    for number, scene in enumerate(("hall", "room")):
+        for face in CUBE:
+            path = tmp_path / f"{form.format(scene=scene, face=face, name=NAMES[face])}.png"
+            write(path, face_of(face, number))
+    (tmp_path / "thumbnail.png").touch()
+    scenes = list_scenes(tmp_path, [])
+    assert [scene.name for scene in scenes] == ["hall", "room"]
+    assert {tile[0] for tile in scenes[0].tiles} == set(CUBE)
+
+
+def test_scenes_without_a_whole_cube_are_named(tmp_path: Path) -> None:
+    write_tour(tmp_path, "Pannellum", ("1", "2", "3"))
+    (tmp_path / "tour/2/2/u1_1.png").unlink()
+    notes: list[str] = []
+    assert [scene.name for scene in list_scenes(tmp_path, notes)] == ["1", "3"]
+    assert notes == ["1 scenes have no complete cube and are skipped: tour/2"]
+    (tmp_path / "tour/1/2/f0_0.png").unlink()
+    with pytest.raises(InputError, match=r"only one scene \(3\)|contains only one scene"):
+        list(list_tour(TourParams.model_validate({"path": tmp_path})))
+
+
+def test_a_folder_without_cubes_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "a.png", face_of("f"))
+    with pytest.raises(InputError, match=r"no tour here\. Six faces of a cube are needed"):
+        list_scenes(tmp_path, [])
+
+
+def test_tiles_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
+    write_tour(tmp_path, "Pannellum")
+    write(tmp_path / "tour/1-hall/2/r0_1.png", face_of("r")[:20, :20])
+    params = TourParams.model_validate({"path": tmp_path})
+    (tmp_path / "scratch").mkdir()
+    with pytest.raises(InputError, match=r"do not fit together|not squares of one size"):
+        tour(next(iter(list_tour(params))), params, Context(np.random.default_rng(0), tmp_path / "scratch", 1))
