@@ -11,7 +11,7 @@ RUN apt-get update \
 COPY pyproject.toml README.md LICENSE /src/
 COPY pano_mvs /src/pano_mvs
 COPY workflows /src/workflows
-RUN pip install --no-cache-dir '/src[exr,heic,mesh]' && rm -rf /src
+RUN pip install --no-cache-dir '/src[exr,heic]' && rm -rf /src
 
 # Compiled kernels are stored here. Mount a volume to keep them between runs; any user may write.
 RUN mkdir --mode=1777 /cache

@@ -1,4 +1,7 @@
-"""Functions are short, have few parameters, and take at most three of them by position.
+"""Functions are short, have few parameters, and take at most three of them by position; modules are not split finely.
+
+A kernel may be as long as its formula. A module that serves only one module beside it belongs there, unless it is an
+idea of its own, because a reader should open at most three files for one question.
 
 Compiled code may take more by position, because numba compiles calls with positional arguments to less code. The engine
 passes the inputs of a stage by port, and typer the options of a command by name, so these two are exempt as well.
@@ -7,7 +10,9 @@ passes the inputs of a stage by port, and typer the options of a command by name
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +22,8 @@ PACKAGE = Path(__file__).parents[1] / "pano_mvs"
 MAX_POSITIONAL = 3
 MAX_PARAMETERS = 12
 MAX_LINES = 60
+SMALL_MODULE_LINES = 120
+MAX_SHARE_OF_SMALL_MODULES = 1 / 8
 CALLED_BY_NAME = {"command", "stage"}
 # Each option of a command is a parameter of its function.
 MANY_PARAMETERS = {"cli/app.py:run", "cli/app.py:view_results", "cli/evaluate/app.py:depth"}
@@ -82,7 +89,51 @@ def test_no_function_has_many_parameters(functions: list[Function]) -> None:
 
 
 def test_no_function_is_long(functions: list[Function]) -> None:
-    assert [one.place for one in functions if one.lines > MAX_LINES] == []
+    assert [one.place for one in functions if one.lines > MAX_LINES and not one.is_compiled] == []
+
+
+def serving_only_one_beside_them(texts: Mapping[str, str]) -> list[str]:
+    """Return the small modules that a single other module, of their folder, imports.
+
+    A folder that imports its modules in its `__init__` to register them, as that of the stages, does not split them.
+
+    Args:
+        texts: dotted names of all modules of a package, to their sources.
+    """
+    users = defaultdict[str, set[str]](set)
+    for user, text in texts.items():
+        for module, names in re.findall(r"^ *from ([\w.]+) import ([^(\n]*)", text, re.MULTILINE):
+            for found in (module, *(f"{module}.{name.split()[0]}" for name in names.split(",") if name.strip())):
+                users[found].add(user)
+    small = [module for module in texts if texts[module].count("\n") <= SMALL_MODULE_LINES]
+    folders = {module: module.rpartition(".")[0] for module in texts}
+    return [
+        module
+        for module in small
+        if [folders[user] for user in users[module] - {f"{folders[module]}.__init__"}] == [folders[module]]
+    ]
+
+
+def test_few_modules_serve_only_a_module_beside_them() -> None:
+    places = {path: path.relative_to(PACKAGE.parent).with_suffix("").parts for path in PACKAGE.rglob("*.py")}
+    texts = {".".join(parts): path.read_text(encoding="utf-8") for path, parts in places.items()}
+    small = serving_only_one_beside_them(texts)
+    assert len(small) > 20, "they are not recognised"
+    assert len(small) < MAX_SHARE_OF_SMALL_MODULES * len(texts), small
+
+
+def test_a_module_that_serves_only_one_beside_it_is_recognised() -> None:
+    texts = {
+        "p.a": "from p.b import x\nfrom p.q.c import y\nfrom p import d, e\n",
+        "p.b": "x = 1\n",
+        "p.d": "z = 1\n",
+        "p.e": "w = 1\n" * 200,
+        "p.f": "from p.g import (\n    one,\n)\n",
+        "p.g": "one = 1\n",
+        "p.h": "from p.g import one\n",
+        "p.q.c": "y = 1\n",
+    }
+    assert serving_only_one_beside_them(texts) == ["p.b", "p.d"]
 
 
 @pytest.mark.parametrize(

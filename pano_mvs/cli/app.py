@@ -114,6 +114,9 @@ def run(
     keep_going: Annotated[
         bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
     ] = False,
+    isolate: Annotated[
+        bool, typer.Option("--isolate", help="Compute each unit of a plugin's stage in a process of its own.")
+    ] = False,
     min_free: MinFreeOption = "",
     durable: DurableOption = False,
     dry_run: Annotated[
@@ -132,7 +135,8 @@ def run(
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
-    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
+    limits = tuple(until or ()), tuple(only or ()), tuple(refresh or ())
+    run_options = RunOptions(*limits, accept_code, keep_going, isolate)
     session = open_session(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )

@@ -9,6 +9,14 @@ import typer
 
 from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
 
+
+def _given_path(text: str) -> Path:
+    """Return the path that an option states, which is empty for a variable of the shell without a value."""
+    if not text:
+        raise typer.BadParameter("the name is empty")
+    return Path(text)
+
+
 WorkflowArgument = Annotated[
     str,
     typer.Argument(
@@ -24,7 +32,13 @@ TargetArgument = Annotated[
     ),
 ]
 ImagesOption = Annotated[
-    Path | None, typer.Option("--images", help="Folder of panoramas, or a video; default: that of the workflow.")
+    Path | None,
+    typer.Option(
+        "--images",
+        parser=_given_path,
+        metavar="PATH",
+        help="Folder of panoramas, or a video; default: that of the workflow.",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from pano_mvs.core.arrays import Picture
 
 WIDTH = 1024
 INK = (60, 60, 60)
 _MARGIN_PX = 8
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-
-Picture = NDArray[np.uint8]
 
 
 def strip(height: int, text: str = "") -> Picture:

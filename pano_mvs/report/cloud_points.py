@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.rendering.viewpoints import horizontal_axes
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud
-
-FloatArray = NDArray[np.float64]
 
 VERSION = 1
 """Raise it when the encoding changes: points of earlier pages are then encoded again."""

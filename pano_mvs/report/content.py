@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pano_mvs.report.advice import MAX_SUGGESTIONS, advice
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.capture_facts import CaptureFacts, capture_facts
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
-from pano_mvs.report.completeness import Shares
+from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
-from pano_mvs.report.panorama_rows import Row, panorama_rows
-from pano_mvs.report.thumbnails import measured_shares, thumbnails
-from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
+from pano_mvs.report.view_cards import ViewCard, chosen_views, key_of, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.next_time import Suggestion, marks_of
+from pano_mvs.results.pictures import Picture, picture, preview_panels
 from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
@@ -27,6 +30,145 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.pairs_and_views import pair_name
 from pano_mvs.scene.scores import NO_TRUTH
+
+MAX_THUMBNAILS = 1000
+MAX_MEASURED = 1000
+MAX_BYTES = 6_000
+_WIDTH = 160
+_THREADS = 2
+_VERSION = 2
+
+
+def thumbnails(
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, *, kept: EarlierPage
+) -> dict[str, Picture]:
+    """Return small images of at most 1,000 evenly spaced views, by name."""
+    chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept=kept), chosen)
+        return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
+
+
+def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
+    """Return the shares of the sphere of at most 1,000 evenly spaced views, by name; the sky does not count."""
+    found: dict[str, Shares] = {}
+    for idx in _evenly(len(views), MAX_MEASURED):
+        name = views[idx].name
+        key = key_of(results, name, "s", version=_VERSION)
+        shares = shares_from_fact(kept.fact(key)) if key else None
+        if shares is None and key:
+            confidence = results.confidence(name)
+            sky = results.sky(name)
+            shares = shares_of(confidence, None if sky is None else ~sky) if confidence is not None else None
+            if shares is not None:
+                kept.keep(key, fact_of(shares))
+        if shares is not None:
+            found[name] = shares
+    return found
+
+
+def _evenly(count: int, most: int) -> list[int]:
+    return sorted({round(at) for at in np.linspace(0, count - 1, min(count, most))}) if count else []
+
+
+def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept: EarlierPage) -> Picture | None:
+    key = key_of(results, view.name, "t", version=_VERSION)
+    known = kept.picture(key) if key else None
+    if known is not None:
+        return known
+    panels = preview_panels(out_dir, view.preview, small=True)
+    return picture(np.vstack(panels), width=_WIDTH, most_bytes=MAX_BYTES, key=key) if panels else None
+
+
+MAX_ROWS = 5000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One panorama.
+
+    Attributes:
+        name: of the image.
+        registered: whether it has a pose; None if no stage computed poses.
+        reason: why it was left out, or "".
+        doubtful: why its pose is doubtful, or "".
+        shares: of the sphere around it, if measured.
+        completeness: share of pixels with a range, as its stage reported it, or None.
+        consistent: share of pixels on which other views agree, likewise.
+        links: number of images with which it has a common geometry.
+        residual_deg: median reprojection residual, or None.
+        p95_deg: 95 % of its residuals are smaller, or None.
+        thumbnail: its preview, or None.
+        group: number of its group; None if there is only one group.
+    """
+
+    name: str
+    registered: bool | None
+    reason: str
+    doubtful: str
+    shares: Shares | None
+    completeness: float | None
+    consistent: float | None
+    links: int
+    residual_deg: float | None
+    p95_deg: float | None
+    thumbnail: Picture | None
+    group: int | None = None
+
+    @property
+    def doubt(self) -> float:
+        """Sort key, largest first: panoramas left out, doubtful ones, then those with the smallest shares."""
+        if self.reason or self.doubtful:
+            return 4.0 if self.reason else 3.0
+        known = (self.completeness or 0.0) + (self.consistent or 0.0)
+        return round(2.0 - known, 4)
+
+
+def panorama_rows(
+    summary: RunSummary,
+    *,
+    shares: Mapping[str, Shares],
+    residuals: Residuals | None,
+    thumbnails: Mapping[str, Picture],
+) -> tuple[Row, ...]:
+    """Return at most 5,000 rows in the order of the capture, followed by images that were left out.
+
+    Args:
+        summary: of the run.
+        shares: image name to its shares of the sphere.
+        residuals: of the points, if known.
+        thumbnails: image name to its small picture.
+    """
+    poses = summary.poses
+    registered = set(poses.registered)
+    rejected = {name: rejection.reason for name, rejection in summary.rejected.items()} | dict(poses.rejected)
+    figures = {view.name: view for view in summary.views}
+    links = Counter(name for link in poses.links if link.inliers for name in link[:2])
+    group_of = {name: number for number, group in enumerate(poses.groups) for name in group.images if poses.groups[1:]}
+    doubts = summary.doubtful_images
+    order = [*poses.registered, *figures, *poses.rejected, *summary.rejected, *doubts]
+    rows = []
+    for name in list(dict.fromkeys(order))[:MAX_ROWS]:
+        median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
+        view = figures.get(name, ViewSummary())
+        rows.append(
+            Row(
+                name,
+                name in registered if poses else None,
+                rejected.get(name, ""),
+                doubts.get(name, ""),
+                shares.get(name),
+                view.completeness,
+                view.consistent,
+                links[name],
+                median,
+                p95,
+                thumbnails.get(name),
+                group_of.get(name),
+            )
+        )
+    return tuple(rows)
+
 
 _MAX_REASONS = 300
 

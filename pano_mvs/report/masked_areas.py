@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
+from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import InputError
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture, resized
@@ -27,8 +28,6 @@ MAX_PICTURES = 12
 MAX_BYTES = 50_000
 _WIDTH = 640
 _EXAMINED_HW = (256, 512)
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

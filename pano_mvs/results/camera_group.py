@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.results.coverage import ViewCoverage
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import PosesSummary
-
-FloatArray = NDArray[np.float64]
 
 _KNOWN_NEIGHBOURS = 6
 

@@ -11,15 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.results.records import Direction
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 VERSION = 1
 """Raise it when the figures change: those of earlier pages are then computed again."""

@@ -139,7 +139,7 @@ def _groups(summary: RunSummary) -> list[Finding]:
     text = (
         f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
         f"largest has {largest} {plural(largest, 'panorama')}; "
-        f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}."
+        f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}. They may also be different places."
     )
     return [Finding("fair", text, pictures_between(groups))]
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.results.camera_group import CameraGroup, shortest_tree
@@ -19,8 +18,6 @@ from pano_mvs.results.findings import compares_views
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.thresholds import FAIR_CONSISTENT
-
-FloatArray = NDArray[np.float64]
 
 MIN_CAMERAS = 4
 """Spacing, links and confirmed shares are compared within a group only if it has at least this many cameras."""

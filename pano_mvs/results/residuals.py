@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 _MAX_OBSERVATIONS = 2_000_000
 _BLOCK = 250_000

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import resolved
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
@@ -173,6 +173,6 @@ def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef])
     sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
     folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
     for name, ref in refs.items() if folder else ():
-        path = Path(str(folder)) / name
-        if any(part.external for part in ref.parts.values()) and is_file(path):
+        path = summary.source_file(name, Path(str(folder)))
+        if path is not None and any(part.external for part in ref.parts.values()):
             store.blobs.register_external(path)

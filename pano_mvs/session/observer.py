@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from pano_mvs.core.kernel_cache import count_compiled
 from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
 from pano_mvs.session.progress import (
     Event,
+    KernelsCompiled,
     Progress,
     StageFinished,
     StageStarted,
@@ -29,6 +31,7 @@ class EventObserver:
         self._clock = clock
         self._estimator = TimeEstimator(clock)
         self._next_estimate_s = clock() + _ESTIMATE_EVERY_S
+        self._kernels_before = self._kernels = count_compiled()
 
     def report(self, event: Event) -> None:
         """Pass on an event, and the time left if its last event is a second ago."""
@@ -60,10 +63,18 @@ class EventObserver:
         self.report(StageFinished(stage=summary.name, **counts, **times, metrics=dict(summary.metrics)))
 
     def waiting(self) -> None:
-        """Report the time left."""
-        if self._clock() >= self._next_estimate_s:
-            self._next_estimate_s = self._clock() + _ESTIMATE_EVERY_S
-            self._progress(self._estimator.estimate())
+        """Report how many kernels have been compiled, and the time left."""
+        now = self._clock()
+        if now < self._next_estimate_s:
+            return
+        since_s = now - self._next_estimate_s + _ESTIMATE_EVERY_S
+        self._next_estimate_s = now + _ESTIMATE_EVERY_S
+        if (kernels := count_compiled()) > self._kernels:
+            self._kernels = kernels
+            compiled = KernelsCompiled(kernels - self._kernels_before, round(since_s, 6))
+            self._estimator(compiled)
+            self._progress(compiled)
+        self._progress(self._estimator.estimate())
 
     def warn(self, text: str) -> None:
         """Pass the event on."""

@@ -69,6 +69,15 @@ class RunPlan:
         return tuple(one.stage for one in self.forecasts if one.seconds is None)
 
     @property
+    def may_run(self) -> tuple[int, bool]:
+        """Number of further units that may have to be computed, and whether that of all stages is known or expected."""
+        open_stages = {plan.name: len(plan.run) for plan in self.stages if plan.open}
+        expected = [one for one in self.forecasts if one.stage in open_stages]
+        count = sum(len(plan.may_run) for plan in self.stages if not plan.open)
+        count += sum(max(0, one.units - open_stages[one.stage]) for one in expected if one.units is not None)
+        return count, all(one.units is not None for one in expected)
+
+    @property
     def may_follow(self) -> bool:
         """Whether more units may have to be computed, depending on their results."""
         return any(plan.may_run or plan.open for plan in self.stages)

@@ -1,8 +1,8 @@
 """Events of a run, as typed records for a callback.
 
-A run reports `RunStarted` and `Forecast`, then events of its stages and units, and now and then `TimeLeft`, then
-`RunFinished`, which is always the last. Stages overlap. If a damaged file is found in the cache, the run starts over:
-`StageStarted` is repeated for every stage, and earlier counts no longer apply.
+A run reports `RunStarted` and `Forecast`, then events of its stages and units, and now and then `KernelsCompiled` and
+`TimeLeft`, then `RunFinished`, which is always the last. Stages overlap. If a damaged file is found in the cache, the
+run starts over: `StageStarted` is repeated for every stage, and earlier counts no longer apply.
 """
 
 from __future__ import annotations
@@ -72,6 +72,20 @@ class TimeLeft:
     at_least: bool = False
     done: float = 0.0
     unknown: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class KernelsCompiled:
+    """Workers are compiling kernels, which happens once for a version; this event comes at most once a second.
+
+    Attributes:
+        kernels: number of kernels that have been compiled during the run.
+        seconds: since the number was looked up last.
+    """
+
+    kind: ClassVar[str] = "kernels_compiled"
+    kernels: int
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +210,7 @@ class RunFinished:
 Event = (
     RunStarted
     | Forecast
+    | KernelsCompiled
     | StageStarted
     | UnitStarted
     | UnitFailed

@@ -176,24 +176,27 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         )
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
+    started, run = datetime.now(UTC), None
     try:
-        output = _run_locked(session, store, executor, observer=observer)
-        end = _finished(output.summary, end)
-        return output
+        run = _new_run(session, store, executor, observer=observer)
+        with output_lock(session.out):
+            if (forecast := forecast_run(run)) is not None:
+                observer.report(forecast)
+            summary, values = _execute(run, started, clock)
+        end = _finished(summary, end)
+        return RunOutput(session.out, summary, values, written=tuple(run.result.written))
     except PanoMvsError as error:
-        end = replace(end, exit_code=error.exit_code, stopped=str(error))
+        end = replace(_counted(run, end), exit_code=error.exit_code, stopped=str(error))
         raise
     except KeyboardInterrupt:
-        end = replace(end, exit_code=INTERRUPTED, stopped="interrupted")
+        end = replace(_counted(run, end), exit_code=INTERRUPTED, stopped="interrupted")
         raise
     finally:
         progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
-def _run_locked(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> RunOutput:
-    """Run while no other run writes into the output folder."""
-    started, clock = datetime.now(UTC), time.perf_counter()
-    run = Run(
+def _new_run(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> Run:
+    return Run(
         session.workflow,
         session.graph,
         store,
@@ -202,11 +205,6 @@ def _run_locked(session: Session, store: Store, executor: Executor, *, observer:
         executor=executor,
         options=session.run_options,
     )
-    with output_lock(session.out):
-        if (forecast := forecast_run(run)) is not None:
-            observer.report(forecast)
-        summary, values = _execute(run, started, clock)
-    return RunOutput(session.out, summary, values, written=tuple(run.result.written))
 
 
 def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:
@@ -244,6 +242,13 @@ def _finished(summary: RunSummary, end: RunFinished) -> RunFinished:
         verdict=summary.verdict,
         doubts=dict(summary.doubtful_images),
     )
+
+
+def _counted(run: Run | None, end: RunFinished) -> RunFinished:
+    """Return the event with the units of a run that did not finish."""
+    stages = run.result.stages if run is not None else []
+    names = ("run", "cached", "failed", "blocked")
+    return replace(end, **{name: sum(getattr(stage, name) for stage in stages) for name in names})
 
 
 def min_free_bytes(size: str = "") -> int:

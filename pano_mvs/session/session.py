@@ -77,6 +77,8 @@ def open_session(
         UsageError: if a stage reads the folder of the cache.
     """
     path, is_preset = find_workflow(str(name), presets_folder())
+    if images == "":
+        raise InputError("--images: the name of the folder is empty. Give the folder that holds the panoramas")
     images = None if images is None else Path(images)
     if images is not None:
         _check_images(images)

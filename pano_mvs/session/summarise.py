@@ -152,7 +152,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
 
 
 def _links(run: Run) -> tuple[PairLink, ...]:
-    """Return the pairs that were matched, with what later stages, such as matches.bridges, found."""
+    """Return the pairs that were matched, with what later stages that judge all pairs found."""
     matched: dict[tuple[str, ...], Mapping[str, float]] = {}
     for stage in run.result.stages:
         if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):

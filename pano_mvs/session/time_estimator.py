@@ -21,6 +21,7 @@ from pano_mvs.engine.planning.forecast import StageForecast, makespan
 from pano_mvs.session.progress import (
     Event,
     Forecast,
+    KernelsCompiled,
     RunFinished,
     RunStarted,
     StageFinished,
@@ -76,6 +77,10 @@ class StageProgress:
         if not self.running:
             self._began = now
         self.running[item] = now
+
+    def wait(self, seconds: float, now: float) -> None:
+        """Note that running units have waited, as they do for kernels to be compiled: other units will not."""
+        self.running = {item: min(now, began + seconds) for item, began in self.running.items()}
 
     def end(self, item: str, now: float) -> None:
         """Note that a unit is settled."""
@@ -176,6 +181,9 @@ class TimeEstimator:
                 self._report_s = event.report_s
                 for forecast in event.stages:
                     self._of(forecast.stage).forecast = forecast
+            case KernelsCompiled():
+                for stage in self.stages.values():
+                    stage.wait(event.seconds, self._clock())
             case StageStarted():
                 # A run that starts over repeats its stages, and finishes again what it has computed.
                 self.stages[event.stage] = StageProgress(self._of(event.stage).forecast, event.units)

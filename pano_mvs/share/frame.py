@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
-
-FloatArray = NDArray[np.float64]
 
 
 def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:

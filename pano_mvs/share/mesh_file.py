@@ -77,14 +77,11 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
 
     Args:
         mesh: the mesh.
-        max_faces: number of triangles; 0 for all.
+        max_faces: number of triangles.
     """
-    if mesh.texture is not None or not 0 < max_faces < len(mesh.faces):
+    if mesh.texture is not None or max_faces >= len(mesh.faces):
         return mesh, ""
-    try:
-        import fast_simplification  # type: ignore[import-untyped, unused-ignore]
-    except ImportError:
-        return mesh, f"all {len(mesh.faces):,} triangles are written; to thin them: pip install 'pano-mvs[mesh]'"
+    import fast_simplification  # type: ignore[import-untyped, unused-ignore]
     from scipy.spatial import cKDTree
 
     vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=max_faces)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.file_names import path_inside
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart
@@ -52,7 +53,10 @@ def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap],
         file_from_world = np.array(about["file_from_world"], np.float64).reshape(3, 3)
         page_from_file = page_from_world @ Rigid3(file_from_world.T, np.zeros(3))
         storeys = [entry for entry in about["storeys"] if "png" in entry]
-        plans = [_storey(entry, decode_image(path.parent / entry["png"]), page_from_file) for entry in storeys]
+        plans = [
+            _storey(entry, decode_image(path_inside(path.parent, str(entry["png"]))), page_from_file)
+            for entry in storeys
+        ]
     except (ValueError, KeyError, TypeError, InputError) as error:
         return [], f"{path} was left out: it is not as export.floor_plan writes it ({error})"
     return plans, ""

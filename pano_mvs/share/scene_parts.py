@@ -65,13 +65,13 @@ def shown_cloud(cloud: PointCloud | None, frame: Rigid3, *, max_points: int) -> 
     Args:
         cloud: of one group; None for an empty one.
         frame: page_from_world.
-        max_points: 0 for all.
+        max_points: the largest number of points.
     """
     if cloud is None:
         empty = np.zeros((0, 3), np.float32)
         cloud = PointCloud(empty, empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
     chosen = np.arange(len(cloud))
-    if 0 < max_points < len(cloud):
+    if max_points < len(cloud):
         chosen = np.sort(np.random.default_rng(0).choice(len(cloud), max_points, replace=False))
     turned = PointCloud(
         frame.apply(cloud.points_in_world[chosen]).astype(np.float32),

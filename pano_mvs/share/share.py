@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import PointCloud, Poses
@@ -138,7 +138,7 @@ def _put_geometry(
     """Write cloud, mesh and maps; return what the page needs to know of them, and notes."""
     shown = shown_cloud(cloud, frame, max_points=options.max_points)
     described = put_cloud(page, shown)
-    mesh, note = run_mesh(run)
+    mesh, note = run_mesh(run) if options.max_triangles else (None, "")
     notes = [note]
     described["mesh"] = None
     if mesh is not None:
@@ -184,10 +184,9 @@ def _image(run: RunOutput, name: str, images: Path | None) -> NDArray[np.uint8] 
     """Return a panorama from the given folder, else from where the run found it; None if it is not there."""
     if images is None and (view := run.views.get(name)) is not None:
         return view.image
-    folder = images or run.summary.source_folder
-    return decode_image(folder / name) if folder is not None and is_file(folder / name) else None
+    path = run.summary.source_file(name, images)
+    return decode_image(path) if path is not None else None
 
 
 def _may_have_image(run: RunOutput, name: str, images: Path | None) -> bool:
-    folder = images or run.summary.source_folder
-    return (images is None and name in run.views) or (folder is not None and is_file(folder / name))
+    return (images is None and name in run.views) or run.summary.source_file(name, images) is not None

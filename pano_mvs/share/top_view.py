@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.scene import PointCloud
-
-FloatArray = NDArray[np.float64]
 
 MAP_PIXELS = 512
 """Length of the longer side of a map."""

@@ -87,6 +87,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "numba": {"version": "1", "disabled": False},
     "pycolmap": {"version": "2"},
     "cv2": {"version": "3", "video": True, "avif": True},
+    "onnxruntime": {"version": "6"},
     "pyvista": {"version": "4"},
     "torch": {"version": "5", "devices": ["Card 7, 24 GB"], "built_for": "12.4"},
 }
@@ -107,7 +108,7 @@ def test_libraries_that_work_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:
     answering(monkeypatch, {})
     found = by_what(library_findings())
     assert {what: finding.state for what, finding in found.items()} == dict.fromkeys(
-        ["numba", "pycolmap", "OpenCV", "PyVista", "torch"], "ok"
+        ["numba", "pycolmap", "OpenCV", "ONNX Runtime", "PyVista", "torch"], "ok"
     )
     assert "Card 7" in found["torch"].detail
     assert found["OpenCV"].detail == "3, reads images"
@@ -124,6 +125,7 @@ def test_libraries_that_work_are_ok(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"cv2": "AssertionError"}, "OpenCV", "failed", "opencv-python-headless"),
         ({"cv2": {**GOOD["cv2"], "video": False}}, "OpenCV video", "warning", "reads no videos"),
         ({"cv2": {**GOOD["cv2"], "avif": False}}, "OpenCV AVIF", "note", "reads no AVIF"),
+        ({"onnxruntime": "UsageError: damaged"}, "ONNX Runtime", "failed", "damaged"),
         ({"pyvista": "gave no answer within 180 s"}, "PyVista", "warning", "libgl1"),
         ({"torch": {"version": "5", "devices": [], "built_for": None}}, "torch", "note", "built without CUDA"),
         ({"torch": "ImportError: libcuda"}, "torch", "warning", "backend: numba"),
@@ -254,7 +256,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
 def test_the_real_libraries_work_here() -> None:
     findings = list(command.all_findings())
     found = {finding.what: finding.state for finding in findings}
-    assert found["numba"] == found["pycolmap"] == found["OpenCV"] == "ok"
+    assert found["numba"] == found["pycolmap"] == found["OpenCV"] == found["ONNX Runtime"] == "ok"
     assert str(kernel_cache_folder()) in next(
         finding.detail for finding in findings if finding.what == "compiled kernels"
     )

@@ -27,15 +27,19 @@ stages:
 def test_pictures_of_every_kind_are_one_capture(pano_mvs: Command, tmp_path: Path) -> None:
     photos = tmp_path / "photos" / "day 1 – außen"
     photos.mkdir(parents=True)
-    picture = Image.fromarray(cv2.resize(counted(3), (128, 64)))
-    for suffix, kind in (("JPG", "JPEG"), ("png", "PNG"), ("Tif", "TIFF"), ("webp", "WEBP"), ("AVIF", "AVIF")):
+    rng = np.random.default_rng(3)
+    pictures = [Image.fromarray(rng.integers(0, 255, (64, 128, 3)).astype(np.uint8)) for _ in range(8)]
+    kinds = (("JPG", "JPEG"), ("png", "PNG"), ("Tif", "TIFF"), ("webp", "WEBP"), ("AVIF", "AVIF"))
+    for (suffix, kind), picture in zip(kinds, pictures, strict=False):
         picture.save(photos / f"{kind}.{suffix}", kind)
     stream = io.BytesIO()
-    pillow_heif.from_pillow(picture).save(stream)
+    pillow_heif.from_pillow(pictures[5]).save(stream)
     (photos / "phone.HEIC").write_bytes(stream.getvalue())
-    sixteen = np.asarray(picture).astype(np.uint16) * 257
+    sixteen = np.asarray(pictures[6]).astype(np.uint16) * 257
     (photos / "deep.png").write_bytes(bytes(cv2.imencode(".png", sixteen)[1]))
-    data = (photos / "JPEG.JPG").read_bytes()
+    stream = io.BytesIO()
+    pictures[7].save(stream, "JPEG")
+    data = stream.getvalue()
     turned = data[:2] + app1(b"Exif\0\0" + exif(orientation=6)) + data[2:]
     (photos / "turned.jpg").write_bytes(turned)
     (tmp_path / "look.yaml").write_text(LOOK)

@@ -98,7 +98,7 @@ def test_status_of_an_output_folder_needs_nothing_else(
     assert found.code == 0
     assert "exit code 3" in found.text
     assert "thirteen is unlucky" in found.flat
-    assert "would run, more may follow" in found.flat
+    assert "would run, and" in found.flat
     assert "cannot run" not in found.text, "a failed unit is tried again"
     (here / "capture" / "3.txt").write_text("30")
     command = shlex.split(pano_mvs("status", here / "out").text.split("to compute this:\n")[1])

@@ -67,6 +67,14 @@ def test_the_page_names_enough_paths_to_be_of_use() -> None:
     assert len(PATHS) > 40
 
 
+def test_no_question_needs_more_than_three_places() -> None:
+    questions = {
+        question: re.findall(r"`([\w./]+/[\w./]*|workflows)`", places) for question, places, _ in rows("places")
+    }
+    assert len(questions) > 35
+    assert {question: places for question, places in questions.items() if not 1 <= len(places) <= 3} == {}
+
+
 def test_stages_are_defined_where_the_page_says() -> None:
     registry = Registry()
     registry.add_module(stages, "pano-mvs")

@@ -23,6 +23,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
+from tests.io.images.tours import write_tour
 from tests.io.images.videos import tiny_video
 
 ROOT = Path(__file__).parents[2]
@@ -34,6 +35,7 @@ FOLDERS = (
     "phone",
     "photos/lobby",
     "photos/flat",
+    "photos/house",
     "photos/site",
     "masks",
     "out/site/colmap/sparse/0",
@@ -47,6 +49,7 @@ FILES = ("walk.mp4", "mask.png", "rig.yaml", "phone/1.jpg")
 PICTURES = {
     "photos/lobby": ("hall.jpg", "stairs.jpg"),
     "photos/flat": ("1.jpg", "2.jpg"),
+    "photos/house": ("001.jpg", "002.jpg"),
     "photos/site/hall": ("0412.jpg", "0413.jpg"),
 }
 
@@ -129,6 +132,7 @@ def folder(tmp_path: Path) -> Path:
         (tmp_path / name).mkdir(parents=True)
     for name in FILES:
         (tmp_path / name).touch()
+    write_tour(tmp_path / "tour", "Marzipano")
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
-from pano_mvs.evaluation.clouds.pictures import _top_view
+from pano_mvs.evaluation.clouds.pictures import _top_view, distance_colors, write_error_cloud
 from pano_mvs.evaluation.drawing import WIDTH
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
 from pano_mvs.io.clouds.ply_reader import open_ply_points

@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.best_constant import best_constant_errors, best_constant_median
 from pano_mvs.evaluation.ranges.errors import BadLimit, range_errors
 from pano_mvs.evaluation.ranges.pixels import aligning_scale, scored_pixels, weighted_median, weighted_quantile
-from pano_mvs.evaluation.ranges.view_scores import PROTOCOLS, ScoreSettings, ViewScores, mean_scores, score_view
+from pano_mvs.evaluation.ranges.view_scores import (
+    PROTOCOLS,
+    ScoreSettings,
+    ViewScores,
+    best_constant_errors,
+    best_constant_median,
+    mean_scores,
+    score_view,
+)
 from pano_mvs.geometry import pixel_solid_angle
 from tests.oracles import range_scores as oracle
 

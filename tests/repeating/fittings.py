@@ -7,8 +7,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Colors, Pattern, Texture
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, Rod, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Rod, Surface, Vector
 from tests.repeating.drawings import Drawing, Kind
 from tests.repeating.prints import Print
 from tests.repeating.walks import Rect

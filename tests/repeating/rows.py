@@ -7,9 +7,9 @@ from typing import Unpack
 
 import numpy as np
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
 from pano_mvs.testing.scenes import Scene
-from pano_mvs.testing.surfaces import FloatArray
 from tests.repeating.fittings import Site, Wall
 from tests.repeating.visits import (
     PLASTER,

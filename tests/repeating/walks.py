@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pano_mvs.testing.surfaces import FloatArray
+from pano_mvs.core.arrays import FloatArray
 
 Rect: TypeAlias = tuple[float, float, float, float]
 Layout: TypeAlias = Literal["unordered", "path", "loop"]

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed
-from pano_mvs.report.color_scales import RangeScales, common_limits, range_ticks
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.page import write_report
-from pano_mvs.report.view_cards import ViewCard, view_cards
+from pano_mvs.report.view_cards import RangeScales, ViewCard, common_limits, range_ticks, view_cards
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary

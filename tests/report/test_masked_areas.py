@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.report.content import measured_shares
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.masked_areas import KINDS, chosen_pictures, masked_areas, masked_kinds
 from pano_mvs.report.page import write_report
-from pano_mvs.report.thumbnails import measured_shares
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.report import cloud_pictures, cloud_points, masked_areas, thumbnails, view_cards, write_report
+from pano_mvs.report import cloud_pictures, cloud_points, content, masked_areas, view_cards, write_report
 from pano_mvs.results.pictures import picture, preview_panels
 from pano_mvs.results.summary import RunSummary
 from tests.report.html_page import Page
@@ -56,7 +56,7 @@ def test_five_thousand_views_fit_with_all_their_pictures(tmp_path: Path) -> None
     write_report(tmp_path, RunSummary.from_json(large(5000)))
     text = (tmp_path / "report.html").stat().st_size
     cards = view_cards.MAX_CARDS * sum(view_cards.MAX_BYTES.values())
-    small = thumbnails.MAX_THUMBNAILS * thumbnails.MAX_BYTES
+    small = content.MAX_THUMBNAILS * content.MAX_BYTES
     cloud = 3 * cloud_pictures.MAX_BYTES + cloud_points.MAX_POINTS * cloud_points.POINT_BYTES
     masked = masked_areas.MAX_PICTURES * masked_areas.MAX_BYTES
     assert text + (cards + small + cloud + masked) * 4 / 3 + 1000 * 300 < MOST_BYTES
@@ -78,7 +78,7 @@ def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path: Pat
 def test_a_thousand_views_of_noise_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     monkeypatch.setattr(
-        thumbnails,
+        content,
         "preview_panels",
         lambda *_, **__: tuple(rng.integers(0, 255, (80, 160, 3), np.uint8) for _ in range(2)),
     )

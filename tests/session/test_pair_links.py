@@ -1,4 +1,4 @@
-"""The report shows all pairs of the stages that were used, also those that matches.bridges added."""
+"""The report shows all pairs of the stages that were used, also those that a stage which judges all pairs added."""
 
 from __future__ import annotations
 

@@ -56,6 +56,25 @@ def test_events_come_from_the_start_of_the_run_to_its_end(toy: Toy) -> None:
     assert (scaled.use, scaled.run, scaled.metrics["value"]) == ("toy.scale", 5, 30.0)
 
 
+def test_the_last_event_of_an_interrupted_run_counts_its_units(toy: Toy) -> None:
+    """It said that nothing was run and nothing was in the cache."""
+    run_toy(toy, until=("scaled",))
+    events: list[Event] = []
+
+    def interrupt(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, UnitFinished) and event.stage == "difference":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_toy(toy, progress=interrupt)
+    end = events[-1]
+    assert isinstance(end, RunFinished)
+    stated = pano_mvs.RunSummary.read(toy.folder / "out").units
+    assert (end.exit_code, end.run, end.cached) == (130, stated.run, stated.cached)
+    assert end.cached == 10
+
+
 def test_failed_units_are_in_the_summary_and_raise_nothing(toy: Toy) -> None:
     toy.number("3.txt", "13")
     events: list[Event] = []

@@ -10,10 +10,12 @@ import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.events import UnitStatus
+from pano_mvs.session import observer as observer_module
 from pano_mvs.session.observer import EventObserver
 from pano_mvs.session.progress import (
     Event,
     Forecast,
+    KernelsCompiled,
     RunFinished,
     RunStarted,
     StageFinished,
@@ -202,6 +204,15 @@ def test_the_start_of_a_worker_is_not_work() -> None:
     assert run.left(10.0).done > 0.09
 
 
+def test_compiling_kernels_does_not_make_a_stage_slow() -> None:
+    run = SimulatedRun(stage("a", 4, 10.0))
+    run.start("a", "1", units=4)
+    assert run.left(60.0).seconds_left > 100
+    run.estimator(KernelsCompiled(12, seconds=60.0))
+    assert run.left().seconds_left == pytest.approx(40.0)
+    assert run.left(4.0).seconds_left == pytest.approx(36.0)
+
+
 def test_unknown_stages_weigh_like_the_others_in_the_bar() -> None:
     run = SimulatedRun(stage("a", 1, 10.0), stage("b", None, None, "a"))
     run.start("a", "", units=1)
@@ -261,7 +272,8 @@ def test_a_countdown_glides_to_a_new_estimate_without_a_jump() -> None:
     assert Countdown().show(-1.0, 0.0) == 0.0
 
 
-def test_the_time_left_is_reported_once_a_second_beside_other_events() -> None:
+def test_the_time_left_is_reported_once_a_second_beside_other_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(observer_module, "count_compiled", lambda: 0)  # other processes may be compiling
     clock, events = Clock(), list[Event]()
     observer = EventObserver(events.append, clock)
     observer.report(RunStarted("w", ("a",), "processes", workers=1, threads=1, out=Path("out")))
@@ -276,3 +288,15 @@ def test_the_time_left_is_reported_once_a_second_beside_other_events() -> None:
     clock.now += 5
     observer.unit_finished("a", "1", status="run", seconds=10.0)
     assert [type(event) for event in events[-3:]] == [TimeLeft, UnitFinished, TimeLeft]
+
+
+def test_kernels_that_are_compiled_meanwhile_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = [7, 7, 9]
+    monkeypatch.setattr(observer_module, "count_compiled", lambda: compiled.pop(0))
+    clock, events = Clock(), list[Event]()
+    observer = EventObserver(events.append, clock)
+    clock.now += 5
+    observer.waiting()
+    clock.now += 3
+    observer.waiting()
+    assert [event for event in events if isinstance(event, KernelsCompiled)] == [KernelsCompiled(2, seconds=3.0)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import builtins
 import json
 import struct
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.results.run_output import load
-from pano_mvs.share import ShareOptions, share_run
+from pano_mvs.share import share_run
 from pano_mvs.share.glb_file import read_glb
 from pano_mvs.share.mesh_file import SharedMesh, run_mesh, thinned
 from pano_mvs.share.mesh_pieces import PIECE_FACES, VertexFacts, mesh_pieces, z_order
@@ -185,27 +184,11 @@ def test_many_triangles_are_thinned_and_keep_their_colours() -> None:
     assert 300 <= len(mesh.faces) <= 440
     assert mesh.colors_rgb is not None
     assert np.abs(mesh.colors_rgb.astype(int) - wall_color(mesh.vertices.astype(float))).max() < 60
-    assert thinned(mesh, 0)[0] is mesh
     assert thinned(textured_box(), 10)[0].texture is not None
 
 
-def test_without_the_library_all_triangles_are_written_and_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    load_module = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "fast_simplification":
-            raise ImportError(name)
-        return load_module(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    vertices, colors, faces = box_mesh()
-    mesh, note = thinned(SharedMesh(vertices, faces, colors_rgb=colors), 400)
-    assert len(mesh.faces) == len(faces)
-    assert "pip install 'pano-mvs[mesh]'" in note
-
-
 def test_the_page_has_the_mesh_in_its_own_frame_with_the_uncertainty_of_the_cloud(tmp_path: Path) -> None:
-    shared = share_run(box_run(tmp_path, points=3_000, mesh=True), tmp_path / "page", ShareOptions(max_triangles=0))
+    shared = share_run(box_run(tmp_path, points=3_000, mesh=True), tmp_path / "page")
     data = tmp_path / "page" / "data"
     scene = value_of(data / "scene.js")
     assert shared.triangles == len(box_mesh()[2])

@@ -208,3 +208,10 @@ def test_the_command_says_where_the_page_is(tmp_path: Path) -> None:
     assert "1,000 points and 3 panoramas" in done.output
     assert "index.html" in done.output
     assert "<title>Lobby</title>" in (tmp_path / "page" / "index.html").read_text()
+
+
+def test_none_means_no_points_and_no_triangles(tmp_path: Path) -> None:
+    """`--points 0` wrote all points."""
+    run = box_run(tmp_path / "run", points=500, mesh=True)
+    shared = share_run(run, tmp_path / "page", ShareOptions(max_points=0, max_triangles=0))
+    assert (shared.points, shared.triangles, shared.panoramas) == (0, 0, 3)

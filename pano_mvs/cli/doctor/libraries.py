@@ -53,6 +53,14 @@ print(json.dumps({"version": cv2.__version__, "video": "FFMPEG" in backends,
                   "avif": bool(cv2.haveImageWriter("a.avif"))}))
 """
 
+_ONNX_RUNTIME = """
+import json
+import onnxruntime
+from pano_mvs.algorithms.learned.networks import PACKAGED
+PACKAGED.load("lightglue_start.onnx")
+print(json.dumps({"version": onnxruntime.__version__}))
+"""
+
 _PYVISTA = """
 import json
 import pyvista
@@ -151,6 +159,7 @@ _LIBRARIES = (
     Library("numba", _NUMBA, "compiles", "failed", f"{_REINSTALL} numba llvmlite"),
     Library("pycolmap", _PYCOLMAP, "has EQUIRECTANGULAR cameras", "failed", f"{_REINSTALL} pycolmap"),
     Library("OpenCV", _OPENCV, "reads images", "failed", f"{_REINSTALL} opencv-python-headless"),
+    Library("ONNX Runtime", _ONNX_RUNTIME, "runs networks", "failed", f"{_REINSTALL} onnxruntime"),
     Library("PyVista", _PYVISTA, "renders without a screen", "warning", _OPENGL, _NO_PICTURES),
     Library("torch", _TORCH, "", "warning", "reinstall torch, or sweep with `backend: numba`"),
 )

@@ -79,7 +79,10 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
         console.print("nothing to compute", highlight=False)
         return
     units = f"{run_plan.units} {plural(run_plan.units, 'unit')} would run"
-    console.print(units + (", more may follow" if run_plan.may_follow else ""), highlight=False)
+    if run_plan.may_follow:
+        count, known = run_plan.may_run
+        units += f", and up to {count} more may" if known else ", and more may follow"
+    console.print(units, highlight=False)
     unknown, workers = run_plan.unknown, f"{run_plan.workers} {plural(run_plan.workers, 'worker')}"
     if len(unknown) == sum(forecast.units != 0 for forecast in run_plan.forecasts):
         text = "time and disk space: unknown, because no earlier run with this cache computed these stages"

@@ -68,8 +68,9 @@ def _lines(unit: Unit, record: UnitRecord | None, reason: str, *, store: Store) 
     lines += [f"figure   {name}: {value:z.6g}" for name, value in record.metrics.items()]
     lines += [f"note     {note}" for note in record.notes]
     for name, ref in record.output.parts.items():
-        place = Path(store.blobs.path(ref))
-        lines.append(f"result   {record.output.kind}.{name}: {place} ({ref.size_bytes} bytes)")
+        place = store.blobs.place(ref)
+        where = place if isinstance(place, Path) else place.name
+        lines.append(f"result   {record.output.kind}.{name}: {where} ({ref.size_bytes} bytes)")
     return lines
 
 

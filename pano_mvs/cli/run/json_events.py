@@ -4,6 +4,7 @@ Every object has `event` and `time` (seconds since 1970). The events, in the ord
 
     run_started     schema (1), workflow, stages (names, in order), executor, workers, threads, out
     forecast        stages (stage, after, cached, units, unit_s, unit_bytes; null if unknown), report_s
+    kernels_compiled  kernels (so far), seconds (since the count before); at most once a second, in a first run
     stage_started   stage, units
     unit_started    stage, item                             only for units that are computed
     unit_failed     stage, item, cause, consequence, log (file or ""), said (the last lines that it printed)

@@ -20,6 +20,7 @@ from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_li
 from pano_mvs.session.progress import (
     Event,
     Forecast,
+    KernelsCompiled,
     RunStarted,
     StageFinished,
     TimeLeft,
@@ -31,6 +32,9 @@ from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstima
 _FIRST_LINE_S = 10.0
 _LINE_EVERY_S = 30.0
 _REFRESHES_PER_S = 4
+_COMPILING_S = 20.0
+"""Kernels are shown to be compiled for this long after one was: some take so long."""
+
 _SHOWN_LINES = 5
 _SHOWN_STAGES = 6
 _SHOWN_UNITS = 2
@@ -50,6 +54,7 @@ class ProgressDisplay:
         self._lock = threading.RLock()  # the display is drawn by a thread of its own
         self._open = ExitStack()
         self._has_begun = False
+        self._kernels, self._kernels_at = 0, -math.inf
 
     def __enter__(self) -> ProgressDisplay:
         """Start to draw."""
@@ -83,6 +88,8 @@ class ProgressDisplay:
                 self._has_begun = True
             case Forecast():
                 self._countdown = Countdown()  # begin with the forecast rather than glide to it
+            case KernelsCompiled(kernels=kernels):
+                self._kernels, self._kernels_at = kernels, self._clock()
             case UnitFailed():
                 self._print_failure(event)
             case StageFinished():
@@ -110,6 +117,8 @@ class ProgressDisplay:
                 )
             if len(stages) > _SHOWN_STAGES:
                 table.add_row(f"… and {len(stages) - _SHOWN_STAGES} more")
+            if compiling := self._compiling():
+                table.add_row(Text(compiling))
             total = Table.grid(padding=(0, 2))
             text = self._left_text(left, clock_text(math.ceil(seconds_left)), seconds_left)
             total.add_row(
@@ -127,11 +136,17 @@ class ProgressDisplay:
             left = self._estimator.estimate()
             text = self._left_text(left, duration_text(left.seconds_left), left.seconds_left)
             stages = [f"{one_line(name)} {_count(stage)}" for name, stage in self._running()]
+            stages += filter(None, [self._compiling()])
         now = f" (now: {shortened_list(stages)})" if stages else ""
         self.console.print(escape(f"{100 * left.done:.0f} %, {text}{now}"), highlight=False, soft_wrap=True)
 
     def _running(self) -> list[tuple[str, StageProgress]]:
         return [(name, stage) for name, stage in self._estimator.stages.items() if stage.running]
+
+    def _compiling(self) -> str:
+        """Return how many kernels have been compiled, while they are; else nothing."""
+        is_current = self._clock() - self._kernels_at < _COMPILING_S
+        return f"compiling kernels (once): {self._kernels} so far" if is_current else ""
 
     def _left_text(self, left: TimeLeft, shown: str, seconds: float) -> str:
         if not self._has_begun:

@@ -9,6 +9,7 @@ import math
 import os
 import re
 import shutil
+import stat
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import ChangedFileError, StoreError
-from pano_mvs.core.files import replacing
-from pano_mvs.core.paths import is_link
+from pano_mvs.core.files import make_room, replacing
+from pano_mvs.core.paths import is_folder, is_link
+from pano_mvs.engine.cache.packs import ARRAY, JSON, Packed, Packs
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
@@ -78,17 +81,21 @@ class BlobRef:
 
 
 class BlobStore:
-    """A folder of blobs. External files are found by digest through the paths that were registered in this run."""
+    """A folder of blobs. External files are found by digest through the paths that were registered in this run.
+
+    A new blob is a file. Arrays and JSON values may be moved into packs later, even while they are in use.
+    """
 
     def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
         self.root = root
+        self.packs = Packs(root)
         self.durable = durable
         self._folder = str(root / "blobs")
         self._digits = folder_digits
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
-        self._verified: set[str] = set()
+        self._verified: set[BlobRef] = set()
 
     def register_external(self, path: Path) -> str:
         """Register a file of the user under its digest, which is returned."""
@@ -101,8 +108,18 @@ class BlobStore:
         self._external[digest] = path
 
     def path(self, ref: BlobRef) -> Path:
-        """Return the path of a blob, whether or not it exists."""
+        """Return the path of a blob as a file, whether or not it exists."""
         return Path(self._place(ref))
+
+    def place(self, ref: BlobRef) -> Path | Packed:
+        """Return where a blob is: in a pack, or in a file, which may not exist."""
+        return self._packed(ref) or self.path(ref)
+
+    def _packed(self, ref: BlobRef, *, refresh: bool = False) -> Packed | None:
+        if ref.external or ref.suffix not in (ARRAY, JSON):
+            return None
+        found = self.packs.find(ref.digest, refresh=refresh)
+        return found if found is not None and found.size_bytes == ref.size_bytes else None
 
     def _place(self, ref: BlobRef) -> str | Path:
         if ref.external:
@@ -112,10 +129,12 @@ class BlobStore:
 
     def exists(self, ref: BlobRef) -> bool:
         """Return whether a blob exists and has the right size; its bytes are checked when it is read."""
+        if self._packed(ref) is not None:
+            return True
         try:
             return os.stat(self._place(ref)).st_size == ref.size_bytes  # noqa: PTH116  # see `_place`
         except OSError:
-            return False
+            return self._packed(ref, refresh=True) is not None  # another process has moved it meanwhile
 
     def put(self, part: Part) -> BlobRef:
         """Store one part of a record."""
@@ -139,46 +158,84 @@ class BlobStore:
             if not self.exists(ref):
                 raise self.discard(ref, "is missing or changed")
             return FilePart(self.path(ref), external=True, digest=ref.digest)
-        path = self.verified_path(ref)
+        place = self.verified_place(ref)
         try:
-            if ref.suffix == ".npy":
-                return _mapped(path) if ref.is_mapped else _read(path)
-            if ref.suffix == ".json":
-                value = json.loads(path.read_bytes())
+            if ref.suffix == ARRAY:
+                return _array(_mapped(place) if ref.is_mapped else place.read_bytes())
+            if ref.suffix == JSON:
+                value = json.loads(place.read_bytes())
                 if not isinstance(value, dict):
                     raise ValueError("not an object")
                 return value
-        except FileNotFoundError as error:  # it was collected after it had been verified
+        except FileNotFoundError as error:
+            if self._packed(ref, refresh=True) not in (None, place):  # it was moved after it had been verified
+                return self.get(ref)
             raise self.discard(ref, "is gone") from error
         except (ValueError, RecursionError) as error:
             raise self.discard(ref, f"has content that pano_mvs does not write ({error})") from error
-        return FilePart(path, digest=ref.digest)
+        assert isinstance(place, Path)
+        return FilePart(place, digest=ref.digest)
+
+    def copy(self, ref: BlobRef, target: Path) -> None:
+        """Copy the bytes of a blob into a file, atomically.
+
+        Raises:
+            DamagedBlobError: if the bytes are not those that were stored; the blob has been removed.
+            StoreError: if the file cannot be written.
+        """
+        place = self.verified_place(ref)
+        try:
+            with replacing(target) as temporary:
+                if isinstance(place, Path):
+                    shutil.copyfile(place, temporary)
+                else:
+                    temporary.write_bytes(place.read_bytes())
+        except StoreError:
+            if self._packed(ref, refresh=True) not in (None, place):  # it was moved after it had been verified
+                self.copy(ref, target)
+                return
+            if self.exists(ref):
+                raise
+            raise self.discard(ref, "is missing") from None  # garbage collection has deleted it meanwhile
 
     def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
         """Remove an unusable blob, unless it is a file of the user, and return the error to raise."""
-        path = self.path(ref)
+        place, path = self.place(ref), self.path(ref)
+        if isinstance(place, Packed):
+            self.packs.forget([place])
         if ref.external:
             self.stat_cache.forget(path)
         elif not is_link(path.parent):
-            path.unlink(missing_ok=True)
-        self._verified.discard(str(path))
-        return DamagedBlobError(f"{path} {why}; the same command computes it again")
+            make_room(path)
+        self._verified.discard(ref)
+        name = place.name if isinstance(place, Packed) else path
+        return DamagedBlobError(f"{name} {why}; the same command computes it again")
 
-    def verified_path(self, ref: BlobRef) -> Path:
-        """Return the path of a blob after checking its bytes; this object checks each blob once."""
-        path = self.path(ref)
-        if str(path) in self._verified:
-            return path
-        if not ref.external:
-            self._refuse_link(path)
-        try:
-            is_intact = path.stat().st_size == ref.size_bytes and digest_from_file(path) == ref.digest
-        except OSError:
-            is_intact = False
+    def verified_place(self, ref: BlobRef) -> Path | Packed:
+        """Return where a blob is, after checking its bytes; this object checks each blob once."""
+        place = self.place(ref)
+        if ref in self._verified:
+            return place
+        if isinstance(place, Path) and not ref.external:
+            self._refuse_link(place)
+        while True:
+            try:
+                is_intact = _is_intact(place, ref)
+                break
+            except FileNotFoundError:
+                moved = self._packed(ref, refresh=True)
+                if moved in (None, place):
+                    is_intact = False
+                    break
+                assert moved is not None
+                place = moved  # by another process, in the meantime
+            except OSError:
+                is_intact = False
+                break
         if not is_intact:
             raise self.discard(ref, "is damaged or missing")
-        self._verified.add(str(path))
-        return path
+        self._verified.add(ref)
+        return place
 
     def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
         ref = BlobRef(digest_from_bytes(data), len(data), suffix)
@@ -187,7 +244,7 @@ class BlobStore:
                 temporary.write_bytes(data)
         return ref
 
-    def _put_array(self, array: np.ndarray[Any, Any]) -> BlobRef:
+    def _put_array(self, array: NDArray[Any]) -> BlobRef:
         """Store an array as .npy without a second copy of it in memory."""
         array = np.ascontiguousarray(array)
         buffer = io.BytesIO()
@@ -225,8 +282,8 @@ class BlobStore:
         if not self.exists(ref):
             return False
         try:
-            self.verified_path(ref)
-            os.utime(self.path(ref))
+            place = self.verified_place(ref)
+            os.utime(place if isinstance(place, Path) else place.pack)
         except (DamagedBlobError, OSError):
             return False
         return True
@@ -234,7 +291,9 @@ class BlobStore:
     def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
         path = self.path(ref)
         self._refuse_link(path)
-        self._verified.discard(str(path))  # it is missing or damaged
+        self._verified.discard(ref)  # it is missing or damaged
+        if is_folder(path):
+            make_room(path)
         return replacing(path, temporary_in=self.temporary, durable=self.durable)
 
     @staticmethod
@@ -246,38 +305,57 @@ class BlobStore:
             )
 
 
-def _mapped(path: Path) -> np.ndarray[Any, Any]:
-    """Return the array of a .npy file, memory-mapped; nothing in the file is executed.
+def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:
+    """Return whether the bytes are those that the reference names.
 
     Raises:
-        ValueError: if the file is not valid, or holds Python objects.
+        OSError: if they cannot be read.
     """
-    try:
-        return np.lib.format.open_memmap(path, mode="r")
-    except OSError:
-        raise
-    except Exception as error:  # numpy reads the header with Python's parser, which raises many kinds of errors
-        raise ValueError(str(error)) from error
+    if isinstance(place, Packed):
+        return place.content_digest() == ref.digest
+    found = place.stat()
+    return stat.S_ISREG(found.st_mode) and found.st_size == ref.size_bytes and digest_from_file(place) == ref.digest
 
 
-def _read(path: Path) -> np.ndarray[Any, Any]:
-    """Return the array of a small .npy file, read-only; see `_mapped`.
+def _mapped(place: Path | Packed) -> NDArray[np.uint8]:
+    return place.mapped() if isinstance(place, Packed) else np.memmap(place, np.uint8, "r")
+
+
+def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:
+    """Return the array in the bytes of a .npy file, read-only and without a copy; nothing in them is executed.
 
     Raises:
-        ValueError: if the file is not valid, holds Python objects, or has not as many values as its header says.
+        ValueError: if the bytes are not valid, hold Python objects, or have not as many values as the header says.
     """
-    data = path.read_bytes()
-    if not data.startswith(_MAGIC):
-        return _mapped(path)
-    begin = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
-    shape, dtype, fortran_order = _header(data[len(_MAGIC) : begin])
+    start = bytes(data[: len(_MAGIC) + 2])
+    if not start.startswith(_MAGIC):
+        return _other_format(bytes(data))
+    begin = len(start) + int.from_bytes(start[len(_MAGIC) :], "little")
+    shape, dtype, fortran_order = _header(bytes(data[len(_MAGIC) : begin]))
     count = math.prod(shape)
     if min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - begin:
         raise ValueError(f"{len(data) - begin} bytes for an array of {shape}")
     try:
-        values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
+        if isinstance(data, bytes):
+            values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
+        else:
+            values = data[begin:].view(dtype)  # an np.memmap stays one
         array = values.reshape(shape, order="F" if fortran_order else "C")
     except Exception as error:  # an impossible shape
+        raise ValueError(str(error)) from error
+    array.flags.writeable = False
+    return array
+
+
+def _other_format(data: bytes) -> NDArray[Any]:
+    """Return the array in a .npy file of a format that this package does not write.
+
+    Raises:
+        ValueError: if the bytes are not valid, or hold Python objects.
+    """
+    try:
+        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:  # numpy reads the header with Python's parser, which raises many kinds of errors
         raise ValueError(str(error)) from error
     array.flags.writeable = False
     return array
@@ -292,7 +370,7 @@ def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
     """
     try:
         shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(data))
-    except Exception as error:  # see `_mapped`
+    except Exception as error:  # see `_other_format`
         raise ValueError(str(error)) from error
     if dtype.hasobject:
         raise ValueError("an array of Python objects")

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import replacing
+from pano_mvs.core.files import read_regular, replacing
 from pano_mvs.core.paths import children, is_file, resolved
 
 Keys: TypeAlias = "dict[str, dict[str, str]]"
@@ -164,7 +164,7 @@ class RunHistory:
 
 def _read(path: Path) -> RunEntry | None:
     try:
-        checksum, _, body = path.read_bytes().partition(b"\n")
+        checksum, _, body = read_regular(path).partition(b"\n")
         if checksum.decode() != digest_from_bytes(body):
             return None
         value = json.loads(body)

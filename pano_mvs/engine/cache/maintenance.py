@@ -1,4 +1,7 @@
-"""Maintenance of a cache: its contents by stage, verification, and garbage collection.
+"""Maintenance of a cache: its contents by stage, verification, packing, and garbage collection.
+
+Packing moves records, arrays and JSON values from files of their own into packs, so that large captures take few files.
+Values are found in the packs before their files are removed, so that runs may use the cache meanwhile.
 
 Garbage collection keeps what the remembered runs and pins name, and deletes everything else that is older than a given
 age. It takes no lock: what a run has just computed is too recent to be deleted, and a run computes again what is
@@ -9,21 +12,26 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
-from pano_mvs.core.files import whose_temporary
+from pano_mvs.core.files import make_room, read_regular, whose_temporary
+from pano_mvs.core.paths import is_file, is_link
 from pano_mvs.engine.cache.blobs import SUFFIX
 from pano_mvs.engine.cache.latest_runs import RunEntry
+from pano_mvs.engine.cache.packs import ARRAY, JSON, RECORD, Packed
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.cache.unproven import Unproven
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
 _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
+_MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can read them
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +61,7 @@ class Verification:
         removed: damaged files, which were removed; the next run computes them again.
         incomplete: records with missing blobs, which runs ignore.
         foreign: files that do not belong to the cache.
-        temporary: temporary files, each with the process that it belongs to.
+        temporary: temporary files, each with the process that it belongs to, and unfinished packs.
         unproven: records of earlier versions that may have been computed from other input files than their keys say.
     """
 
@@ -72,24 +80,42 @@ class GarbageCollection:
 
     Attributes:
         runs: remembered runs that are too old.
-        records: paths of records.
-        blobs: paths of blobs.
+        records: records.
+        blobs: blobs, and packs that were not finished.
         size_bytes: size of both.
         kept_bytes: size of the blobs that are kept.
     """
 
     runs: list[RunEntry] = field(default_factory=list)
-    records: list[str] = field(default_factory=list)
-    blobs: list[str] = field(default_factory=list)
+    records: list[Path | Packed] = field(default_factory=list)
+    blobs: list[Path | Packed] = field(default_factory=list)
     size_bytes: int = 0
     kept_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """A record or a blob: where it is, its key or digest, its size, and when it was last used."""
+
+    place: Path | Packed
+    digest: str
+    size_bytes: int
+    used_s: float
+
+    @property
+    def name(self) -> str:
+        return self.place.name if isinstance(self.place, Packed) else str(self.place)
+
+    @property
+    def file_name(self) -> str:
+        return f"{self.digest}{self.place.kind if isinstance(self.place, Packed) else self.place.suffix}"
 
 
 def usage_of(store: Store) -> list[StageUsage]:
     """Return the results of each stage in a cache, the largest first."""
     seen: set[str] = set()
     totals: dict[str, list[float]] = {}
-    for _, record in _records(store):
+    for _, record in _intact_records(store):
         total = totals.setdefault(_stage_of(record), [0, 0, 0.0])
         total[0] += 1
         total[2] += record.seconds
@@ -121,52 +147,120 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
     """
     found, unproven = Verification(), Unproven()
     intact: set[str] = set()
-    for file in _files(store.root / "blobs"):
-        name = _own_name(store, file, _BLOB_NAME)
-        if not name:
-            found.foreign.append(file.path)
-            continue
-        digest = _digest(file.path)
-        if digest == name:
-            intact.add(file.name)
+    _verify_names(store, found)
+    for value in _blobs(store):
+        digest = _digest(value.place)
+        if digest == value.digest:
+            intact.add(value.file_name)
             found.blobs += 1
         elif digest:
-            _remove(Path(file.path))
-            found.removed.append(file.path)
-    for file in _files(store.root / "records"):
-        key = _own_name(store, file, _RECORD_NAME)
-        data = _read(file.path) if key else None
-        if not key:
-            found.foreign.append(file.path)
-        elif data is not None:
-            record = _verify_record(store, file.path, found=found, intact=intact, key=key, data=data)
-            stat = _stat(file.path)
-            if record is not None and stat is not None:
-                unproven.add(file.path, stat.st_mtime, record)
+            _remove_damaged(store, value, found)
+    keys: dict[str, str] = {}
+    for value in _records(store):
+        data = _read(value.place)
+        record = _verify_record(store, value, data, found=found, intact=intact) if data is not None else None
+        if record is not None:
+            keys[value.name] = record.key
+            unproven.add(value.name, value.used_s, record)
     found.unproven = list(unproven.paths(store.stat_cache))
-    for path in found.unproven if drop_unproven else ():
-        _remove(Path(path))
+    for name in found.unproven if drop_unproven else ():
+        store.drop(keys[name])
+    for path in store.blobs.packs.without_index():
+        found.temporary.append(f"{path} (a pack that was not finished; collection removes it)")
     for entry in _sorted(store.blobs.temporary):
         found.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
     return found
 
 
+def _verify_names(store: Store, found: Verification) -> None:
+    """Remove what is not a file in the place of one, and indexes that cannot be read; list what is not of the cache."""
+    for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
+        for file in _files(store.root / folder):
+            if _own_name(store, file, pattern):
+                continue
+            is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
+            if pattern.fullmatch(file.name) and is_special:
+                make_room(Path(file.path))
+                found.removed.append(file.path)
+            else:
+                found.foreign.append(file.path)
+    for index in store.blobs.packs.damaged_indexes():
+        store.blobs.packs.remove(index.with_suffix(".pack"))
+        found.removed.append(str(index))
+
+
+def _remove_damaged(store: Store, value: _Value, found: Verification) -> None:
+    if isinstance(value.place, Packed):
+        store.blobs.packs.forget([value.place])
+    else:
+        _remove(value.place)
+    found.removed.append(value.name)
+
+
 def _verify_record(
-    store: Store, path: str, *, found: Verification, intact: set[str], key: str, data: bytes
+    store: Store, value: _Value, data: bytes, *, found: Verification, intact: set[str]
 ) -> UnitRecord | None:
     """Check a record and enter it into what was found; return it if it and all its blobs are intact."""
     record = record_from_bytes(data)
-    if record is None or record.key != key:
-        _remove(Path(path))
-        found.removed.append(path)
+    if record is None or record.key != value.digest:
+        _remove_damaged(store, value, found)
         return None
     # A running workflow may have written other blobs after the blobs were checked.
     blobs = (ref for ref in record.own_blobs() if f"{ref.digest}{ref.suffix}" not in intact)
-    if all(_digest(store.blobs.path(ref)) == ref.digest for ref in blobs):
+    if all(_digest(store.blobs.place(ref)) == ref.digest for ref in blobs):
         found.records += 1
         return record
-    found.incomplete.append(path)
+    found.incomplete.append(value.name)
     return None
+
+
+def pack(store: Store) -> int:
+    """Move records, arrays and JSON values from files of their own into packs; return how many files were removed.
+
+    Nothing is done below a few hundred files. Runs may use the cache at the same time.
+
+    Raises:
+        StoreError: if a file cannot be read, written or removed.
+    """
+    loose = [
+        (Packed(store.blobs.packs.folder, 0, value.size_bytes, value.digest, kind, value.used_s), value.place)
+        for value, kind in _packable(store)
+        if isinstance(value.place, Path)
+    ]
+    if len(loose) < _MIN_PACKED_FILES:
+        return 0
+    packs = store.blobs.packs
+    small = _merged(packs.times(), sum(value.size_bytes for value, _ in loose))
+    packs.add(chain(loose, ((value, None) for value in packs.each() if value.pack in small)))
+    for value, path in loose:
+        if packs.find(value.digest) is not None:
+            _remove(path)
+    for path in small:
+        packs.remove(path)
+    return len(loose)
+
+
+def _merged(packs: Iterable[Path], size_bytes: int) -> set[Path]:
+    """Return the packs to merge with a new one, so that each is more than twice as large as the next smaller one.
+
+    Their number then grows with the logarithm of what is packed, and each value is copied as often.
+    """
+    chosen: set[Path] = set()
+    for size, path in sorted((found.st_size, path) for path in packs if (found := _stat(path)) is not None):
+        if size > 2 * size_bytes:
+            break
+        chosen.add(path)
+        size_bytes += size
+    return chosen
+
+
+def _packable(store: Store) -> Iterator[tuple[_Value, str]]:
+    """Yield the values that may be in packs, each with its kind there."""
+    for value in _records(store):
+        yield value, RECORD
+    for value in _blobs(store):
+        if isinstance(value.place, Path) and value.place.suffix in (ARRAY, JSON):
+            yield value, value.place.suffix
 
 
 def collect(
@@ -176,7 +270,8 @@ def collect(
 
     Args:
         store: the cache.
-        unused_s: keep what was computed within this time.
+        unused_s: keep what was computed within this time; files with times in the future count by their distance from
+            now, as those of a clock that is wrong.
         forget_after_s: forget runs that ended longer ago than this; None forgets none. Pins are kept.
         delete: delete what was found.
 
@@ -185,7 +280,7 @@ def collect(
             read or deleted.
     """
     found = GarbageCollection()
-    newest = time.time() - unused_s
+    now = time.time()
     kept_keys: set[bytes] = set()
     for entry in store.runs.each():
         if not entry.pinned and forget_after_s is not None and entry.age_s() > forget_after_s:
@@ -193,36 +288,54 @@ def collect(
         else:
             kept_keys.update(_packed(key) for units in entry.keys.values() for key in units.values())
     kept_blobs: set[bytes] = set()
-    for file, record in _records(store):
-        stat = _stat(file.path)
-        if stat is not None and _packed(record.key) not in kept_keys and stat.st_mtime <= newest:
-            found.records.append(file.path)
-            found.size_bytes += stat.st_size
+    for value, record in _intact_records(store):
+        if _packed(record.key) not in kept_keys and _is_unused(value.used_s, now, unused_s):
+            found.records.append(value.place)
+            found.size_bytes += value.size_bytes
         else:
             kept_blobs.update(_packed(ref.digest) for ref in record.blobs())
-    for file in _files(store.root / "blobs"):
-        stat = _stat(file.path)
-        name = _own_name(store, file, _BLOB_NAME)
-        if stat is None or not name:
-            continue
-        if _packed(name) in kept_blobs or stat.st_mtime > newest:
-            found.kept_bytes += stat.st_size
+    unfinished = (_Value(path, "", stat.st_size, stat.st_mtime) for path, stat in _unfinished(store))
+    for value in chain(_blobs(store), unfinished):
+        if _packed(value.digest) in kept_blobs or not _is_unused(value.used_s, now, unused_s):
+            found.kept_bytes += value.size_bytes
         else:
-            found.blobs.append(file.path)
-            found.size_bytes += stat.st_size
+            found.blobs.append(value.place)
+            found.size_bytes += value.size_bytes
     if delete:
-        _delete(store, found, newest)
+        _delete(store, found, now=now, unused_s=unused_s)
     return found
 
 
-def _delete(store: Store, found: GarbageCollection, newest: float) -> None:
+def _is_unused(used_s: float, now: float, unused_s: float) -> bool:
+    """Return whether a time is long ago; one far in the future is the error of a clock."""
+    return abs(now - used_s) >= unused_s
+
+
+def _delete(store: Store, found: GarbageCollection, *, now: float, unused_s: float) -> None:
     """Delete records before the blobs that they name, so that no record is left without its blobs."""
+    packs = store.blobs.packs
     for entry in found.runs:
         store.runs.forget(entry)
-    for path in (*found.records, *found.blobs):
+    for places in (found.records, found.blobs):
+        times = packs.times()
+        # A run may have used a value in the meantime.
+        packs.forget(
+            place
+            for place in places
+            if isinstance(place, Packed) and _is_unused(times.get(place.pack, now), now, unused_s)
+        )
+        for place in places:
+            stat = _stat(place) if isinstance(place, Path) else None
+            if stat is not None and _is_unused(stat.st_mtime, now, unused_s):
+                _remove(Path(str(place)))
+    packs.rewrite({place.pack for place in (*found.records, *found.blobs) if isinstance(place, Packed)})
+
+
+def _unfinished(store: Store) -> Iterator[tuple[Path, os.stat_result]]:
+    for path in store.blobs.packs.without_index():
         stat = _stat(path)
-        if stat is not None and stat.st_mtime <= newest:  # otherwise a run has used it in the meantime
-            _remove(Path(path))
+        if stat is not None:
+            yield path, stat
 
 
 def _packed(digest: str) -> bytes:
@@ -240,13 +353,39 @@ def _remove(path: Path) -> None:
         raise StoreError(f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache") from error
 
 
-def _records(store: Store) -> Iterator[tuple[os.DirEntry[str], UnitRecord]]:
+def _records(store: Store) -> Iterator[_Value]:
+    """Yield every record, whether or not it is intact."""
+    yield from _of_files(store, "records", _RECORD_NAME)
+    yield from (value for value, kind in _of_packs(store) if kind == RECORD)
+
+
+def _blobs(store: Store) -> Iterator[_Value]:
+    """Yield every blob, whether or not it is intact."""
+    yield from _of_files(store, "blobs", _BLOB_NAME)
+    yield from (value for value, kind in _of_packs(store) if kind != RECORD)
+
+
+def _of_files(store: Store, folder: str, pattern: re.Pattern[str]) -> Iterator[_Value]:
+    for file in _files(store.root / folder):
+        digest = _own_name(store, file, pattern)
+        stat = _stat(file.path) if digest else None
+        if stat is not None:
+            yield _Value(Path(file.path), digest, stat.st_size, stat.st_mtime)
+
+
+def _of_packs(store: Store) -> Iterator[tuple[_Value, str]]:
+    times = store.blobs.packs.times()
+    for packed in store.blobs.packs.each():
+        used_s = max(packed.time_s, times.get(packed.pack, 0.0))
+        yield _Value(packed, packed.digest, packed.size_bytes, used_s), packed.kind
+
+
+def _intact_records(store: Store) -> Iterator[tuple[_Value, UnitRecord]]:
     """Yield every intact record."""
-    for file in _files(store.root / "records"):
-        key = _own_name(store, file, _RECORD_NAME)
-        record = record_from_bytes(_read(file.path) or b"") if key else None
-        if record is not None and record.key == key:
-            yield file, record
+    for value in _records(store):
+        record = record_from_bytes(_read(value.place) or b"")
+        if record is not None and record.key == value.digest:
+            yield value, record
 
 
 def _stage_of(record: UnitRecord) -> str:
@@ -261,23 +400,26 @@ def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) ->
     return match[1] if file.is_file(follow_symlinks=False) else ""
 
 
-def _read(path: str) -> bytes | None:
-    """Return the bytes of a file, or None if another process has deleted it."""
+def _read(place: Path | Packed) -> bytes | None:
+    """Return the bytes of a value, or None if another process has deleted it."""
     try:
-        return Path(path).read_bytes()
+        return place.read_bytes() if isinstance(place, Packed) else read_regular(place)
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise _cannot_read(path, error) from error
+        raise _cannot_read(place.pack if isinstance(place, Packed) else place, error) from error
 
 
-def _digest(path: str | Path) -> str:
+def _digest(place: Path | Packed) -> str:
+    """Return the digest of a value, or nothing if another process has deleted it, or it is not a regular file."""
     try:
-        return digest_from_file(Path(path))
+        if isinstance(place, Path) and not stat.S_ISREG(place.lstat().st_mode):
+            return ""
+        return place.content_digest() if isinstance(place, Packed) else digest_from_file(place)
     except FileNotFoundError:
         return ""
     except OSError as error:
-        raise _cannot_read(path, error) from error
+        raise _cannot_read(place.pack if isinstance(place, Packed) else place, error) from error
 
 
 def _stat(path: str | Path) -> os.stat_result | None:
@@ -294,9 +436,12 @@ def _cannot_read(path: str | Path, error: OSError) -> StoreError:
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """Yield the files below a folder, sorted by name; links are not followed."""
+    """Yield the files below a folder, and folders that have the name of a file of the cache, sorted by name.
+
+    Links are not followed.
+    """
     for entry in _sorted(folder):
-        if entry.is_dir(follow_symlinks=False):
+        if entry.is_dir(follow_symlinks=False) and not _BLOB_NAME.fullmatch(entry.name):
             yield from _files(Path(entry.path))
         else:
             yield entry

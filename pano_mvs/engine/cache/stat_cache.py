@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.files import CACHE_MARK, write_text
+from pano_mvs.core.files import CACHE_MARK, read_regular, write_text
 from pano_mvs.core.paths import below, is_file, is_folder, reason_of, resolved
 
 # A file that changed this shortly before it was hashed may change again without a new time stamp.
@@ -114,7 +114,7 @@ def _state(stat: os.stat_result) -> State:
 def _read(path: Path) -> dict[str, Entry]:
     """Return the entries in a file; none if it is damaged."""
     try:
-        checksum, _, body = path.read_bytes().partition(b"\n")
+        checksum, _, body = read_regular(path).partition(b"\n")
         entries = json.loads(body) if checksum.decode() == digest_from_bytes(body) else None
     except (OSError, ValueError, RecursionError):
         return {}

@@ -1,13 +1,13 @@
 """The cache: a small record for each finished unit, by key, and immutable blobs with the values.
 
-Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (the key of each unit in
-the latest run of a workflow into a folder, for the reasons in plans and for garbage collection), `pins/` (protected
-runs), `stat-cache.json`, `unit-times.json` (for estimates), `tmp/`, `layout.json`, and an empty file that marks the
-folder as a cache.
+Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `packs/` (most blobs and records, if
+there are many: `pano_mvs.engine.cache.packs`), `runs/<id>.json` (the key of each unit in the latest run of a workflow
+into a folder, for the reasons in plans and for garbage collection), `pins/` (protected runs), `stat-cache.json`,
+`unit-times.json` (for estimates), `tmp/`, `layout.json`, and an empty file that marks the folder as a cache.
 
 What is cached follows from the records alone: there is no status file that could be wrong, and no lock. A record is
 written after its blobs. Files get their names by renaming, are never changed, and are never links, so that any number
-of runs on several hosts can share a cache.
+of runs on several hosts can share a cache, also on a network file system.
 """
 
 from __future__ import annotations
@@ -23,12 +23,22 @@ from typing import Any
 
 from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, replacing, write_text
-from pano_mvs.core.paths import children, exists, is_link, reason_of
+from pano_mvs.core.files import (
+    CACHE_MARK,
+    clear_abandoned,
+    is_older,
+    make_room,
+    read_regular,
+    remove_whole,
+    replacing,
+    write_text,
+)
+from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packed_refs import PackedRefs
+from pano_mvs.engine.cache.packs import RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
@@ -39,7 +49,7 @@ _FOLDER_DIGITS = {1: 2, 2: 3}
 
 MIN_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
-_FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
+_FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
 
 
 class ItemRef:
@@ -223,20 +233,38 @@ class Store:
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key, whether or not its blobs exist; None if it is missing or damaged."""
-        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"
-        try:
-            with open(path, "rb") as stream:  # noqa: PTH123  # creating a Path takes as long as the rest
-                data = stream.read()
-        except OSError:
-            return None
+        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"  # creating a Path takes as long as the rest
+        packed: Packed | None = None
+        for _ in range(2):  # again, because another process may have moved it meanwhile
+            if (packed := self.packed_record(key, refresh=packed is not None)) is not None:
+                with suppress(OSError):
+                    return self._valid(packed.read_bytes(), key, packed.name)
+            try:
+                return self._valid(read_regular(path), key, path)
+            except (FileNotFoundError, NotADirectoryError):
+                if packed is None and self.packed_record(key) is None:
+                    return None
+            except OSError:
+                self.damaged.append(path)
+                return None
+        return None
+
+    def packed_record(self, key: str, *, refresh: bool = False) -> Packed | None:
+        """Return where the record of a key is in the packs, or None if it is not there; see `Packs.find`."""
+        found = self.blobs.packs.find(key, refresh=refresh) if IS_DIGEST.fullmatch(key) else None
+        return found if found is not None and found.kind == RECORD else None
+
+    def _valid(self, data: bytes, key: str, name: str) -> UnitRecord | None:
         record = record_from_bytes(data)
         if record is None or record.key != key:
-            self.damaged.append(path)
+            self.damaged.append(name)
             return None
         return record
 
     def put(self, record: UnitRecord) -> None:
         """Write a record; its blobs must already exist."""
+        if (packed := self.packed_record(record.key)) is not None:  # it could not be used
+            self.blobs.packs.forget([packed])
         body = json.dumps(
             record.to_json(), sort_keys=True
         ).encode()  # 50 MB for a stage with all pairs, so avoid copies
@@ -246,6 +274,8 @@ class Store:
                 f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
                 "with --cache DIR"
             )
+        if is_folder(path):
+            make_room(path)
         with (
             replacing(path, temporary_in=self.blobs.temporary, durable=self.durable) as temporary,
             temporary.open("wb") as stream,
@@ -255,9 +285,11 @@ class Store:
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be unusable."""
+        if (packed := self.packed_record(key)) is not None:
+            self.blobs.packs.forget([packed])
         path = self.record_path(key)
         if not is_link(path.parent):
-            path.unlink(missing_ok=True)
+            make_room(path)
 
     def put_value(self, value: Record) -> ItemRef:
         """Store a value's parts and return its reference.
@@ -318,7 +350,7 @@ class Store:
                 )
         path = self.root / "layout.json"
         try:
-            layout = json.loads(path.read_bytes())
+            layout = json.loads(read_regular(path))
         except FileNotFoundError:
             try:
                 self._create(path)

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 
 from pano_mvs.core.digest import digest_from_bytes
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import read_regular, write_text
 from pano_mvs.core.paths import stat_of
 from pano_mvs.scene.image_files.header import image_kind, stated_size_of_file
 
@@ -183,7 +183,7 @@ def _distance(sample: Sample, size: CaptureSize) -> float:
 def _read(path: Path) -> dict[str, list[Sample]]:
     """Return the samples in a file; none if it is missing or damaged."""
     try:
-        checksum, _, body = path.read_bytes().partition(b"\n")
+        checksum, _, body = read_regular(path).partition(b"\n")
         value = json.loads(body) if checksum.decode() == digest_from_bytes(body) else {}
         return {str(stage): [_sample(entry) for entry in found] for stage, found in value.items()}
     except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError):

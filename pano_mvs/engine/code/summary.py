@@ -18,6 +18,8 @@ _STAGE_DECORATORS = frozenset(
 
 _PURE_DECORATORS = frozenset(
     {
+        "kernel",
+        "inlined",
         "njit",
         "jit",
         "vectorize",

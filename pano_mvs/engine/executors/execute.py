@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -9,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from pano_mvs.core import kernel_cache
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import ChangedFileError, ContractError
+from pano_mvs.core.errors import ChangedFileError, ContractError, PluginError
+from pano_mvs.core.process_state import Changes, ProcessState, has_plugins
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
 from pano_mvs.engine.executors.lazy_mapping import LazyMapping
@@ -25,19 +28,26 @@ _MAX_OPEN_FILES = 128
 _MAX_BYTES = 128_000_000
 
 
+class ChangedStateError(PluginError):
+    """A plugin, in a thread that it left behind, changed what a unit of another stage computes."""
+
+
 def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """Run a unit and store its result; the record is written last.
+
+    The time of the unit does not include that of compiling kernels, which later units do not need.
 
     Raises:
         ChangedFileError: if an input file is not the one whose digest is in the key.
         ContractError: if the stage returns something other than what it declared.
+        ChangedStateError: if a plugin changed the process while a built-in stage was running.
         Exception: any exception of the stage.
     """
-    started = time.perf_counter()
+    started, compiling_s = time.perf_counter(), kernel_cache.compilation_time.seconds
     with store.scratch() as scratch:
         context = Context(np.random.default_rng(_seed(unit)), scratch, threads)
         arguments = arguments_of(unit, store)
-        value = unit.entry.spec.function(**arguments, **_extras(unit, context))
+        value = _called(unit, arguments, context)
         _check_kind(value, unit)
         if reasons := [*changed_items(unit, store).values(), *changed_settings(unit, store)]:
             raise ChangedFileError(reasons[0])
@@ -56,11 +66,33 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         tuple(context.notes),
         context.rejected,
         value.doubted(),
-        time.perf_counter() - started,
+        max(0.0, time.perf_counter() - started - (kernel_cache.compilation_time.seconds - compiling_s)),
         checked=True,
     )
     store.put(record)
     return record
+
+
+def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
+    """Return what the stage returns, with the state of the process as before.
+
+    Raises:
+        ChangedStateError: if a plugin changed the state while a built-in stage was running.
+        Exception: any exception of the stage.
+    """
+    process, before, changes = os.getpid(), ProcessState.now() if has_plugins() else None, Changes()
+    try:
+        value = unit.entry.spec.function(**arguments, **_extras(unit, context))
+    finally:
+        if os.getpid() != process:  # the stage forked, and this is the child, which must not store or answer
+            os._exit(0)
+        if before is not None:
+            changes = before.restore()
+    if changes and not unit.entry.spec.is_built_in:
+        context.note(f"it changed {changes} in its process; this was undone")
+    elif changes.deciding:
+        raise ChangedStateError(f"a plugin changed {changes.deciding} while {unit.label} was computed")
+    return value
 
 
 def _seed(unit: Unit) -> int:

@@ -24,6 +24,7 @@ class Job:
         timeout_s: time after which it is ended; 0 for no limit.
         log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.
         plugins: the plugin files of the workflow, with the digests of their code.
+        fresh: whether it needs a process of its own.
     """
 
     number: int
@@ -32,6 +33,7 @@ class Job:
     timeout_s: float
     log: Path
     plugins: Mapping[Path, str] = field(default_factory=dict)
+    fresh: bool = False
 
     @property
     def inputs_file(self) -> Path:
@@ -52,7 +54,7 @@ class JobOutcome:
         trace: the Python traceback, if the code of the stage failed.
         error: name of the class of the error, if the run has to raise it again.
         exit_code: exit code of an error that the user can fix, otherwise 0.
-        died: whether the worker process died.
+        died: whether the worker process died, or must not compute anything else.
         seconds: how long the job took.
         changed: input files that have changed since they were listed, with the reasons.
     """

@@ -53,6 +53,7 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
         "log": str(job.log.absolute()),
         "threads": job.threads,
         "timeout_s": job.timeout_s,
+        "fresh": job.fresh,
     }
 
 

@@ -12,7 +12,7 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import captured
 from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
-from pano_mvs.engine.executors.execute import execute_unit
+from pano_mvs.engine.executors.execute import ChangedStateError, execute_unit
 from pano_mvs.engine.executors.failure_cause import cause_of
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.threads import bound_threads
@@ -42,6 +42,8 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     if isinstance(error, StoreError | RunStoppedError) and not isinstance(error, DamagedBlobError):
         kind = StoreError if isinstance(error, StoreError) else RunStoppedError
         return JobOutcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
+    if isinstance(error, ChangedStateError):
+        return JobOutcome("failed", cause=str(error), died=True)  # the process cannot be used any more
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
         store.stat_cache.forget(error.path)

@@ -1,8 +1,9 @@
 """The main function of a worker process.
 
 It reads requests from its standard input and answers on its standard output, one JSON object per line: first
-`{"ready": true}`, then for each request `{"started": true}` and the outcome. It exits at once when its input ends,
-because then nobody reads the result.
+`{"ready": true}`, then for each request `{"started": true}` and the outcome, both with the `nonce` of the request and
+the key of its unit. When its input ends, it ends at once with all processes that its units started, because then nobody
+reads the result. Processes that its units fork have neither its input nor its output.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import queue
 import signal
 import sys
 import threading
+from functools import partial
 from typing import Any, BinaryIO
 
 
@@ -27,8 +29,9 @@ def main() -> None:
     _answer(answers_out, {"ready": True})
     while True:
         request = json.loads(requests.get())
-        _answer(answers_out, {"started": True})
-        _answer(answers_out, run_request(request).to_json())
+        whose = {"nonce": request["nonce"], "key": request["unit"]["key"]}
+        _answer(answers_out, {**whose, "started": True})
+        _answer(answers_out, {**whose, "outcome": run_request(request).to_json()})
 
 
 def _take_streams() -> tuple[BinaryIO, BinaryIO]:
@@ -39,12 +42,21 @@ def _take_streams() -> tuple[BinaryIO, BinaryIO]:
     os.close(nothing)
     os.dup2(2, 1)
     sys.stdout = sys.stderr
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=partial(_close, requests_in.fileno(), answers_out.fileno()))
     return requests_in, answers_out
+
+
+def _close(*descriptors: int) -> None:
+    for descriptor in descriptors:
+        os.close(descriptor)
 
 
 def _read(requests_in: BinaryIO, requests: queue.SimpleQueue[bytes]) -> None:
     for line in requests_in:
         requests.put(line)
+    if os.name == "posix" and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
     os._exit(0)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
 import threading
+import uuid
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -26,6 +28,7 @@ _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from pano_mvs.engine.executors.worker import main; main()"
 )
 _STOP_S = 5.0
+_LISTEN_S = 0.5
 
 
 class WorkerProcess:
@@ -48,27 +51,32 @@ class WorkerProcess:
         self.served = 0
         self.refused = False
         self._ready = False
+        self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
 
     def run(self, request: Mapping[str, Any]) -> JobOutcome:
         """Compute a unit and wait for it; if the process dies or takes too long, only this unit fails."""
+        if request["fresh"] and self.served:
+            self.stop()
         process = self._process or self._start()
         self.served += 1
+        whose = {"nonce": uuid.uuid4().hex, "key": request["unit"]["key"]}
         timeout_s = float(request["timeout_s"])
         timer = threading.Timer(timeout_s, self._end_late) if timeout_s else None
         try:
             assert process.stdin is not None
-            process.stdin.write(json.dumps(request).encode() + b"\n")
+            process.stdin.write(json.dumps({**request, "nonce": whose["nonce"]}).encode() + b"\n")
             process.stdin.flush()
-            outcome = self._listen(process, timer)
+            outcome = self._listen(process, whose, timer)
         except OSError:
             outcome = None
         if timer is not None:
             timer.cancel()
         if outcome is None:
             return self._death(process, timeout_s)
-        if self._too_late:  # it finished just when it was being ended
+        # It finished just when it was being ended, or nothing else may be computed after it.
+        if self._too_late or outcome.died or request["fresh"]:
             self.stop()
         return outcome
 
@@ -81,10 +89,10 @@ class WorkerProcess:
             self.errors.unlink(missing_ok=True)
 
     def kill(self) -> None:
-        """End the process at once, from any thread."""
+        """End the process and those that its unit started at once, from any thread."""
         process = self._process
         if process is not None:
-            process.kill()
+            _kill(process)
 
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)
@@ -102,21 +110,32 @@ class WorkerProcess:
                 start_new_session=os.name == "posix",
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
+        self._lines = queue.SimpleQueue()
+        threading.Thread(target=_read_lines, args=(self._process, self._lines), daemon=True).start()
         return self._process
 
-    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> JobOutcome | None:
-        """Return the outcome from the worker, or None if it dies first."""
-        assert process.stdout is not None
-        for line in process.stdout:
-            if not line.endswith(b"\n"):
-                return None
+    def _listen(
+        self, process: subprocess.Popen[bytes], whose: Mapping[str, str], timer: threading.Timer | None
+    ) -> JobOutcome | None:
+        """Return the outcome from the worker, or None if it dies first, even if others hold its output open."""
+        while (line := self._next_line(process)) is not None:
             answer = json.loads(line)
-            if "status" in answer:
-                return JobOutcome.from_json(answer)
             self._ready = True
-            if "started" in answer and timer is not None:
+            if {name: answer.get(name) for name in whose} != whose:
+                continue  # it is ready, or another process answered an earlier request
+            if "outcome" in answer:
+                return JobOutcome.from_json(answer["outcome"])
+            if timer is not None:
                 timer.start()
         return None
+
+    def _next_line(self, process: subprocess.Popen[bytes]) -> bytes | None:
+        while True:
+            try:
+                return self._lines.get(timeout=_LISTEN_S)
+            except queue.Empty:
+                if process.poll() is not None:
+                    return None
 
     def _end_late(self) -> None:
         self._too_late = True
@@ -135,19 +154,33 @@ class WorkerProcess:
         return JobOutcome("failed", cause=cause, died=True)
 
 
+def _read_lines(process: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
+    """Pass on the lines that a process writes, and None at the end, until nobody holds its output open."""
+    assert process.stdout is not None
+    with process.stdout as stream:
+        for line in stream:
+            lines.put(line if line.endswith(b"\n") else None)
+    lines.put(None)
+
+
 def _close(process: subprocess.Popen[bytes]) -> None:
-    """Close the pipes of a process and wait for its end; kill it if that takes too long."""
-    for pipe in (process.stdin, process.stdout):
-        try:
-            if pipe is not None:
-                pipe.close()
-        except OSError:
-            continue  # unsent data is not needed any more
-    try:
+    """Close the input of a process, which ends it, and wait for that; end it and what it started in any case."""
+    with suppress(OSError):  # unsent data is not needed any more
+        if process.stdin is not None:
+            process.stdin.close()
+    with suppress(subprocess.TimeoutExpired):
         process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
+    _kill(process)
+    process.wait()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End a process and all processes of its group, which may outlive it."""
+    if os.name != "posix":
         process.kill()
-        process.wait()
+        return
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def _how(code: int) -> str:

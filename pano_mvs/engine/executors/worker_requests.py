@@ -11,7 +11,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
-from pano_mvs.core.paths import resolved
+from pano_mvs.core.paths import is_inside
+from pano_mvs.core.process_state import ProcessState, has_plugins
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.protocol import JobOutcome
@@ -23,6 +24,9 @@ from pano_mvs.engine.stages.stage import StageSpec
 
 def run_request(request: Mapping[str, Any]) -> JobOutcome:
     """Compute the unit of a request; see `request_to_json`."""
+    global _left
+    if _left is not None and (changes := _left.restore().deciding):
+        return JobOutcome("failed", cause=f"a plugin changed {changes} in its worker after a unit", died=True)
     try:
         store = _store(*request["store"])
         files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
@@ -31,10 +35,15 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
     outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
+    _left = ProcessState.now() if has_plugins() else None
     for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
     return outcome
+
+
+_left: ProcessState | None = None
+"""The state of this process after its last unit, if it has loaded plugins."""
 
 
 def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:
@@ -50,7 +59,7 @@ def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
         folder = _folders[digest] = TemporaryDirectory(prefix="pano-mvs-plugin-")
         for relative, text in texts.items():
             path = Path(folder.name) / relative
-            if not resolved(path).is_relative_to(resolved(Path(folder.name))):
+            if not is_inside(path, Path(folder.name)):
                 raise UsageError(
                     f"plugin {name} imports {relative}, which is not beside it, so that it cannot be sent to workers"
                 )

@@ -237,6 +237,8 @@ class Resolver:
             case Cardinality.ALL | Cardinality.NAMES:
                 if state.open or state.pending:
                     return None, "", True
+                if not items and not state.failed and edge.port.optional:
+                    return None, "", False  # the other stage had nothing to do
                 return (dict(items), "", False) if items else (None, self._why(edge, state, ""), False)
         if state.open or (edge.exploded and state.pending):
             return None, "", True

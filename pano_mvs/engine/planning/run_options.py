@@ -24,6 +24,7 @@ class RunOptions:
         refresh: stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached.
         accept_code: reuse results that differ from what is needed only in the code or the libraries that computed them.
         keep_going: go on after a failed unit even if its stage says `on_error: stop`.
+        isolate: compute each unit of a plugin's stage in a process of its own.
     """
 
     until: tuple[str, ...] = ()
@@ -31,6 +32,7 @@ class RunOptions:
     refresh: tuple[str, ...] = ()
     accept_code: bool = False
     keep_going: bool = False
+    isolate: bool = False
 
     @property
     def is_partial(self) -> bool:

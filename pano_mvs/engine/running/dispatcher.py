@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pano_mvs.core.files import temporary_prefix
 from pano_mvs.core.memory import size_text
-from pano_mvs.core.paths import resolved, stat_of
+from pano_mvs.core.paths import is_inside, stat_of
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
@@ -56,8 +56,20 @@ class _RunningJob:
 class Dispatcher:
     """Keeps track of the jobs that an executor is working on."""
 
-    def __init__(self, executor: Executor, store: Store, *, out: Path, plugins: Mapping[Path, str]) -> None:
+    def __init__(
+        self, executor: Executor, store: Store, *, out: Path, plugins: Mapping[Path, str], isolate: bool = False
+    ) -> None:
+        """Prepare.
+
+        Args:
+            executor: computes the units.
+            store: the cache.
+            out: the output folder, for logs.
+            plugins: the plugin files of the workflow, with the digests of their code.
+            isolate: whether each unit of a plugin's stage gets a process of its own.
+        """
         self._executor = executor
+        self._isolate = isolate
         self._plugins = plugins
         self._store = store
         self._logs = out / LOG_FOLDER
@@ -103,7 +115,8 @@ class Dispatcher:
         """
         threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
-        job = Job(self._next_number, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
+        fresh = self._isolate and not unit.entry.spec.is_built_in
+        job = Job(self._next_number, unit, threads, unit.entry.policy.timeout_s, log, self._plugins, fresh)
         self._next_number += 1
         self._running[job.number] = _RunningJob(job, self._memory_of(unit))
         self._executor.submit(job)
@@ -166,7 +179,7 @@ class Dispatcher:
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
         said = tail(job.log, _SHOWN_LINES)
-        if not resolved(path.parent).is_relative_to(resolved(self._logs.parent)):
+        if not is_inside(path.parent, self._logs.parent):
             return None, said  # a link, or the name of an item of a plugin, leads outside
         with suppress(OSError):  # the run does not fail because of a log
             found = stat_of(job.log)

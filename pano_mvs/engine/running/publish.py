@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.file_names import is_of_the_run
-from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
-from pano_mvs.core.paths import is_file, is_link, resolved
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, set_aside
+from pano_mvs.core.paths import is_file, is_inside, is_link
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import is_full_disk
 from pano_mvs.engine.cache.store import ItemRef, Store
@@ -64,6 +64,7 @@ class Publisher:
         except OSError as error:
             raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
         self._cleared: set[Path] = set()
+        self._patterns: set[tuple[str, str]] = set()  # what stands before and after the name of an image
         self._clear(out)
 
     def name_items(self, names: Iterable[str]) -> None:
@@ -123,7 +124,7 @@ class Publisher:
         """Return the files of a unit by their path in the output folder, after checking these paths."""
         files: dict[str, BlobRef] = {}
         for target, blob in self._files(ref):
-            name = str(PurePosixPath(to) / self._placed(target, item))
+            name = self._placed(str(PurePosixPath(to) / target), item)
             if is_of_the_run(name):
                 raise ContractError(
                     f"it delivers {name}, which the run itself writes: change the stage's name for the file, or give "
@@ -149,15 +150,22 @@ class Publisher:
             (self.out / name).unlink(missing_ok=True)
             self._remove_emptied([name])
 
-    def remove_stale(self, earlier: dict[str, str]) -> list[str]:
+    def remove_stale(self, earlier: dict[str, str], *, complete: bool = True) -> list[str]:
         """Delete files that an earlier run wrote and this one did not, if they are unchanged since then.
 
         Their folders are deleted too if they are empty; the output folder itself and links are kept.
+
+        Args:
+            earlier: file to digest.
+            complete: whether this run has written all its files; otherwise, only those of images that are no longer in
+                the capture are deleted.
         """
         removed: list[str] = []
         for name, digest in earlier.items():
             path = self.out / name
-            if name in self.published or not _is_inside(path, self.out) or not is_file(path):
+            if not complete and not self._is_of_gone_image(name):
+                continue
+            if name in self.published or not is_inside(path.parent, self.out) or not is_file(path):
                 continue
             if self.store.stat_cache.digest(path) == digest:
                 path.unlink()
@@ -165,17 +173,31 @@ class Publisher:
         self._remove_emptied(removed)
         return removed
 
+    def _is_of_gone_image(self, name: str) -> bool:
+        """Return whether a file is named like those of an image, but after no image of the capture."""
+        texts = {*self._stems, *self._stems.values()}
+        for before, after in self._patterns:
+            middle = name[len(before) : len(name) - len(after)]
+            if name == f"{before}{middle}{after}" and middle:
+                folders_and_parts = {
+                    middle[:end] for end in range(1, len(middle) + 1) if middle[end : end + 1] in "._/"
+                }
+                return not folders_and_parts & texts
+        return False
+
     def _remove_emptied(self, removed: Iterable[str]) -> None:
         """Remove the folders of removed files if they are empty."""
         emptied = {folder for name in removed for folder in PurePosixPath(name).parents if folder.parts}
         for folder in sorted(emptied, key=lambda folder: len(folder.parts), reverse=True):
             path = self.out / folder
-            if _is_inside(path, self.out) and not is_link(path):
+            if is_inside(path.parent, self.out) and not is_link(path):
                 with suppress(OSError):  # it is not empty, or it is gone
                     path.rmdir()
 
     def _placed(self, target: str, item: str) -> str:
         texts = {"{item}": self._stems.get(item, item), "{name}": item}
+        if len(parts := _PLACEHOLDER.split(target)) == 2:
+            self._patterns.add((parts[0], parts[1]))
         return _PLACEHOLDER.sub(lambda match: texts[match[0]], target)
 
     def _files(self, ref: ItemRef) -> list[tuple[str, BlobRef]]:
@@ -199,7 +221,7 @@ class Publisher:
 
     def _write(self, name: str, blob: BlobRef) -> None:
         target = self.out / name
-        if not _is_inside(target, self.out):
+        if not is_inside(target.parent, self.out):
             raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
         self._clear(target.parent)
         there = ""
@@ -207,23 +229,14 @@ class Publisher:
             there = self.store.stat_cache.digest(target)
         if there == blob.digest:
             return
-        source = self.store.blobs.verified_path(blob)
+        self.store.blobs.verified_place(blob)
         if there and there != self.earlier.get(name) and not self._is_stored(target, there, blob.suffix):
             self.set_aside[name] = set_aside(target).relative_to(self.out).as_posix()
-        try:
-            copy_file(source, target)
-        except StoreError:
-            if not self.store.blobs.exists(blob):  # garbage collection has deleted it meanwhile
-                raise self.store.blobs.discard(blob, "is missing") from None
-            raise
+        self.store.blobs.copy(blob, target)
         self.written.append(name)
 
     def _is_stored(self, path: Path, digest: str, suffix: str) -> bool:
         return self.store.blobs.exists(BlobRef(digest, path.stat().st_size, suffix))
-
-
-def _is_inside(path: Path, folder: Path) -> bool:
-    return resolved(path.parent).is_relative_to(resolved(folder))
 
 
 def _cannot_write(path: Path, reason: str) -> str:

@@ -24,6 +24,7 @@ from pano_mvs.core.errors import ContractError, PanoMvsError, RunStoppedError, S
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.maintenance import pack
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import Sample
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
@@ -92,7 +93,8 @@ class Run:
             options: what the user asked for beyond the workflow.
 
         Raises:
-            UsageError: if the output folder cannot be written, or the options name a stage that does not exist.
+            UsageError: if the output folder cannot be written, the options name a stage that does not exist, or units
+                cannot be isolated.
         """
         self.workflow, self.graph = options.applied_to(workflow, graph)
         self.options = options
@@ -101,7 +103,9 @@ class Run:
         self.observer = observer or SilentObserver()
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
-        self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins)
+        if options.isolate and not self.executor.enforces_timeouts:
+            raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use processes or dask")
+        self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
         self.keys: dict[str, dict[str, str]] = {}
         self.computed: set[str] = set()
@@ -139,8 +143,8 @@ class Run:
             self._execute_passes()
             self._has_passed = True
             self._warn_of_unused_refresh()
-            if self.result.complete and not self.graph.is_part:
-                self.result.removed = self.publisher.remove_stale(self.publisher.earlier)
+            if not self.result.stopped and not self.graph.is_part:
+                self.result.removed = self.publisher.remove_stale(self.publisher.earlier, complete=self.result.complete)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
             self._wait_for_running_units()
@@ -199,6 +203,15 @@ class Run:
             self._remember_times()
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
+        if self._has_passed and self.computed:
+            self._pack()
+
+    def _pack(self) -> None:
+        """Move the results into few files; the run does not fail if that is impossible."""
+        try:
+            pack(self.store)
+        except StoreError as error:
+            self.warn(f"the results stay in many files, because they could not be packed: {error}")
 
     def _remember_times(self) -> None:
         """Store what the units of each stage took, for the estimates of later runs."""

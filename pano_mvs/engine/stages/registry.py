@@ -10,7 +10,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Collection, Iterator
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
@@ -21,6 +21,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.process_state import loading_plugin
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.stages.plugin_files import (
@@ -164,7 +165,8 @@ class Registry:
     def _load_entry_point(self, entry: EntryPoint) -> None:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
         try:
-            with redirect_stdout(sys.stderr):
+            ours = entry.value.partition(".")[0] == "pano_mvs"
+            with redirect_stdout(sys.stderr), nullcontext() if ours else loading_plugin():
                 module = entry.load()
             if not isinstance(module, ModuleType):
                 raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
@@ -280,7 +282,7 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
-        with redirect_stdout(sys.stderr):  # commands write their results to the standard output
+        with redirect_stdout(sys.stderr), loading_plugin():  # commands write their results to the standard output
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]

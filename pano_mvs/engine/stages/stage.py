@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import typing
 from collections.abc import Callable, Iterable, Mapping
@@ -67,6 +68,7 @@ class StageSpec:
         memory_bytes: memory that one unit needs; 0 if not declared.
         memory_needed: returns the memory that a unit needs, if it depends on settings and inputs.
         every_image: whether the stage has a unit for images without neighbours as well; see `stage`.
+        needs: distributions that must be installed, by the module that each provides.
     """
 
     name: str
@@ -82,11 +84,22 @@ class StageSpec:
     memory_bytes: int = 0
     memory_needed: MemoryNeeded | None = None
     every_image: bool = False
+    needs: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def doc(self) -> str:
         """The stage's docstring."""
         return inspect.getdoc(self.function) or ""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The distributions that the stage needs and that are not installed."""
+        return tuple(name for module, name in self.needs.items() if importlib.util.find_spec(module) is None)
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the stage is part of this package, and not of a plugin."""
+        return self.function.__module__.partition(".")[0] == "pano_mvs"
 
     @property
     def index_kind(self) -> type[Record] | None:
@@ -119,7 +132,12 @@ class _Signature:
 
 
 def stage(
-    name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0, every_image: bool = False
+    name: str,
+    *,
+    version: int = 1,
+    memory: str | int | MemoryNeeded = 0,
+    every_image: bool = False,
+    needs: Mapping[str, str] | None = None,
 ) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
@@ -133,6 +151,9 @@ def stage(
     Each ports instead, so that a stage that returns images loses none. Near ports then begin with the image's own
     items, if it has them at all Near ports, and are empty for images that are not in the index.
 
+    `needs` names what must be installed, as module to distribution, such as `{"cv2": "opencv-python-headless"}`. A
+    workflow with the stage is refused before anything runs if one is missing.
+
     Raises:
         PluginError: if the function does not have the signature of a stage.
     """
@@ -142,7 +163,7 @@ def stage(
         spec = _spec(name, function, signature, version=version, memory=memory)
         if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
             raise PluginError(f"stage {name!r} ({spec.origin}): every_image needs ports annotated Each and Near")
-        setattr(function, _ATTRIBUTE, replace(spec, every_image=every_image))
+        setattr(function, _ATTRIBUTE, replace(spec, every_image=every_image, needs=dict(needs or {})))
         return function
 
     return decorate

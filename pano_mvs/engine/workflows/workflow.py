@@ -190,6 +190,10 @@ class WorkflowReader:
             hint = self.registry.suggest(str(use.value)[:80])
             self.problems.add(use.place, f"stage {name!r}: there is no stage {shown}; {hint}")
             return None
+        if missing := spec.missing:
+            packages = " ".join(missing)
+            message = f"{use.value} needs packages that are not installed: pip install {packages}"
+            self.problems.add(use.place, f"stage {name!r}: {message}")
         values = node.plain()
         policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name=name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}

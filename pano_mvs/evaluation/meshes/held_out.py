@@ -11,10 +11,9 @@ from pano_mvs.algorithms.mesh.texture import TexturedMesh
 from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.algorithms.mesh.visibility import surface_view
 from pano_mvs.algorithms.rendering.mesh import picture_from_texture, picture_from_vertices, reduced_picture
+from pano_mvs.core.arrays import Picture
 from pano_mvs.evaluation.meshes.picture_scores import PictureScores, picture_scores
 from pano_mvs.geometry import Rigid3
-
-Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle
-
-Picture = NDArray[np.uint8]
 
 # Of Z. Wang et al., section III C: a window of 11 × 11 pixels, and the constants for 8 bits.
 _SIGMA_PX, _RADIUS_PX = 1.5, 5

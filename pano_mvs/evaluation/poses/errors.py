@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.poses.alignment import align_centers, camera_extent
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
-
-FloatArray = NDArray[np.float64]
 
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
 # Centres closer than this share of the capture's extent coincide: an image that occurs twice.

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.paths import is_file
-from pano_mvs.evaluation.drawing import INK, WIDTH, Picture, put_text, strip, write_stack
+from pano_mvs.core.file_names import file_inside, path_inside
+from pano_mvs.evaluation.drawing import INK, WIDTH, put_text, strip, write_stack
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
 from pano_mvs.evaluation.ranges.pairs import RangePairs
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
@@ -59,7 +60,7 @@ def write_depth_pictures(
     for name in evaluation.views:
         maps = evaluation.read_maps(name)
         image = _load(panoramas[name]) if name in panoramas else None
-        path = folder / f"{name}.jpg"
+        path = path_inside(folder, f"{name}.jpg")
         write_error_picture(path, maps.estimated, maps.truth, image=image, counted=maps.counted, limit=limit)
 
 
@@ -141,10 +142,10 @@ def _panoramas(images: Path | None, pairs: RangePairs) -> Mapping[str, Path]:
     if pairs.truth_path is None:
         return {}
     places = {
-        name: [folder / other for folder in (pairs.truth_path, pairs.truth_path.parent)]
+        name: [file_inside(folder, other, through_links=True) for folder in (pairs.truth_path, pairs.truth_path.parent)]
         for name, other in pairs.true_names.items()
     }
-    found = {name: next(filter(is_file, paths), None) for name, paths in places.items()}
+    found = {name: next(filter(None, paths), None) for name, paths in places.items()}
     return {name: path for name, path in found.items() if path and path.suffix.lower() in PICTURE_SUFFIXES}
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.clouds.ply_frame import FloatArray, frame_comments, stated_rotation, turned, without_comments
+from pano_mvs.io.clouds.ply_frame import frame_comments, stated_rotation, turned, without_comments
 from pano_mvs.scene import FilePart
 
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])

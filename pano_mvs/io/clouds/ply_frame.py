@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 _KEY = b"comment file_from_world "
 _MEANING = "comment x_in_file = file_from_world x_in_world; poses and COLMAP models are in the world\n"

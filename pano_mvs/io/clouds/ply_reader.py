@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.clouds.ply_frame import FloatArray, stated_rotation, turned
+from pano_mvs.io.clouds.ply_frame import stated_rotation, turned
 from pano_mvs.scene import PointCloud
 
 # PLY's names of number types, old and new.

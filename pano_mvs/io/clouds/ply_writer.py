@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.clouds.ply_frame import FloatArray, frame_comments, stated_rotation, turned, without_comments
+from pano_mvs.io.clouds.ply_frame import frame_comments, stated_rotation, turned, without_comments
 from pano_mvs.io.clouds.thinning import SelectedPoints, chunks
 from pano_mvs.scene import FilePart, PointCloud
 

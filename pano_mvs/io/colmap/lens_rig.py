@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, quat_wxyz_from_rotation
 from pano_mvs.io.colmap.points import ModelForm, ModelPoints, write_model
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 # COLMAP's OPENCV_FISHEYE cannot project points at 90° from the axis or beyond.
 MAX_ANGLE_DEG = 89.0

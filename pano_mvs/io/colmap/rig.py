@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import PinholeView, Rigid3
 from pano_mvs.io.colmap.photographs import add_photographs
 from pano_mvs.io.colmap.points import ModelForm, ModelPoints, write_model
 from pano_mvs.scene import Poses
 from pano_mvs.scene.photographs import Photographs
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import OUTPUT_MARK, is_cache
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
+from pano_mvs.core.text import shortened_list
 from pano_mvs.io.images.containers import read_container
 from pano_mvs.io.images.exif import orientation_from_exif, position_from_exif
 from pano_mvs.io.images.gpano import GPano, find_gpano
@@ -20,6 +21,7 @@ from pano_mvs.scene.image_files.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
+_OTHER_PICTURES = frozenset({".bmp", ".dng", ".gif", ".insp", ".jp2", ".jxl", ".psd"})
 _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = (
     "an EXIF orientation that rotates or mirrors them, which was ignored: the pixels of a panorama are used as "
@@ -77,6 +79,10 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
     notes = [] if notes is None else notes
     files = list(files_below(folder, notes))
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    others = [path.name for path in files if path.suffix.lower() in _OTHER_PICTURES]
+    if others:
+        kinds = ", ".join(sorted({Path(name).suffix.lower().lstrip(".") for name in others}))
+        notes.append(f"{folder}: images of unsupported formats ({kinds}) are skipped: {shortened_list(others)}")
     if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
         raise InputError(
             f"{folder}: no images here, but the video {film.name}. Use source.video: "
@@ -131,6 +137,11 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
         sphere, crop, more = _placed(path, (height, width), full_hw=gpano.full_size_hw, crop_ltwh=gpano.crop_ltwh)
         warnings = (*warnings, *more)
+        if sphere[0] * sphere[1] > max_pixels:
+            raise InputError(
+                f"{path}: its GPano metadata say that the full sphere is {sphere[1]}×{sphere[0]} px, more than the "
+                f"limit of {max_pixels / 1e6:.0f} megapixels. Correct the metadata, or remove them"
+            )
     elif width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
@@ -149,7 +160,7 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
 
     Args:
         folder: the folder.
-        notes: a warning is appended for each subfolder that cannot be listed.
+        notes: a warning is appended for each subfolder that cannot be listed, and each image that is not a file.
 
     Raises:
         InputError: if the folder itself cannot be listed, or is a cache.
@@ -174,7 +185,14 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
             continue
         seen.add(resolved(here))
         folders[:] = sorted(name for name in folders if not _is_left_out(here / name))
-        yield from (here / name for name in sorted(files) if not name.startswith(".") and _is_file(here / name))
+        for path in (here / name for name in sorted(files) if not name.startswith(".")):
+            if is_file(path) or is_denied(
+                path
+            ):  # reading a file that cannot be examined raises an error with the reason
+                yield path
+            elif path.suffix.lower() in PICTURE_SUFFIXES:
+                what = "not a regular file" if exists(path) else "a link that leads nowhere"
+                notes.append(f"{path}: this is {what}; it is skipped")
 
 
 def _is_left_out(folder: Path) -> bool:
@@ -182,11 +200,6 @@ def _is_left_out(folder: Path) -> bool:
     if name.startswith(".") or name.lower() in _IGNORED_FOLDERS:
         return True
     return exists(folder / OUTPUT_MARK) or is_cache(folder)
-
-
-def _is_file(path: Path) -> bool:
-    """Return whether a path is a file, or cannot be examined; reading it then raises an error with the reason."""
-    return is_file(path) or is_denied(path)
 
 
 def _placed(

@@ -24,13 +24,25 @@ def keyframe_file(video: Path, settings: object) -> Path | None:
         video: the video; its path, size, time stamps and inode are part of the file's name.
         settings: plain values that the choice depends on.
     """
+    return file_of_state(video, "keyframes", settings, suffix=".json")
+
+
+def file_of_state(path: Path, what: str, settings: object, *, suffix: str) -> Path | None:
+    """Return the file among the user's caches for what was computed from a file as it is now; None if there is none.
+
+    Args:
+        path: the file; its path, size, time stamps and inode are part of the name.
+        what: folder for what is stored.
+        settings: plain values that it depends on.
+        suffix: of the name.
+    """
     try:
-        stated = video.stat()
+        stated = path.stat()
         folder = user_cache_folder()
     except OSError:
         return None
-    state = [str(resolved(video)), stated.st_size, stated.st_mtime_ns, stated.st_ctime_ns, stated.st_ino]
-    return folder / "pano-mvs" / "keyframes" / f"{digest_from_value([state, settings])}.json"
+    state = [str(resolved(path)), stated.st_size, stated.st_mtime_ns, stated.st_ctime_ns, stated.st_ino]
+    return folder / "pano-mvs" / what / f"{digest_from_value([state, settings])}{suffix}"
 
 
 def read_times(path: Path | None) -> list[float] | None:

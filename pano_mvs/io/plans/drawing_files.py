@@ -8,12 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 DXF_REMEDY = "DXF files need the package ezdxf: pip install 'pano-mvs[dxf]'"
 _METRES, _UNITLESS = 6, 0

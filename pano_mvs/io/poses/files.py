@@ -20,12 +20,21 @@ from pano_mvs.io.poses.json_files import (
     require_object,
     rigid_from_arrays,
 )
+from pano_mvs.io.poses.metashape import read_metashape
+from pano_mvs.io.poses.openmvg import is_openmvg, openmvg_poses
 from pano_mvs.io.poses.opensfm import is_opensfm, opensfm_poses
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
-_IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv", "reconstruction.json")
+_IN_A_FOLDER = (
+    "transforms.json",
+    "poses.json",
+    "truth/poses.json",
+    "poses.csv",
+    "reconstruction.json",
+    "sfm_data.json",
+)
 
 
 def read_poses(path: Path) -> Poses:
@@ -36,6 +45,8 @@ def read_poses(path: Path) -> Poses:
         of SphereSfM with SPHERE cameras, whose points are ignored;
       * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
       * OpenSfM's reconstruction.json with a spherical camera; the largest of several reconstructions;
+      * openMVG's sfm_data.json with spherical cameras;
+      * Metashape's XML of cameras with a spherical sensor; the largest of several components;
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
@@ -50,13 +61,19 @@ def read_poses(path: Path) -> Poses:
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _from_file(read_csv(path), path, metric=False)
+    if suffix == ".xml":
+        return _from_file(read_metashape(path), path, metric=False)
     if suffix != ".json":
-        raise InputError(f"{path}: poses are read from a COLMAP model (its folder), .json and .csv, not {suffix!r}")
+        raise InputError(
+            f"{path}: poses are read from a COLMAP model (its folder), .json, .xml and .csv, not {suffix!r}"
+        )
     value = read_json_value(path)
     if is_opensfm(value):
         poses, metric = opensfm_poses(value, path)
         return _from_file(poses, path, metric=metric)
     data = require_object(value, path)
+    if is_openmvg(data):
+        return _from_file(openmvg_poses(data, path), path, metric=False)
     if "frames" in data:
         return _from_file(read_transforms(path), path, metric=False)
     if "views" in data:
@@ -96,7 +113,7 @@ def recorded_pictures(path: Path) -> dict[str, str]:
     """
     path = _file_or_model(path)
     value = read_json_value(path) if path.suffix.lower() == ".json" else None
-    if not isinstance(value, dict) or "views" not in value:
+    if not isinstance(value, dict) or "views" not in value or is_openmvg(value):
         return {}
     return {view.name: view.sha256 for view in read_posed_views(path)[0] if view.sha256 is not None}
 
@@ -130,7 +147,7 @@ def _file_or_model(path: Path) -> Path:
     if not exists(path):
         raise InputError(
             f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-            "poses.json, a reconstruction.json or a CSV file"
+            "poses.json, a reconstruction.json, a sfm_data.json, an XML file of Metashape or a CSV file"
         )
     if not is_folder(path):
         return path

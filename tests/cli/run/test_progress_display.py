@@ -14,6 +14,7 @@ from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.session.progress import (
     Event,
     Forecast,
+    KernelsCompiled,
     RunStarted,
     StageFinished,
     StageStarted,
@@ -104,6 +105,14 @@ def test_a_line_states_share_time_left_and_the_stages_at_work() -> None:
     assert shown.line(10.0) == "5 %, about 3 min left (now: depth 0 of 4)"
     shown.events(UnitFinished("depth", "a.jpg", "run", 30.0))
     assert shown.line().startswith("16 %, about 3 min left")
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_compilation_is_shown_while_it_takes_place(is_terminal: bool) -> None:
+    shown = Shown(is_terminal=is_terminal)
+    shown.events(STARTED, FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a"), KernelsCompiled(12, 1.0))
+    assert "compiling kernels (once): 12 so far" in (shown.line(1.0) if not is_terminal else "\n".join(shown.live(1.0)))
+    assert "compiling" not in (shown.line(60.0) if not is_terminal else "\n".join(shown.live(60.0)))
 
 
 def test_finished_stages_failures_and_warnings_stay() -> None:

@@ -15,7 +15,7 @@ stages:
   features: {{use: features.{features}, max_keypoints: 1500}}
   {looks}
   pairs:    {{use: pairs.{selector}}}
-  matches:  {{use: matches.brute_force, preemptive: 100}}
+  matches:  {{use: matches.brute_force}}
   poses:    {{use: poses.scaled_translation}}
   refined:  {{use: poses.refine}}
   export:   {{use: export.colmap}}

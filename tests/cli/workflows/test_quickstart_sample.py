@@ -74,14 +74,15 @@ def test_killed_in_the_middle_it_resumes_to_the_same_bytes(tmp_path: Path) -> No
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     for folder in (undisturbed, killed):
         folder.mkdir()
-    subprocess.run(command(undisturbed, *SMALL), check=True)
+    finished = subprocess.run(command(undisturbed, *SMALL), check=False).returncode
+    assert finished in (0, 3), "3: at this size, a camera may be doubtful"
     whole = len(times_of_records(undisturbed))
     kill_in("matches", killed)
     matched = times_of_records(killed)
     kill_in("depth", killed)
     swept = times_of_records(killed)
     assert 0 < len(matched) < len(swept) < whole
-    subprocess.run(command(killed, *SMALL), check=True)
+    assert subprocess.run(command(killed, *SMALL), check=False).returncode == finished
     resumed = times_of_records(killed)
     assert len(resumed) == whole
     assert matched.items() <= swept.items() <= resumed.items()  # what was computed is not computed again

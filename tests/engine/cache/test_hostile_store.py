@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import pickle
 import re
 import shutil
+import time
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -28,7 +30,7 @@ from pano_mvs.engine.cache.latest_runs import _read as read_run
 from pano_mvs.engine.cache.maintenance import collect, usage_of, verify
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.running.events import RunResult
-from tests.engine.conftest import Toy
+from tests.engine.conftest import Toy, ran
 from tests.stress.captures import deliverables
 from tests.stress.damage import Patient, make_patient
 
@@ -276,6 +278,36 @@ def test_link_in_place_of_a_blob_is_replaced_and_what_it_leads_to_stays(toy: Toy
     assert toy.run().exit_code == 0
     assert toy.deliverables() == clean
     assert all(set(path.read_bytes()) <= {ord("p")} for path in toy.folder.glob("precious-*"))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
+def test_what_stands_in_place_of_a_record_is_replaced(toy: Toy, kind: str) -> None:
+    """A pipe in place of a record stopped the run for ever, and a folder ended it."""
+    toy.run()
+    clean, root = toy.deliverables(), toy.folder / "cache"
+    assert records(root, "toy.scale")
+    for path in records(root, "toy.scale"):
+        path.unlink()
+        if kind == "folder":
+            (path / "inside").mkdir(parents=True)
+        elif kind == "device":
+            path.symlink_to("/dev/null")
+        else:
+            os.mkfifo(path)
+    verify(Store(root))
+    assert toy.run().exit_code == 0
+    assert toy.deliverables() == clean
+    assert ran(toy.run()) == {}
+
+
+def test_records_of_a_clock_that_was_wrong_are_collected(toy: Toy) -> None:
+    toy.run()
+    root = toy.folder / "cache"
+    future = time.time() + 1e8
+    for path in (root / "records").rglob("*.json"):
+        os.utime(path, (future, future))
+    found = collect(Store(root), unused_s=3600.0, forget_after_s=0.0)
+    assert len(found.records) == len(list((root / "records").rglob("*.json")))
 
 
 def test_output_folder_with_a_link_is_not_left(toy: Toy) -> None:

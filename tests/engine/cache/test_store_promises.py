@@ -257,7 +257,7 @@ def test_a_users_file_is_found_where_it_was_said_to_be(tmp_path: Path) -> None:
     assert not blobs.exists(ref)
     blobs.place_external(ref.digest, tmp_path / "a")
     assert blobs.exists(ref)
-    assert blobs.verified_path(ref) == tmp_path / "a"
+    assert blobs.verified_place(ref) == tmp_path / "a"
 
 
 @pytest.mark.parametrize("part", [{"a": 1}, np.arange(5), "file"])
@@ -288,12 +288,13 @@ def test_what_is_damaged_is_written_again(tmp_path: Path, part: Part) -> None:
 def test_bytes_are_checked_once_in_the_life_of_a_store(tmp_path: Path) -> None:
     store = Store(tmp_path)
     ref = store.blobs.put({"a": 1})
-    path = store.blobs.verified_path(ref)
+    path = store.blobs.path(ref)
+    assert store.blobs.verified_place(ref) == path
     data = path.read_bytes()
     path.write_bytes(data[::-1])
-    assert store.blobs.verified_path(ref) == path
+    assert store.blobs.verified_place(ref) == path
     with pytest.raises(DamagedBlobError, match="is damaged or missing"):
-        Store(tmp_path).blobs.verified_path(ref)
+        Store(tmp_path).blobs.verified_place(ref)
     assert not path.exists()
     path.write_bytes(data[::-1])
     error = store.blobs.discard(ref, "is of no use")
@@ -301,14 +302,15 @@ def test_bytes_are_checked_once_in_the_life_of_a_store(tmp_path: Path) -> None:
     assert str(error) == f"{path} is of no use; the same command computes it again"
     path.write_bytes(data[::-1])
     with pytest.raises(DamagedBlobError, match="is damaged or missing"):
-        store.blobs.verified_path(ref)
+        store.blobs.verified_place(ref)
 
 
 def test_a_blob_that_was_collected_since_it_was_verified_is_damage(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for part in ({"a": 1}, np.arange(3)):
         ref = store.blobs.put(part)
-        store.blobs.verified_path(ref).unlink()
+        store.blobs.verified_place(ref)
+        store.blobs.path(ref).unlink()
         with pytest.raises(DamagedBlobError, match="is gone; the same command"):
             store.blobs.get(ref)
 
@@ -455,7 +457,7 @@ def test_a_blob_that_is_not_there_is_damage(tmp_path: Path) -> None:
     blobs = Store(tmp_path).blobs
     for ref in (BlobRef(KEY, 3, ".npy"), BlobRef(KEY, 3, ".json")):
         with pytest.raises(DamagedBlobError, match="is damaged or missing"):
-            blobs.verified_path(ref)
+            blobs.verified_place(ref)
 
 
 @pytest.mark.parametrize("shape", [(1,) * 70, (0, -1), (-1, -1)])

@@ -246,6 +246,8 @@ def test_definitions_and_what_a_module_does_on_import(
 @pytest.mark.parametrize(
     "decorator",
     [
+        "kernel",
+        "inlined",
         "njit",
         "jit",
         "vectorize",

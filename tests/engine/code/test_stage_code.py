@@ -88,7 +88,7 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
             "algorithms.two_view.kernels_five_point",
             "_MAX_INTERVALS = ",
             "_MAX_INTERVALS = 1 + ",
-            {"matches.bridges", "matches.brute_force"},
+            {"matches.brute_force", "matches.lightglue"},
         ),
     ],
 )

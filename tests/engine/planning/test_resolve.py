@@ -45,6 +45,7 @@ class Resolved:
         toy.edit("plug.py", lambda text: text + MORE)
         more = (
             "plus: {use: toy.plus, in: {x: scaled}}",
+            "any: {use: toy.total_of_any, in: {xs: scaled}}",
             "again: {use: toy.scale, in: {x: shifted}}",
             "seen: {use: toy.view, in: {mean: mean, x: shifted}}",
             "around: {use: toy.around, in: {x: images, near: scaled}}",
@@ -107,6 +108,13 @@ def test_a_gather_waits_for_all_and_does_without_what_failed(resolved: Resolved)
     assert resolved("shifted", scaled=images("a", "b", pending="b"))[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=OPEN)[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
+
+
+def test_an_optional_gather_is_given_nothing_if_the_other_stage_had_nothing_to_do(resolved: Resolved) -> None:
+    units, _ = resolved("any", scaled=images())
+    assert units[WHOLE].inputs == {"xs": None}
+    assert resolved("any", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
+    assert resolved("any", scaled=images("a", pending="a"))[1].waiting == [WHOLE]
 
 
 def whole(reference: ItemRef | None, *, pending: bool = False, failed: bool = False) -> StageState:

@@ -56,6 +56,22 @@ def test_folders_that_stale_files_leave_empty_go_with_them(tmp_path: Path) -> No
     assert out.is_dir()
 
 
+def test_an_incomplete_run_deletes_only_files_of_images_that_are_gone(tmp_path: Path) -> None:
+    """A capture with one image that is never registered kept the files of renamed images for ever."""
+    out, store = tmp_path / "out", Store(tmp_path / "cache")
+    names = ["range/a.tiff", "range/b.tiff", "range/b.old.tiff", "range/gone.tiff", "range/x/gone.tiff", "cloud.ply"]
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(name)
+    publisher = Publisher(out, store)
+    earlier = {name: store.stat_cache.digest(out / name) for name in names}
+    publisher.name_items(["a.png", "b.png"])
+    publisher.begin_pass()
+    delivered(tmp_path, publisher, store, "a.png", "range/{item}.tiff")
+    assert publisher.remove_stale(earlier, complete=False) == ["range/gone.tiff", "range/x/gone.tiff"]
+    assert publisher.remove_stale(earlier) == ["range/b.tiff", "range/b.old.tiff", "cloud.ply"]
+
+
 def test_a_linked_folder_and_what_it_leads_to_stay(tmp_path: Path) -> None:
     out, outside = tmp_path / "out", tmp_path / "outside"
     (out / "real").mkdir(parents=True)

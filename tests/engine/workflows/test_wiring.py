@@ -25,6 +25,12 @@ def total(xs: All[Number]) -> Total:
     return Total(sum(x.value for x in xs.values()))
 
 
+@stage("toy.total_of_any")
+def total_of_any(xs: All[Number] | None) -> Total:
+    """Sum; of none without input."""
+    return Total(sum(x.value for x in (xs or {}).values()))
+
+
 @stage("toy.plus")
 def plus(x: Each[Number], total: One[Total] | None) -> Number:
     """With the total, if there is one."""

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import re
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import CACHE_MARK
@@ -15,8 +20,15 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.io.images import captures
 from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
 from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.image_files.decoding import MAX_PIXELS
 from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
 from tests.permissions import permissions_hold
+
+FIELDS = (
+    *("ProjectionType", "FullPanoWidthPixels", "FullPanoHeightPixels", "CroppedAreaImageWidthPixels"),
+    *("CroppedAreaImageHeightPixels", "CroppedAreaLeftPixels", "CroppedAreaTopPixels", "PosePitchDegrees"),
+)
+HOSTILE_NUMBERS = ("64", "32", "0", "-1", "1e9", "2000000000", "1e308", "nan", "-inf", "64.5", "9" * 400)
 
 
 def test_pictures_come_in_the_order_in_which_people_count(tmp_path: Path) -> None:
@@ -179,6 +191,47 @@ def test_a_panorama_made_smaller_keeps_its_place(tmp_path: Path) -> None:
     info = describe_picture(write_png(tmp_path / "a.png", (30, 60), xmp(fields)))
     assert (info.size_hw, info.crop_ltwh, info.full_width_px) == ((400, 800), (100, 70, 600, 300), 80)
     assert "resized from 600×300 to 60×30 px" in info.warnings[0]
+
+
+@pytest.mark.parametrize("height", [20_000, 10**9, 10**300])
+def test_a_sphere_of_any_size_costs_no_memory(tmp_path: Path, height: int) -> None:
+    """A GPano field of two thousand million columns ended the whole run without a report."""
+    fields = full_sphere(height, 2 * height) | {
+        "CroppedAreaImageWidthPixels": 64,
+        "CroppedAreaImageHeightPixels": 32,
+        "CroppedAreaLeftPixels": 0,
+        "CroppedAreaTopPixels": 0,
+    }
+    with pytest.raises(InputError, match=r"the full sphere is \d+×\d+ px, more than the limit of 512 megapixels"):
+        describe_picture(write_png(tmp_path / "a.png", (32, 64), xmp(fields)))
+
+
+@given(st.dictionaries(st.sampled_from(FIELDS), st.sampled_from(HOSTILE_NUMBERS) | st.text(max_size=6), max_size=9))
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_gpano_fields_give_a_sphere_within_the_limit_or_an_error(tmp_path: Path, fields: dict[str, object]) -> None:
+    legal = {name: re.sub(r"[^\w.+ -]", "", str(value)) for name, value in fields.items()}
+    path = write_png(tmp_path / "a.png", (32, 64), xmp(legal))
+    with suppress(InputError):
+        info = describe_picture(path)
+        assert info.size_hw[0] * info.size_hw[1] <= MAX_PIXELS
+
+
+def test_what_is_not_a_picture_file_is_named(tmp_path: Path) -> None:
+    """Broken links, pipes, links to devices and GIFs vanished without a word."""
+    write_png(tmp_path / "a.png", (32, 64))
+    (tmp_path / "b.jpg").symlink_to("nowhere.jpg")
+    (tmp_path / "c.jpg").symlink_to("/dev/zero")
+    (tmp_path / "e.gif").touch()
+    (tmp_path / "notes.txt").touch()
+    notes: list[str] = []
+    os.mkfifo(tmp_path / "d.jpg")
+    assert [path.name for path in list_pictures(tmp_path, notes)] == ["a.png"]
+    assert [note.removeprefix(str(tmp_path)) for note in notes] == [
+        "/b.jpg: this is a link that leads nowhere; it is skipped",
+        "/c.jpg: this is not a regular file; it is skipped",
+        "/d.jpg: this is not a regular file; it is skipped",
+        ": images of unsupported formats (gif) are skipped: e.gif",
+    ]
 
 
 def test_a_whole_panorama_made_smaller_is_whole(tmp_path: Path) -> None:

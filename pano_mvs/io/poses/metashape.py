@@ -1,0 +1,86 @@
+"""Poses from the XML file that Agisoft Metashape writes with File, Export, Export Cameras.
+
+A camera's transform is chunk_from_cam by rows, for the camera frame x right, y down, z forward, and that of its
+component is x_in_world = s R x_in_chunk + t. A spherical sensor looks along z in the middle of its image, as ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3, Similarity3
+from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
+
+_MAX_BYTES = 1 << 30
+
+
+def read_metashape(path: Path) -> dict[str, Rigid3]:
+    """Return the poses of the aligned cameras, by label, in the world of their component.
+
+    Of several components, the one with the most cameras is returned, because each may have a world of its own.
+
+    Raises:
+        InputError: if the file is not such a file, or a camera is not spherical; it names the camera.
+    """
+    root = _parsed(path)
+    chunk = root if root.tag == "chunk" else root.find("chunk")
+    if chunk is None:
+        raise InputError(f"{path}: has no element 'chunk'. Export the cameras of Metashape as XML")
+    sensors = {sensor.get("id"): sensor.get("type", "frame") for sensor in chunk.iterfind("sensors/sensor")}
+    worlds = {component.get("id"): component.find("transform") for component in chunk.iterfind("components/component")}
+    groups: dict[str | None, list[tuple[str, Rigid3]]] = {}
+    for camera in chunk.iterfind("cameras//camera"):
+        label, transform = camera.get("label") or "", camera.find("transform")
+        if transform is None or camera.get("enabled", "true") in ("false", "0"):
+            continue
+        where = f"{path}: camera {label!r}"
+        if (kind := sensors.get(camera.get("sensor_id"))) != "spherical":
+            raise InputError(f"{where}: its sensor is {kind}, expected spherical. Only panoramas can be used")
+        matrix = _numbers(transform.text, (4, 4), where)
+        chunk_from_cam = rigid_from_arrays(matrix[:3, :3], matrix[:3, 3], where)
+        component = camera.get("component_id")
+        world_from_chunk = _similarity(worlds.get(component), f"{path}: component {component}")
+        groups.setdefault(component, []).append((label, world_from_chunk.move_camera(chunk_from_cam.inverse())))
+    largest = max(groups.values(), key=len, default=[])
+    require_distinct([name for name, _ in largest], path)
+    return dict(largest)
+
+
+def _parsed(path: Path) -> ElementTree.Element:
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= _MAX_BYTES else b""
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    if not data or b"<!DOCTYPE" in data[:1000].upper() or b"<!ENTITY" in data.upper():
+        raise InputError(f"{path}: is too large, empty, or declares XML entities, which Metashape does not write")
+    try:
+        return ElementTree.fromstring(data)  # noqa: S314  # without entities
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not an XML file ({error})") from error
+
+
+def _similarity(transform: ElementTree.Element | None, where: str) -> Similarity3:
+    if transform is None:
+        return Similarity3(1.0, np.eye(3), np.zeros(3))
+    parts = {name: transform.findtext(name) for name in ("rotation", "translation", "scale")}
+    rotation = np.eye(3) if parts["rotation"] is None else _numbers(parts["rotation"], (3, 3), where)
+    translation = np.zeros(3) if parts["translation"] is None else _numbers(parts["translation"], (3,), where)
+    scale = 1.0 if parts["scale"] is None else float(_numbers(parts["scale"], (1,), where)[0])
+    if not 0 < scale < np.inf:
+        raise InputError(f"{where}: its scale {scale} is not a positive number")
+    checked = rigid_from_arrays(rotation, translation, where)
+    return Similarity3(scale, checked.rotation, checked.translation)
+
+
+def _numbers(text: str | None, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    try:
+        found = np.array([float(word) for word in (text or "").split()])
+        return found.reshape(shape)
+    except ValueError as error:
+        raise InputError(f"{where}: expected {' × '.join(map(str, shape))} numbers, got {str(text)[:60]!r}") from error

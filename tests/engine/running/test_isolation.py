@@ -1,0 +1,155 @@
+"""Nothing that a plugin does in its process reaches other units: changed libraries, forks, hanging children."""
+
+from __future__ import annotations
+
+import os
+import queue
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors.processes import ProcessExecutor
+from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.worker_process import WorkerProcess
+from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.running.run import Run
+from tests.engine.conftest import Toy, ran
+from tests.engine.running.test_executors import Make, files_below, run_with, told, two_processes
+from tests.engine.running.test_run import ALL_UNITS
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+
+
+def one_process(store: Store) -> ProcessExecutor:
+    return ProcessExecutor(store, workers=1, threads=1)
+
+
+def edit(toy: Toy, code: str) -> None:
+    """Put code at the beginning of the stage that multiplies."""
+    lines = "\n".join(f"    {line}" for line in code.splitlines())
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'    """Multiply."""\n{lines}'))
+
+
+def ended(pids: Path) -> bool:
+    """Return whether all processes whose ids are in a file have ended, within some seconds."""
+    numbers = [int(line) for line in pids.read_text().split()]
+    for _ in range(100):
+        states = [Path(f"/proc/{pid}/stat") for pid in numbers]
+        if all(not path.exists() or path.read_text().rpartition(")")[2].split()[0] == "Z" for path in states):
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, one_process])
+@pytest.mark.parametrize("at_import", [False, True])
+def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_import: bool) -> None:
+    """A plugin that switched OpenCV's optimisation off changed 12 of 12 files of built-in stages, with exit 0."""
+    clean = run_with(toy, SerialExecutor, name="clean")
+    edit(
+        toy,
+        """import cv2, math
+if not cv2.useOptimized() or math.floor(1.5) != 1: raise ValueError("tainted")
+cv2.setUseOptimized(False)
+math.floor = lambda x: 7""",
+    )
+    if at_import:
+        change = "import cv2, math\ncv2.setUseOptimized(False)\nmath.floor = lambda x: 7\nimport time"
+        toy.edit("plug.py", lambda text: text.replace("import time", change, 1))
+    result = run_with(toy, make)
+    assert result.exit_code == 0
+    assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
+    assert ran(result) == ran(clean) == ALL_UNITS
+    notes = {note for stage in result.stages for note in stage.notes}
+    assert any("it changed OpenCV's optimisation, math.floor in its process; this was undone" in note for note in notes)
+
+
+@pytest.mark.parametrize("how", ["returns", "raises"])
+def test_a_forked_child_neither_stores_nor_answers(toy: Toy, how: str) -> None:
+    """Units got the results of other units, since a forked child of the stage answered too."""
+    clean = run_with(toy, SerialExecutor, name="clean")
+    pids = toy.folder / "pids"
+    edit(
+        toy,
+        f"""if (child := os.fork()) == 0:
+    {"return Number(666.0)" if how == "returns" else "raise ValueError('child')"}
+open({str(pids)!r}, "a").write(f"{{child}} ")""",
+    )
+    result = run_with(toy, two_processes)
+    assert told(result) == told(clean)
+    assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
+    assert ended(pids)
+
+
+@pytest.mark.parametrize("child", ["os.fork() == 0", "subprocess.Popen(['sleep', '600']) is None"])
+def test_a_timeout_ends_what_the_unit_started(toy: Toy, child: str) -> None:
+    """A child that held the pipe of the worker made the run wait for it for ever."""
+    pids = toy.folder / "pids"
+    edit(
+        toy,
+        f"""import subprocess
+if x.value == 20:
+    {child}
+    open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
+    time.sleep(600)""",
+    )
+    result = run_with(toy, two_processes, "scaled.timeout_s=3")
+    assert [(failure.stage, failure.item) for failure in result.failures if "timeout_s: 3" in failure.cause] == [
+        ("scaled", "2.txt")
+    ]
+    assert ended(pids)
+
+
+def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> None:
+    pids = toy.folder / "pids"
+    edit(
+        toy,
+        f"""if x.value == 20:
+    if os.fork() == 0:
+        open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
+        time.sleep(600)
+    os._exit(3)""",
+    )
+    result = run_with(toy, two_processes)
+    assert ["its worker process died (exit code 3)" in failure.cause for failure in result.failures][:1] == [True]
+    assert ended(pids)
+
+
+def test_isolated_units_have_processes_of_their_own(toy: Toy) -> None:
+    pids = toy.folder / "pids"
+    edit(toy, f'open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")')
+    session = toy.session(cache=toy.folder / "cache-x")
+    store = Store(session.store_root)
+    options = RunOptions(until=("scaled",), isolate=True)
+    executor = one_process(store)
+    try:
+        Run(session.workflow, session.graph, store, out=toy.folder / "o", executor=executor, options=options).execute()
+    finally:
+        executor.close()
+    numbers = pids.read_text().split()
+    assert len(numbers) == len(set(numbers)) == 5
+    with pytest.raises(UsageError, match="--isolate has no effect with --executor serial"):
+        Run(session.workflow, session.graph, store, out=toy.folder / "o", options=options)
+
+
+def test_answers_to_other_requests_are_ignored(tmp_path: Path) -> None:
+    worker = WorkerProcess(1, tmp_path / "errors.txt")
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    for line in (
+        b'{"ready": true}\n',
+        b'{"nonce": "old", "key": "k", "outcome": {"status": "failed", "record": null, "cause": "a child"}}\n',
+        b'{"nonce": "new", "key": "other", "outcome": {"status": "failed", "record": null, "cause": "a child"}}\n',
+        b'{"nonce": "new", "key": "k", "outcome": {"status": "failed", "record": null, "cause": "mine"}}\n',
+    ):
+        lines.put(line)
+    worker._lines = lines
+    found = worker._listen(process, {"nonce": "new", "key": "k"}, None)
+    process.wait()
+    assert found is not None
+    assert found.cause == "mine"

@@ -1,0 +1,161 @@
+"""Poses of openMVG and Metashape, in their own conventions."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Similarity3, pixel_from_ray, rotation_from_rotvec
+from pano_mvs.io.poses.files import read_poses, recorded_pictures
+from pano_mvs.testing.room import capture_poses
+
+POSES = dict(zip(("1.jpg", "rooms/2.jpg", "10.jpg"), capture_poses(3, seed=5), strict=True))
+SIZE_HW = (512, 1024)
+CHUNK = Similarity3(2.5, rotation_from_rotvec(np.array([0.3, -0.2, 0.9])), np.array([10.0, -4.0, 2.0]))
+
+
+def sfm_data() -> dict[str, Any]:
+    """Return a scene as openMVG 2 writes it; the third view has no pose."""
+
+    def wrapped(number: int, data: dict[str, Any], **kind: object) -> dict[str, Any]:
+        return {**kind, "ptr_wrapper": {"id": 2147483649 + number, "data": data}}
+
+    views, extrinsics = [], []
+    for number, (name, pose) in enumerate(POSES.items()):
+        folder, _, file = name.rpartition("/")
+        about = {"local_path": folder, "filename": file, "width": SIZE_HW[1], "height": SIZE_HW[0]}
+        ids = {"id_view": number, "id_intrinsic": 0, "id_pose": number}
+        views.append({"key": number, "value": wrapped(number, about | ids, polymorphic_id=1073741824)})
+        extrinsics.append(
+            {"key": number, "value": {"rotation": pose.rotation.tolist(), "center": pose.center.tolist()}}
+        )
+    kind = {"polymorphic_id": 2147483649, "polymorphic_name": "spherical"}
+    size = {"value0": {"width": SIZE_HW[1], "height": SIZE_HW[0]}}
+    return {
+        "sfm_data_version": "0.3",
+        "root_path": "/photos",
+        "views": views,
+        "intrinsics": [{"key": 0, "value": wrapped(9, size, **kind)}],
+        "extrinsics": extrinsics[:2],
+        "structure": [],
+        "control_points": [],
+    }
+
+
+def cameras_xml() -> str:
+    """Return an XML file as Metashape writes it; the last camera is not aligned, and a group holds the second."""
+    cameras = []
+    for number, (name, pose) in enumerate(POSES.items()):
+        in_chunk = CHUNK.inverse().move_camera(pose).inverse()
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = in_chunk.rotation, in_chunk.translation
+        transform = f"<transform>{' '.join(map(repr, matrix.ravel().tolist()))}</transform>" if number < 2 else ""
+        camera = f'<camera id="{number}" sensor_id="0" component_id="0" label="{name}">{transform}</camera>'
+        cameras.append(f'<group id="0" label="a">{camera}</group>' if number == 1 else camera)
+    placed = {"rotation": CHUNK.rotation.ravel(), "translation": CHUNK.translation, "scale": np.array([CHUNK.scale])}
+    world = "".join(
+        f'<{name} locked="0">{" ".join(map(repr, part.tolist()))}</{name}>' for name, part in placed.items()
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1" enabled="1">'
+        '<sensors next_id="1"><sensor id="0" label="360" type="spherical"><resolution width="1024" height="512"/>'
+        "</sensor></sensors>"
+        f'<components next_id="1" active_id="0"><component id="0" label="c"><transform>{world}</transform></component>'
+        f'</components><cameras next_id="3" next_group_id="1">{"".join(cameras)}</cameras></chunk></document>'
+    )
+
+
+def written(folder: Path, form: str) -> Path:
+    path = folder / ("sfm_data.json" if form == "openMVG" else "cameras.xml")
+    path.write_text(json.dumps(sfm_data()) if form == "openMVG" else cameras_xml())
+    return path
+
+
+@pytest.mark.parametrize("form", ["openMVG", "Metashape"])
+def test_aligned_cameras_are_read(tmp_path: Path, form: str) -> None:
+    path = written(tmp_path, form)
+    found = read_poses(path)
+    found.check()
+    assert found.names == tuple(POSES)[:2]
+    assert not found.metric
+    for idx, pose in enumerate(list(POSES.values())[:2]):
+        assert found.rotations[idx] == pytest.approx(pose.rotation, abs=1e-9)
+        assert found.centers[idx] == pytest.approx(pose.center, abs=1e-9)
+    assert recorded_pictures(path) == {}
+
+
+def test_a_folder_with_the_scene_of_openmvg_is_enough(tmp_path: Path) -> None:
+    written(tmp_path, "openMVG")
+    assert read_poses(tmp_path).names == tuple(POSES)[:2]
+
+
+def test_pixels_of_openmvg_are_ours() -> None:
+    """openMVG: (cos lat sin lon, −sin lat, cos lat cos lon) for u = lon / 2π, v = −lat / 2π in image widths."""
+    height, width = SIZE_HW
+    pixels = np.random.default_rng(1).uniform((0, 0), (width, height), (200, 2))
+    lon, lat = (2 * np.pi * (pixels - (width / 2, height / 2)) / width * (1, -1)).T
+    bearings = np.stack([np.cos(lat) * np.sin(lon), -np.sin(lat), np.cos(lat) * np.cos(lon)], axis=-1)
+    assert pixel_from_ray(bearings, SIZE_HW) == pytest.approx(pixels, abs=1e-9)
+
+
+def changed(path: tuple[Any, ...], value: object) -> Callable[[dict[str, Any]], object]:
+    def change(data: dict[str, Any]) -> None:
+        at: Any = data
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = value
+
+    return change
+
+
+ABOUT = ("views", 0, "value", "ptr_wrapper")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (changed(("intrinsics", 0, "value", "polymorphic_name"), "pinhole"), "view 0 .* its camera is pinhole"),
+        (changed(("views",), {}), "key 'views' must be a list"),
+        (changed(("extrinsics", 0, "key"), "a"), "key 'extrinsics' must be a list"),
+        (changed(ABOUT, None), "view 0: key 'ptr_wrapper'"),
+        (changed((*ABOUT, "data", "filename"), 3), "view 0: key 'filename'"),
+        (changed(("extrinsics", 0, "value", "rotation"), [[1]]), "pose 0 .*key 'rotation' must hold 3 × 3"),
+        (changed(("extrinsics", 1, "value", "center"), [0, 0, float("nan")]), "pose 1 .*NaN"),
+        (changed(("extrinsics",), []), "contains no poses"),
+    ],
+)
+def test_what_is_wrong_in_a_scene_is_named(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], what: str
+) -> None:
+    data = copy.deepcopy(sfm_data())
+    change(data)
+    (tmp_path / "sfm_data.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=rf"sfm_data\.json: {what}"):
+        read_poses(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ('type="spherical"', 'type="frame"', "camera '1.jpg': its sensor is frame, expected spherical"),
+        ('label="1.jpg"><transform>', 'label="1.jpg"><transform>a ', "expected .* numbers"),
+        ("<chunk", "<chunks", "not an XML file"),
+        ("</chunk>", "", "not an XML file"),
+        ("<document", "<!DOCTYPE x><document", "declares XML entities"),
+        ('<scale locked="0">2.5', '<scale locked="0">-1', "its scale -1.0 is not a positive number"),
+        ('label="rooms/2.jpg"', 'label="1.jpg"', "'1.jpg' is listed twice"),
+    ],
+)
+def test_what_is_wrong_in_the_xml_is_named(tmp_path: Path, old: str, new: str, what: str) -> None:
+    text = cameras_xml()
+    assert old in text
+    (tmp_path / "cameras.xml").write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=what):
+        read_poses(tmp_path / "cameras.xml")
