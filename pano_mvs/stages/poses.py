@@ -193,7 +193,7 @@ class FromModelParams(Params):
 
     path: InputPath = Field(
         description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json, "
-        "sfm_data.json, XML of Metashape, or CSV"
+        "sfm_data.json, cameras.sfm, XML of Metashape, or CSV"
     )
 
 

@@ -1,4 +1,4 @@
-"""Poses of openMVG and Metashape, in their own conventions."""
+"""Poses of openMVG, AliceVision and Metashape, in their own conventions."""
 
 from __future__ import annotations
 
@@ -72,13 +72,35 @@ def cameras_xml() -> str:
     )
 
 
+def alicevision() -> dict[str, Any]:
+    """Return a scene as AliceVision writes it: numbers as strings, matrices by columns; the third has no pose."""
+    views, poses = [], []
+    for number, (name, pose) in enumerate(POSES.items()):
+        numbers = {"viewId": number, "poseId": number, "intrinsicId": 7, "width": SIZE_HW[1], "height": SIZE_HW[0]}
+        views.append({**{key: str(value) for key, value in numbers.items()}, "path": f"/photos/{name}", "metadata": ""})
+        transform = {
+            "rotation": [repr(value) for value in pose.rotation.T.ravel().tolist()],
+            "center": [repr(value) for value in pose.center.tolist()],
+        }
+        poses.append({"poseId": str(number), "pose": {"transform": transform, "locked": "0"}})
+    camera = {"intrinsicId": "7", "width": "1024", "height": "512", "serialNumber": "", "type": "equirectangular"}
+    return {"version": ["1", "2", "7"], "views": views, "intrinsics": [camera], "poses": poses[:2]}
+
+
+FORMS: dict[str, tuple[str, Callable[[], str]]] = {
+    "openMVG": ("sfm_data.json", lambda: json.dumps(sfm_data())),
+    "AliceVision": ("cameras.sfm", lambda: json.dumps(alicevision())),
+    "Metashape": ("cameras.xml", cameras_xml),
+}
+
+
 def written(folder: Path, form: str) -> Path:
-    path = folder / ("sfm_data.json" if form == "openMVG" else "cameras.xml")
-    path.write_text(json.dumps(sfm_data()) if form == "openMVG" else cameras_xml())
-    return path
+    name, text = FORMS[form]
+    (folder / name).write_text(text())
+    return folder / name
 
 
-@pytest.mark.parametrize("form", ["openMVG", "Metashape"])
+@pytest.mark.parametrize("form", list(FORMS))
 def test_aligned_cameras_are_read(tmp_path: Path, form: str) -> None:
     path = written(tmp_path, form)
     found = read_poses(path)
@@ -91,9 +113,25 @@ def test_aligned_cameras_are_read(tmp_path: Path, form: str) -> None:
     assert recorded_pictures(path) == {}
 
 
-def test_a_folder_with_the_scene_of_openmvg_is_enough(tmp_path: Path) -> None:
-    written(tmp_path, "openMVG")
+@pytest.mark.parametrize("form", ["openMVG", "AliceVision"])
+def test_a_folder_with_the_scene_is_enough(tmp_path: Path, form: str) -> None:
+    written(tmp_path, form)
     assert read_poses(tmp_path).names == tuple(POSES)[:2]
+
+
+def test_matrices_of_alicevision_are_stored_by_columns(tmp_path: Path) -> None:
+    """Pose 1 of scene_v1.2.14.json of AliceVision's tests, which `generateCubeScene` turns by √2 rad about (−1, −1, 0).
+
+    By rows, the rotation would be the opposite one.
+    """
+    first = "0.57797184738268714 0.42202815261731275 0.69845599863660834"
+    second = "0.42202815261731275 0.57797184738268714 -0.69845599863660834"
+    third = "-0.69845599863660834 0.69845599863660834 0.15594369476537437"
+    data = alicevision()
+    data["poses"][0]["pose"]["transform"]["rotation"] = f"{first} {second} {third}".split()
+    (tmp_path / "cameras.sfm").write_text(json.dumps(data))
+    found = read_poses(tmp_path)
+    assert found.rotations[0] == pytest.approx(rotation_from_rotvec(np.array([-1.0, -1.0, 0.0])), abs=1e-9)
 
 
 def test_pixels_of_openmvg_are_ours() -> None:
@@ -139,6 +177,33 @@ def test_what_is_wrong_in_a_scene_is_named(
     (tmp_path / "sfm_data.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=rf"sfm_data\.json: {what}"):
         read_poses(tmp_path)
+
+
+TRANSFORM = ("poses", 0, "pose", "transform")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (changed(("intrinsics", 0, "type"), "pinhole"), "view 0 .* its camera is pinhole"),
+        (changed(("views", 0, "rigId"), "1"), "view 0 .* its camera is part of a rig"),
+        (changed(("views",), {}), "key 'views' must be a list"),
+        (changed(("views", 0, "path"), "/"), "view 0: key 'path'"),
+        (changed(TRANSFORM, [1]), "pose 0 .*must hold a transform"),
+        (changed((*TRANSFORM, "rotation"), ["1"]), "pose 0 .*key 'rotation' must hold 9"),
+        (changed((*TRANSFORM, "center"), ["0", "0", "nan"]), "pose 0 .*NaN"),
+        (changed(("views", 1, "path"), "/photos/1.jpg"), "'/photos/1.jpg' is listed twice"),
+        (changed(("poses",), []), "contains no poses"),
+    ],
+)
+def test_what_is_wrong_in_a_scene_of_alicevision_is_named(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], what: str
+) -> None:
+    data = alicevision()
+    change(data)
+    (tmp_path / "scene.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=rf"scene\.json: .*({what})"):
+        read_poses(tmp_path / "scene.json")
 
 
 @pytest.mark.parametrize(

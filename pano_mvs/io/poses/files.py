@@ -12,6 +12,7 @@ from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.model_writer import is_colmap_model, read_colmap_model
+from pano_mvs.io.poses.alicevision import alicevision_poses, is_alicevision
 from pano_mvs.io.poses.json_files import (
     read_json_value,
     read_posed_views,
@@ -27,6 +28,7 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
+_JSON = (".json", ".sfm")
 _IN_A_FOLDER = (
     "transforms.json",
     "poses.json",
@@ -34,6 +36,7 @@ _IN_A_FOLDER = (
     "poses.csv",
     "reconstruction.json",
     "sfm_data.json",
+    "cameras.sfm",
 )
 
 
@@ -46,6 +49,7 @@ def read_poses(path: Path) -> Poses:
       * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
       * OpenSfM's reconstruction.json with a spherical camera; the largest of several reconstructions;
       * openMVG's sfm_data.json with spherical cameras;
+      * AliceVision's (Meshroom's) .sfm or .json with equirectangular cameras;
       * Metashape's XML of cameras with a spherical sensor; the largest of several components;
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
@@ -63,9 +67,9 @@ def read_poses(path: Path) -> Poses:
         return _from_file(read_csv(path), path, metric=False)
     if suffix == ".xml":
         return _from_file(read_metashape(path), path, metric=False)
-    if suffix != ".json":
+    if suffix not in _JSON:
         raise InputError(
-            f"{path}: poses are read from a COLMAP model (its folder), .json, .xml and .csv, not {suffix!r}"
+            f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml and .csv, not {suffix!r}"
         )
     value = read_json_value(path)
     if is_opensfm(value):
@@ -74,6 +78,8 @@ def read_poses(path: Path) -> Poses:
     data = require_object(value, path)
     if is_openmvg(data):
         return _from_file(openmvg_poses(data, path), path, metric=False)
+    if is_alicevision(data):
+        return _from_file(alicevision_poses(data, path), path, metric=False)
     if "frames" in data:
         return _from_file(read_transforms(path), path, metric=False)
     if "views" in data:
@@ -112,8 +118,8 @@ def recorded_pictures(path: Path) -> dict[str, str]:
         InputError: as `read_poses`.
     """
     path = _file_or_model(path)
-    value = read_json_value(path) if path.suffix.lower() == ".json" else None
-    if not isinstance(value, dict) or "views" not in value or is_openmvg(value):
+    value = read_json_value(path) if path.suffix.lower() in _JSON else None
+    if not isinstance(value, dict) or "views" not in value or is_openmvg(value) or is_alicevision(value):
         return {}
     return {view.name: view.sha256 for view in read_posed_views(path)[0] if view.sha256 is not None}
 
@@ -147,7 +153,7 @@ def _file_or_model(path: Path) -> Path:
     if not exists(path):
         raise InputError(
             f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-            "poses.json, a reconstruction.json, a sfm_data.json, an XML file of Metashape or a CSV file"
+            "poses.json, a reconstruction.json, a sfm_data.json, a cameras.sfm, an XML file of Metashape or a CSV file"
         )
     if not is_folder(path):
         return path
