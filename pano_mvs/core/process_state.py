@@ -16,6 +16,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
+from operator import attrgetter, is_
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -42,17 +44,17 @@ class ProcessState:
 
     Attributes:
         settings: the value of each setting, by its name in words.
-        functions: of each loaded library module, its functions and classes by name.
+        libraries: what the loaded library modules hold.
     """
 
     settings: Mapping[str, Any]
-    functions: Mapping[str, Mapping[str, _Function]]
+    libraries: _Libraries
 
     @staticmethod
     def now() -> ProcessState:
         """Return the present state."""
         settings = {name: setting.read() for name, setting in _SETTINGS.items()}
-        return ProcessState(settings, {name: _functions_of(module) for name, module in _library_modules()})
+        return ProcessState(settings, _Libraries.now())
 
     def restore(self) -> Changes:
         """Make the state as it was, and return what was different."""
@@ -60,13 +62,15 @@ class ProcessState:
         settings = [name for name, value in known.items() if _SETTINGS[name].read() != value]
         for name in settings:
             _SETTINGS[name].write(self.settings[name])
+        if self.libraries.are_unchanged():
+            return Changes(tuple(settings))
         replaced = [f"{name}.{function}" for name, module in _library_modules() for function in self._put_back(module)]
         return Changes(tuple(settings), tuple(replaced))
 
     def _put_back(self, module: ModuleType) -> Iterator[str]:
         """Put the functions of a module back, and yield the names of those that were replaced."""
         present = vars(module)
-        for name, known in self.functions.get(module.__name__, {}).items():
+        for name, known in self.libraries.functions.get(module.__name__, {}).items():
             if present.get(name) is not known.value:
                 setattr(module, name, known.value)
                 yield name
@@ -127,6 +131,59 @@ _PLUGINS = _Plugins()
 class _Function:
     value: Any
     code: Any
+
+
+@dataclass(frozen=True)
+class _Libraries:
+    """What the loaded library modules hold: some 50,000 objects, which are compared without a loop in Python.
+
+    Attributes:
+        modules: the modules.
+        content: the names in all modules, and the objects with these names.
+        python: the functions that are written in Python.
+        codes: the code of each of those.
+        functions: of each module, its functions and classes by name.
+    """
+
+    modules: list[ModuleType]
+    content: list[object]
+    python: list[FunctionType]
+    codes: list[object]
+    functions: Mapping[str, Mapping[str, _Function]]
+
+    @staticmethod
+    def now() -> _Libraries:
+        """Return what the modules hold now; unless something has changed, this is the latest record."""
+        if _LATEST and _LATEST[0].are_unchanged():
+            return _LATEST[0]
+        found = _library_modules()
+        modules = [module for _, module in found]
+        content, functions = _content(modules), {name: _functions_of(module) for name, module in found}
+        known = [known for module in functions.values() for known in module.values() if known.code is not None]
+        python, codes = [each.value for each in known], [each.code for each in known]
+        _LATEST[:] = [_Libraries(modules, content, python, codes, functions)]
+        return _LATEST[0]
+
+    def are_unchanged(self) -> bool:
+        """Return whether the same modules hold the same objects, and functions have the same code."""
+        modules = [module for _, module in _library_modules()]
+        return (
+            _same(self.modules, modules)
+            and _same(self.content, _content(modules))
+            and _same(self.codes, [*map(attrgetter("__code__"), self.python)])
+        )
+
+
+_LATEST: list[_Libraries] = []
+
+
+def _content(modules: list[ModuleType]) -> list[object]:
+    held = [*map(vars, modules)]
+    return [*chain.from_iterable(held), *chain.from_iterable(map(dict.values, held))]
+
+
+def _same(known: list[Any], present: list[Any]) -> bool:
+    return len(known) == len(present) and all(map(is_, known, present))
 
 
 @dataclass(frozen=True)
