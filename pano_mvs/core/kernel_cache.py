@@ -75,7 +75,9 @@ def kernel_cache_folder(package: Path = PACKAGE) -> Path:
 def count_compiled() -> int:
     """Return how many kernels all processes together have compiled into the cache."""
     folder = os.environ.get(VARIABLE)
-    return len(below(Path(folder), "*.nbi")) if folder else 0
+    # Observers of runs call this every second; `Path.rglob` takes three times as long.
+    names = (name for _, _, names in os.walk(folder) for name in names) if folder else ()
+    return sum(name.endswith(".nbi") for name in names)
 
 
 def user_cache_folder() -> Path:

@@ -62,9 +62,10 @@ class ProcessState:
         settings = [name for name, value in known.items() if _SETTINGS[name].read() != value]
         for name in settings:
             _SETTINGS[name].write(self.settings[name])
-        if self.libraries.are_unchanged():
+        modules = _library_modules()
+        if self.libraries.are_unchanged(modules):
             return Changes(tuple(settings))
-        replaced = [f"{name}.{function}" for name, module in _library_modules() for function in self._put_back(module)]
+        replaced = [f"{name}.{function}" for name, module in modules.items() for function in self._put_back(module)]
         return Changes(tuple(settings), tuple(replaced))
 
     def _put_back(self, module: ModuleType) -> Iterator[str]:
@@ -154,22 +155,21 @@ class _Libraries:
     @staticmethod
     def now() -> _Libraries:
         """Return what the modules hold now; unless something has changed, this is the latest record."""
-        if _LATEST and _LATEST[0].are_unchanged():
-            return _LATEST[0]
         found = _library_modules()
-        modules = [module for _, module in found]
-        content, functions = _content(modules), {name: _functions_of(module) for name, module in found}
+        if _LATEST and _LATEST[0].are_unchanged(found):
+            return _LATEST[0]
+        modules = [*found.values()]
+        content, functions = _content(modules), {name: _functions_of(module) for name, module in found.items()}
         known = [known for module in functions.values() for known in module.values() if known.code is not None]
         python, codes = [each.value for each in known], [each.code for each in known]
         _LATEST[:] = [_Libraries(modules, content, python, codes, functions)]
         return _LATEST[0]
 
-    def are_unchanged(self) -> bool:
+    def are_unchanged(self, modules: Mapping[str, ModuleType]) -> bool:
         """Return whether the same modules hold the same objects, and functions have the same code."""
-        modules = [module for _, module in _library_modules()]
         return (
-            _same(self.modules, modules)
-            and _same(self.content, _content(modules))
+            _same(self.modules, [*modules.values()])
+            and _same(self.content, _content(self.modules))
             and _same(self.codes, [*map(attrgetter("__code__"), self.python)])
         )
 
@@ -193,12 +193,12 @@ class _Setting:
     decides: bool = False
 
 
-def _library_modules() -> list[tuple[str, ModuleType]]:
-    return [
-        (name, module)
+def _library_modules() -> dict[str, ModuleType]:
+    return {
+        name: module
         for name, module in list(sys.modules.items())
         if name.partition(".")[0] in _LIBRARIES and type(module) is ModuleType and module.__name__ == name
-    ]
+    }
 
 
 def _functions_of(module: ModuleType) -> dict[str, _Function]:
