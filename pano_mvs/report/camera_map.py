@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -14,7 +13,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
-from pano_mvs.scene.upright import states_y_down
+from pano_mvs.scene.upright import states_y_down, states_z_north
 
 # A capture is a walk if it has at least this number of cameras, most consecutive ones are matched, and most pairs are
 # of cameras that follow each other closely, although many others would have been possible.
@@ -77,7 +76,6 @@ _LETTER, _LINE = 8.6, 16.0
 _NEAR, _TINY_MAP = 9, 140
 _MAX_LABELS, _MANY, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 150, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
-_ALONG_NORTH = re.compile(r"\bz north\b")
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ def camera_maps(
     labels = short_names(names)
     walk = _walk_of(poses.links, names)
     links = _chosen(poses.links, names, labels, reasons=reasons or {}, walk=walk)
-    north = bool(_ALONG_NORTH.search(poses.frame))
+    north = states_z_north(poses.frame)
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
         _drawn(

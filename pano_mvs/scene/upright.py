@@ -22,6 +22,7 @@ _Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _MAX_SNAP_DEG: Final = 20.0
 _STATES_DOWN: Final = re.compile(r"\by down\b")
+_STATES_NORTH: Final = re.compile(r"\bz north\b")
 
 
 def world_up(poses: Poses) -> FloatArray:
@@ -43,6 +44,11 @@ def world_up(poses: Poses) -> FloatArray:
 def states_y_down(frame: str) -> bool:
     """Return whether the description of a world frame states that y points down, along gravity."""
     return _STATES_DOWN.search(frame) is not None
+
+
+def states_z_north(frame: str) -> bool:
+    """Return whether the description of a world frame states that z points north, as `poses.level` writes."""
+    return _STATES_NORTH.search(frame) is not None
 
 
 def z_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:

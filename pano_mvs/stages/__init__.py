@@ -11,7 +11,9 @@ from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh
 from pano_mvs.stages.exports.mesh_textured import mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
+from pano_mvs.stages.exports.poses import poses_files
 from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
+from pano_mvs.stages.exports.tour import panoramas, tour_of_panoramas
 from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -86,11 +88,13 @@ __all__ = [
     "nerfstudio_frames",
     "operator",
     "orb_tangent",
+    "panoramas",
     "patchmatch",
     "photographs",
     "plain_surfaces",
     "planes",
     "ply",
+    "poses_files",
     "position",
     "previews",
     "ranges",
@@ -113,6 +117,7 @@ __all__ = [
     "surface",
     "sweep",
     "tour",
+    "tour_of_panoramas",
     "tracked",
     "triangulate",
     "truth",

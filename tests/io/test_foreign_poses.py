@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,7 +15,12 @@ import pytest
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Similarity3, pixel_from_ray, rotation_from_rotvec
 from pano_mvs.io.poses.files import read_poses, recorded_pictures
+from pano_mvs.io.poses.metashape import write_metashape
+from pano_mvs.io.poses.openmvg import write_openmvg
+from pano_mvs.scene import Poses
+from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.testing.room import capture_poses
+from pano_mvs.testing.tiny_capture import tiny_capture
 
 POSES = dict(zip(("1.jpg", "rooms/2.jpg", "10.jpg"), capture_poses(3, seed=5), strict=True))
 SIZE_HW = (512, 1024)
@@ -177,6 +183,62 @@ def test_what_is_wrong_in_a_scene_is_named(
     (tmp_path / "sfm_data.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=rf"sfm_data\.json: {what}"):
         read_poses(tmp_path)
+
+
+def keys(value: object) -> object:
+    """Return the keys of a JSON value, of lists those of the first entry."""
+    if isinstance(value, dict):
+        return {key: keys(inner) for key, inner in value.items()}
+    return keys(value[0]) if isinstance(value, list) and value else None
+
+
+def test_a_scene_for_openmvg_is_as_openmvg_writes_it(tmp_path: Path) -> None:
+    poses = tiny_capture().whole(Poses)
+    write_openmvg(tmp_path / "sfm_data.json", poses, dict.fromkeys(poses.names, SIZE_HW))
+    data = json.loads((tmp_path / "sfm_data.json").read_text())
+    found = read_poses(tmp_path)
+    assert found.names == poses.names
+    assert found.rotations == pytest.approx(poses.rotations, abs=1e-12)
+    assert found.centers == pytest.approx(poses.centers, abs=1e-12)
+    assert keys(data | {"structure": []}) == keys(sfm_data())
+    pointers = [entry["value"]["ptr_wrapper"]["id"] for part in ("views", "intrinsics") for entry in data[part]]
+    assert len(set(pointers)) == len(pointers)
+
+
+def test_pixels_in_a_scene_for_openmvg_are_those_of_its_camera(tmp_path: Path) -> None:
+    poses = tiny_capture().whole(Poses)
+    write_openmvg(tmp_path / "sfm_data.json", poses, dict.fromkeys(poses.names, SIZE_HW))
+    data = json.loads((tmp_path / "sfm_data.json").read_text())
+    height, width = SIZE_HW
+    errors = []
+    for landmark in data["structure"]:
+        for seen in landmark["value"]["observations"]:
+            pose = data["extrinsics"][seen["key"]]["value"]
+            x, y, z = np.array(pose["rotation"]) @ (np.array(landmark["value"]["X"]) - pose["center"])
+            lon, lat = np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z))
+            predicted = np.array([lon, -lat]) / (2 * np.pi) * width + (width / 2, height / 2)
+            errors.append(np.abs((predicted - seen["value"]["x"] + width / 2) % width - width / 2))
+    assert len(errors) == len(poses.track_point_idx)
+    assert np.median(errors) < 0.5
+
+
+def test_cameras_for_metashape_have_z_up(tmp_path: Path) -> None:
+    poses = tiny_capture().whole(Poses)
+    sizes = {name: SIZE_HW if idx else (256, 512) for idx, name in enumerate(poses.names)}
+    turn = z_up_from_world()
+    write_metashape(tmp_path / "cameras.xml", poses, sizes, file_from_world=turn)
+    found = read_poses(tmp_path / "cameras.xml")
+    assert found.names == poses.names
+    assert found.centers == pytest.approx(poses.centers @ turn.T, abs=1e-12)
+    assert found.rotations == pytest.approx(poses.rotations @ turn.T, abs=1e-12)
+    written_tree, known_tree = (
+        ElementTree.parse(tmp_path / "cameras.xml").getroot(),
+        ElementTree.fromstring(cameras_xml()),
+    )
+    known = {element.tag: set(element.keys()) for element in known_tree.iter()}
+    for element in written_tree.iter():
+        assert set(element.keys()) <= known.get(element.tag, set()) or element.tag == "reference"
+    assert [sensor.get("type") for sensor in written_tree.iter("sensor")] == ["spherical"] * 2
 
 
 TRANSFORM = ("poses", 0, "pose", "transform")

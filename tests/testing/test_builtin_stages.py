@@ -8,6 +8,7 @@ import pytest
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
+from pano_mvs.scene.level_panorama import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.io.images.tours import tiny_tour
 from tests.io.images.videos import tiny_video
@@ -32,6 +33,7 @@ FRAME = NerfstudioFrame(
 INPUTS: dict[str, dict[str, Any]] = {
     "export.colmap_lenses": {"image": tiny_rig_panorama()},
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
+    "export.tour": {"panoramas": {f"{idx:03d}.png": LevelPanorama({}, "panoramas/{item}.jpg") for idx in range(4)}},
     "features.aliked": {"features": None},  # those of the tiny capture, which the stage returns, too, are everywhere
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }

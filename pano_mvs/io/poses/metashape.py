@@ -1,4 +1,4 @@
-"""Poses from the XML file that Agisoft Metashape writes with File, Export, Export Cameras.
+"""Poses in the XML file that Agisoft Metashape writes with File, Export, Export Cameras, and imports.
 
 A camera's transform is chunk_from_cam by rows, for the camera frame x right, y down, z forward, and that of its
 component is x_in_world = s R x_in_chunk + t. A spherical sensor looks along z in the middle of its image, as ours.
@@ -6,6 +6,7 @@ component is x_in_world = s R x_in_chunk + t. A spherical sensor looks along z i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
+from pano_mvs.scene.poses import Poses
 
 _MAX_BYTES = 1 << 30
+_LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 
 
 def read_metashape(path: Path) -> dict[str, Rigid3]:
@@ -84,3 +87,42 @@ def _numbers(text: str | None, shape: tuple[int, ...], where: str) -> NDArray[np
         return found.reshape(shape)
     except ValueError as error:
         raise InputError(f"{where}: expected {' × '.join(map(str, shape))} numbers, got {str(text)[:60]!r}") from error
+
+
+def write_metashape(
+    path: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]], *, file_from_world: NDArray[np.float64]
+) -> None:
+    """Write poses of one group as cameras of a spherical sensor, in local coordinates.
+
+    Args:
+        path: the file to write.
+        poses: poses of one group. The chunk has their world.
+        sizes_hw: (height, width) of each image.
+        file_from_world: (3, 3) rotation of the component, which turns the chunk into the world that Metashape shows.
+    """
+    document = ElementTree.Element("document", version="2.0.0")
+    chunk = ElementTree.SubElement(document, "chunk", label="pano_mvs", enabled="true")
+    sizes = list(dict.fromkeys(sizes_hw[name] for name in poses.names))
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(sizes)))
+    for number, (height, width) in enumerate(sizes):
+        sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=f"{width}x{height}", type="spherical")
+        ElementTree.SubElement(sensor, "resolution", width=str(width), height=str(height))
+    components = ElementTree.SubElement(chunk, "components", next_id="1", active_id="0")
+    component = ElementTree.SubElement(components, "component", id="0", label="pano_mvs")
+    placed = ElementTree.SubElement(component, "transform")
+    for name, value in (("rotation", file_from_world), ("translation", np.zeros(3)), ("scale", np.ones(1))):
+        ElementTree.SubElement(placed, name, locked="false").text = _text(value)
+    cameras = ElementTree.SubElement(chunk, "cameras", next_id=str(len(poses.names)), next_group_id="0")
+    for number, name in enumerate(poses.names):
+        ids = {"id": str(number), "sensor_id": str(sizes.index(sizes_hw[name])), "component_id": "0"}
+        camera = ElementTree.SubElement(cameras, "camera", ids, label=name)
+        chunk_from_cam = np.eye(4)
+        chunk_from_cam[:3, :3], chunk_from_cam[:3, 3] = poses.rotations[number].T, poses.centers[number]
+        ElementTree.SubElement(camera, "transform").text = _text(chunk_from_cam)
+    ElementTree.SubElement(chunk, "reference").text = _LOCAL
+    ElementTree.indent(document)
+    ElementTree.ElementTree(document).write(path, encoding="UTF-8", xml_declaration=True)
+
+
+def _text(values: NDArray[np.float64]) -> str:
+    return " ".join(map(repr, values.ravel().tolist()))

@@ -1,4 +1,4 @@
-"""Poses from openMVG's sfm_data.json.
+"""Poses in openMVG's sfm_data.json.
 
 openMVG's spherical camera maps a bearing (cos lat sin lon, −sin lat, cos lat cos lon) to u = lon / 2π, v = −lat / 2π
 about the image centre in image widths, so that its camera frame is x right, y down, z forward, as ours. A pose holds
@@ -7,14 +7,20 @@ the rotation of cam_from_world by rows, and the camera's centre: x_in_cam = R (x
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, pixel_from_ray
 from pano_mvs.io.poses.json_files import number_array, require_distinct, rigid_from_arrays
+from pano_mvs.scene.poses import Poses
 
 _SPHERICAL = "spherical"
+_NEW, _PLAIN = 1 << 31, 1 << 30  # of cereal: the first mention of a pointer or class; an object of the base class
 
 
 def is_openmvg(data: Any) -> bool:
@@ -84,7 +90,7 @@ def _inner(view: dict[str, Any], where: str) -> dict[str, Any]:
 def _class_of(camera: dict[str, Any]) -> int:
     """Return the number of a camera's class; the highest bit marks its first mention."""
     number = camera.get("polymorphic_id")
-    return number | 1 << 31 if isinstance(number, int) else -1
+    return number | _NEW if isinstance(number, int) else -1
 
 
 def _pose(value: dict[str, Any], where: str) -> Rigid3:
@@ -94,3 +100,65 @@ def _pose(value: dict[str, Any], where: str) -> Rigid3:
     )
     checked = rigid_from_arrays(rotation, center, where)
     return Rigid3.from_center(checked.rotation, center)
+
+
+def write_openmvg(path: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
+    """Write poses of one group with their points and tracks, as openMVG's `Save` (cereal's JSON archive) does.
+
+    The world is that of the poses. Pixels follow openMVG's spherical camera: those of this package.
+
+    Args:
+        path: the file to write.
+        poses: poses of one group.
+        sizes_hw: (height, width) of each image.
+    """
+    sizes = list(dict.fromkeys(sizes_hw[name] for name in poses.names))
+    views, extrinsics = [], []
+    for number, name in enumerate(poses.names):
+        folder, _, file = name.rpartition("/")
+        height, width = sizes_hw[name]
+        about = {"local_path": folder, "filename": file, "width": width, "height": height}
+        ids = {"id_view": number, "id_intrinsic": sizes.index((height, width)), "id_pose": number}
+        views.append(_entry(number, {"polymorphic_id": _PLAIN, **_pointer(number, about | ids)}))
+        pose = {"rotation": poses.rotations[number].tolist(), "center": poses.centers[number].tolist()}
+        extrinsics.append(_entry(number, pose))
+    intrinsics = []
+    for number, (height, width) in enumerate(sizes):
+        # The first object of a class states its name; later ones refer to it by number.
+        kind = {"polymorphic_id": 1} if number else {"polymorphic_id": _NEW | 1, "polymorphic_name": _SPHERICAL}
+        camera = {"value0": {"width": width, "height": height}}
+        intrinsics.append(_entry(number, {**kind, **_pointer(len(views) + number, camera)}))
+    document = {
+        "sfm_data_version": "0.3",
+        "root_path": "",
+        "views": views,
+        "intrinsics": intrinsics,
+        "extrinsics": extrinsics,
+        "structure": _structure(poses, sizes_hw),
+        "control_points": [],
+    }
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+
+def _structure(poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> list[dict[str, Any]]:
+    """Return the points with the pixels at which images see them."""
+    pixels = np.zeros((len(poses.track_image_idx), 2))
+    for number, name in enumerate(poses.names):
+        seen = poses.track_image_idx == number
+        pixels[seen] = pixel_from_ray(poses.track_bearings[seen], sizes_hw[name])
+    seen_by: list[list[dict[str, Any]]] = [[] for _ in poses.points_in_world]
+    for number in np.lexsort((poses.track_image_idx, poses.track_point_idx)):
+        at = {"id_feat": int(number), "x": pixels[number].tolist()}
+        seen_by[poses.track_point_idx[number]].append(_entry(int(poses.track_image_idx[number]), at))
+    return [
+        _entry(number, {"X": point.tolist(), "observations": seen})
+        for number, (point, seen) in enumerate(zip(poses.points_in_world, seen_by, strict=True))
+    ]
+
+
+def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
+    return {"key": key, "value": value}
+
+
+def _pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
+    return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
