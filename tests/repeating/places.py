@@ -28,6 +28,7 @@ __all__ = [
     "doors",
     "draw_arguments",
     "draw_capture",
+    "draw_sizes",
     "facade_row",
     "stairs",
     "tiled_hall",
@@ -63,7 +64,12 @@ def draw_arguments(seed: int, *, views: int | None = None) -> tuple[str, dict[st
         "turned": bool(rng.random() < 0.5),
         "exposure": 0.0 if rng.random() < 0.5 else round(rng.uniform(0.03, 0.12), 3),
     }
-    return name, visit | _SIZES[name](rng, count)
+    return name, visit | draw_sizes(name, rng, count)
+
+
+def draw_sizes(name: str, rng: np.random.Generator, views: int) -> dict[str, Any]:
+    """Return the size of a place for a number of views, and the other arguments that only this place has."""
+    return _SIZES[name](rng, views)
 
 
 def _hall(rng: np.random.Generator, views: int) -> dict[str, Any]:

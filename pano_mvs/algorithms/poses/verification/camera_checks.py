@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -142,15 +143,10 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
     """
     moved: set[int] = set()
     for remaining in reversed(range(_BLOCK_ROUNDS + 1)):
-        aliases = find_aliases(model)
-        gains = [
-            (_gain_of(model, alias, labels, confirmation=confirmation), alias, labels)
-            for alias in aliases
-            for labels in labellings(model, alias)
-        ]
-        if not gains:
+        moves = block_moves(model, confirmation)
+        if not moves:
             break
-        gain, alias, labels = max(gains, key=lambda found: found[0])
+        gain, alias, labels = max(moves, key=lambda found: found.gain)
         if gain > _PROMISING_GAIN and remaining:
             labels, gain = _with_better_labels(model, alias, labels, gain=gain, confirmation=confirmation)
         if gain <= _MIN_BLOCK_GAIN or not remaining:
@@ -158,12 +154,35 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
             if gain > limit:
                 return moved, _ambiguity(model, alias, labels)
-            return moved, next((_turned_ambiguity(other) for other in aliases if _turn_deg(other)), "")
+            return moved, next((_turned_ambiguity(other.alias) for other in moves if _turn_deg(other.alias)), "")
         before, after = model.cameras, _with_block_moved(model, alias, labels)
         model.cameras, model.chosen = after.cameras, after.chosen
         model.learn_ranges()
         moved |= {image for image, camera in model.cameras.items() if camera is not before[image]}
     return moved, ""
+
+
+class BlockMove(NamedTuple):
+    """A block of cameras that an alias may have moved.
+
+    Attributes:
+        gain: relative gain in agreement of images and pairs if the block is moved.
+        alias: the motion.
+        labels: image position to 1 for the images of the block, 0 for the others.
+    """
+
+    gain: float
+    alias: Alias
+    labels: dict[int, int]
+
+
+def block_moves(model: PlacedModel, confirmation: Confirmation) -> list[BlockMove]:
+    """Return the moves of blocks that several pairs suggest, each with the gain of making it."""
+    return [
+        BlockMove(_gain_of(model, alias, labels, confirmation=confirmation), alias, labels)
+        for alias in find_aliases(model)
+        for labels in labellings(model, alias)
+    ]
 
 
 def _with_block_moved(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> PlacedModel:

@@ -64,6 +64,45 @@ class JointEvidence:
         return self.agreeing_sr > _MIN_AGREEING_SR and self.density >= _MIN_DENSITY and not self.contradicts
 
 
+@dataclass(frozen=True)
+class Joint:
+    """Two parts of a model that meet, and the evidence for how they are joined.
+
+    Attributes:
+        first: images of one part.
+        second: images of the other.
+        evidence: of the surfaces that both see; None if a part has one camera only.
+        matches: number of matches between them with which their cameras agree.
+        rivals: share of the pairs between them with another geometry that has nearly as much weight; NaN without pairs.
+    """
+
+    first: list[int]
+    second: list[int]
+    evidence: JointEvidence | None
+    matches: int
+    rivals: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the joint is not in doubt; a part of one camera is judged by its matches."""
+        if self.evidence is None:
+            return self.matches >= LINKED
+        return self.evidence.confirms and not self.rivals > 1 / 2
+
+
+def measured_joints(model: PlacedModel, confirmation: Confirmation) -> Iterator[Joint]:
+    """Yield the joints between the parts of a model that meet; none if it has a single part."""
+    for first, second in _meeting(model, linked_parts(model)):
+        several = min(len(first), len(second)) > 1
+        yield Joint(
+            first,
+            second,
+            joint_evidence(model, confirmation, (first, second)) if several else None,
+            sum(_matches_of(model, one, other) for one in first for other in second),
+            _rival_share(model, first, second),
+        )
+
+
 def joint_doubts(model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> dict[int, str]:
     """Return the images of parts that the images contradict or do not confirm, with the reason.
 
@@ -76,20 +115,17 @@ def joint_doubts(model: PlacedModel, confirmation: Confirmation, *, given: bool 
         confirmation: of the same capture.
         given: whether the poses come from elsewhere and not from these pairs: few common points then cause no doubt.
     """
-    parts = linked_parts(model)
     doubts: dict[int, str] = {}
-    for first, second in _meeting(model, parts):
-        several = min(len(first), len(second)) > 1
-        evidence = joint_evidence(model, confirmation, (first, second)) if several else None
-        if evidence is not None and evidence.contradicts:
+    for joint in measured_joints(model, confirmation):
+        if joint.evidence is not None and joint.evidence.contradicts:
             reason = (
-                f"the images of {_named(model, first)} contradict those of {_named(model, second)}, and few points "
-                "connect them: take panoramas in between"
+                f"the images of {_named(model, joint.first)} contradict those of {_named(model, joint.second)}, and "
+                "few points connect them: take panoramas in between"
             )
             return dict.fromkeys(sorted(model.cameras), reason)
-        if given or _is_certain(model, first, second, evidence=evidence):
+        if given or joint.is_certain:
             continue
-        side = _smaller_side(model, first, second)
+        side = _smaller_side(model, joint.first, joint.second)
         doubts |= dict.fromkeys(
             side,
             f"few points connect {_named(model, side)} with the other cameras, and the images do not confirm how: take "
@@ -152,15 +188,6 @@ def _meeting(model: PlacedModel, parts: Sequence[list[int]]) -> Iterator[tuple[l
     }
     meeting = {(min(number[a], number[b]), max(number[a], number[b])) for a, b in near | model.chosen.keys()}
     yield from ((parts[a], parts[b]) for a, b in sorted(meeting) if a != b)
-
-
-def _is_certain(
-    model: PlacedModel, first: Collection[int], second: Collection[int], *, evidence: JointEvidence | None
-) -> bool:
-    """Return whether the joint of two parts is not in doubt; a part of one camera is judged by its matches."""
-    if evidence is None:
-        return _number_of_matches(model, first, second) >= LINKED
-    return evidence.confirms and not _is_ambiguous(model, first, second)
 
 
 def joint_evidence(
@@ -249,12 +276,8 @@ def _was_compared(model: PlacedModel, one: int, other: int) -> bool:
     return compared is None or (min(one, other), max(one, other)) in compared
 
 
-def _number_of_matches(model: PlacedModel, first: Collection[int], second: Collection[int]) -> int:
-    return sum(_matches_of(model, one, other) for one in first for other in second)
-
-
-def _is_ambiguous(model: PlacedModel, first: Collection[int], second: Collection[int]) -> bool:
-    """Return whether most pairs between two parts have another geometry with nearly as many matches."""
+def _rival_share(model: PlacedModel, first: Collection[int], second: Collection[int]) -> float:
+    """Return the share of the pairs between two parts that have another geometry with nearly as many matches."""
     rivals = []
     for one, other in ((one, other) for one in first for other in second):
         edge = min(one, other), max(one, other)
@@ -262,7 +285,7 @@ def _is_ambiguous(model: PlacedModel, first: Collection[int], second: Collection
             found, rank = model.pairs.geometries[edge], model.chosen[edge]
             others = [geometry.weight for number, geometry in enumerate(found) if number != rank]
             rivals.append(max(others, default=0.0) > _RIVAL * found[rank].weight)
-    return 2 * sum(rivals) > len(rivals)
+    return float(np.mean(rivals)) if rivals else np.nan
 
 
 def _solid_angle(mask: NDArray[np.bool_]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -55,21 +55,38 @@ def verify_poses(
     if len(poses.names) < 2:
         return poses
     groups = [
-        _verified(group, load, features=features or {}, two_views=two_views or {}, correct=correct)
+        verified_group(group, load, features=features or {}, two_views=two_views or {}, correct=correct).poses
         for group in split_groups(poses)
     ]
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
 
 
-def _verified(
+@dataclass(frozen=True, eq=False)
+class VerifiedGroup:
+    """Checked poses of one group, and what they were checked with.
+
+    Attributes:
+        poses: the poses, with their doubts.
+        model: the same cameras with their pairs.
+        checks: the evidence of the images for each of them.
+        confirmation: of the capture.
+    """
+
+    poses: Poses
+    model: PlacedModel
+    checks: CameraChecks
+    confirmation: Confirmation
+
+
+def verified_group(
     poses: Poses,
     load: Callable[[str], Picture],
     *,
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     correct: bool,
-) -> Poses:
-    """Return poses of one group, checked and corrected."""
+) -> VerifiedGroup:
+    """Check and correct poses of one group; the arguments are those of `verify_poses`."""
     known = all(name in features for name in poses.names)
     inside = {pair: view for pair, view in two_views.items() if known and {*pair} <= {*poses.names}}
     pairs = pairs_of({name: features[name] for name in poses.names}, inside) if known else Pairs.without(poses.names)
@@ -81,7 +98,7 @@ def _verified(
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
     checked = with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation, given=not correct)
-    return with_unconfirmed_doubts(checked, features, inside)
+    return VerifiedGroup(with_unconfirmed_doubts(checked, features, inside), model, checks, confirmation)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:

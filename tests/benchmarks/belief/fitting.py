@@ -1,0 +1,198 @@
+"""Fit the model of `pano_mvs.algorithms.poses.belief` to measured cameras, and see how well it is calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from tests.benchmarks.belief.model import Model, Term, steps_behind
+
+FloatArray = NDArray[np.float64]
+
+SIGNS = {
+    "ratio": 1,
+    "share": 1,
+    "confirmed_in_all": 1,
+    "explained": 1,
+    "explained_in_all": 1,
+    "agreeing": 1,
+    "alarms_best": 1,
+    "alarms_second": 1,
+    "points": 1,
+    "residual_deg": -1,
+    "triangles": 1,
+    "broken": -1,
+    "scale_worst": -1,
+    "parallax_deg": 1,
+    "rival_weight": -1,
+    "place_rival": -1,
+    "place_gain": -1,
+    "alias_gain": -1,
+    "alias_gain_elsewhere": -1,
+    "alias_pairs": -1,
+    "learned_share": -1,
+    "bridge_matches": 1,
+    "joint_matches": 1,
+    "joint_contradicting": -1,
+    "height": -1,
+    "images": 1,
+}
+"""Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
+
+QUANTILES = (0.02, 0.1, 0.35, 0.7)
+PENALTY = 1.0
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Measured cameras as arrays.
+
+    Attributes:
+        columns: measurement to its values (N,), NaN where missing.
+        right: (N,) bool.
+        doubted: (N,) bool, by the rules that the model is compared with.
+        family: (N,) str.
+        capture: (N,) str.
+    """
+
+    columns: Mapping[str, FloatArray]
+    right: NDArray[np.bool_]
+    doubted: NDArray[np.bool_]
+    family: NDArray[Any]
+    capture: NDArray[Any]
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> Cameras:
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return Cameras(columns, self.right[chosen], self.doubted[chosen], self.family[chosen], self.capture[chosen])
+
+
+def cameras_of(captures: Sequence[Mapping[str, Any]]) -> Cameras:
+    """Return the cameras of measured captures (lines of `collect`)."""
+    rows = [row for capture in captures for row in capture["cameras"]]
+    names = sorted({name for row in rows for name in row["evidence"]})
+    columns = {
+        name: np.array([np.nan if row["evidence"].get(name) is None else row["evidence"][name] for row in rows])
+        for name in names
+    }
+    return Cameras(
+        columns,
+        np.array([row["right"] for row in rows], np.bool_),
+        np.array([row["doubted"] for row in rows], np.bool_),
+        np.array([row["family"] for row in rows]),
+        np.array([f"{row['family']} {row['seed']} {row['variant']}" for row in rows]),
+    )
+
+
+def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] = SIGNS) -> Model:
+    """Return the model with the largest likelihood less a penalty on the squared losses.
+
+    Knots are quantiles of each measurement. All losses are at least 0, so that each measurement only ever counts the
+    way of its sign, and a missing one is never better than the best.
+    """
+    knots = {name: _knots(cameras.columns[name], sign) for name, sign in signs.items()}
+    behind = np.hstack([steps_behind(cameras.columns[name], knots[name]) for name in signs])
+    target = cameras.right.astype(np.float64)
+
+    def cost(values: FloatArray) -> tuple[float, FloatArray]:
+        logit = values[0] - behind @ values[1:]
+        likelihood = np.logaddexp(0.0, -logit) + (1 - target) * logit
+        error = 1 / (1 + np.exp(-logit)) - target
+        gradient = np.concatenate([[error.sum()], -behind.T @ error + 2 * penalty * values[1:]])
+        return float(likelihood.sum() + penalty * (values[1:] ** 2).sum()), gradient
+
+    start = np.concatenate([[3.0], np.full(behind.shape[1], 0.1)])
+    found = minimize(
+        cost,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(None, None), *[(0, None)] * behind.shape[1]],
+        options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-12},
+    )
+    terms, at = {}, 1
+    for name in signs:
+        count = len(knots[name])
+        losses = np.round(found.x[at : at + count], 4)
+        terms[name] = Term(knots[name], tuple(losses[:-1].tolist()), float(losses[-1]))
+        at += count
+    return Model(
+        round(float(found.x[0]), 4), {name: term for name, term in terms.items() if any(term.losses) or term.missing}
+    )
+
+
+def _knots(values: FloatArray, sign: int) -> tuple[float, ...]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return (0.0, 1.0) if sign > 0 else (1.0, 0.0)
+    quantiles = QUANTILES if sign > 0 else tuple(1 - one for one in QUANTILES)
+    found = [float(f"{value:.4g}") for value in np.quantile(known, quantiles)]
+    distinct = [found[0]]
+    for value in found[1:]:
+        if sign * (value - distinct[-1]) > 1e-9:
+            distinct.append(value)
+    if len(distinct) == 1:
+        distinct.insert(0, distinct[0] - sign * max(1e-3, 0.1 * abs(distinct[0])))
+    return tuple(distinct)
+
+
+def probabilities(model: Model, cameras: Cameras) -> FloatArray:
+    """Return the probability of each camera, (N,)."""
+    logit = np.full(len(cameras.right), model.intercept)
+    for name, term in model.terms.items():
+        logit += term.contributions(cameras.columns[name])
+    return np.asarray(1 / (1 + np.exp(-logit)))
+
+
+def left_out(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] = SIGNS) -> FloatArray:
+    """Return the probability of each camera by the model that was fitted to all other families, (N,)."""
+    found = np.full(len(cameras.right), np.nan)
+    for family in np.unique(cameras.family):
+        mine = cameras.family == family
+        found[mine] = probabilities(fit(cameras[~mine], penalty=penalty, signs=signs), cameras[mine])
+    return found
+
+
+def calibration_error(probability: FloatArray, right: NDArray[np.bool_], *, bins: int = 10) -> float:
+    """Return the expected calibration error: the mean gap between probability and frequency over equal-width bins."""
+    number = np.minimum((probability * bins).astype(int), bins - 1)
+    gaps = [
+        (number == each).mean() * abs(probability[number == each].mean() - right[number == each].mean())
+        for each in np.unique(number)
+    ]
+    return float(sum(gaps))
+
+
+def area_under_roc(probability: FloatArray, right: NDArray[np.bool_]) -> float:
+    """Return the share of pairs of a right and a wrong camera in which the right one is more probable."""
+    good, bad = probability[right], probability[~right]
+    if not len(good) or not len(bad):
+        return float("nan")
+    return float((good[:, None] > bad[None]).mean() + 0.5 * (good[:, None] == bad[None]).mean())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How often a verdict is wrong, in both ways."""
+
+    right: int
+    wrong: int
+    right_doubted: int
+    wrong_silent: int
+
+    @staticmethod
+    def of(right: NDArray[np.bool_], doubted: NDArray[np.bool_]) -> Outcome:
+        """Return the outcome of doubts about cameras."""
+        return Outcome(
+            int(right.sum()), int((~right).sum()), int((right & doubted).sum()), int((~right & ~doubted).sum())
+        )
+
+    def line(self, label: str) -> str:
+        """Return a row of a table."""
+        doubted = f"{self.right_doubted} ({100 * self.right_doubted / max(1, self.right):.1f} %)"
+        silent = f"{self.wrong_silent} ({1000 * self.wrong_silent / max(1, self.right + self.wrong):.1f} ‰ of all)"
+        return f"| {label} | {self.right} | {self.wrong} | {doubted} | {silent} |"

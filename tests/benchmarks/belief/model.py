@@ -1,0 +1,90 @@
+"""A monotone logistic model: the probability that a camera is right, from one row of its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Term:
+    """What one measurement contributes to the logarithm of the odds: 0 at best, negative otherwise.
+
+    The contribution falls piecewise linearly from one knot to the next and is constant beyond the last one on either
+    side, so that no measurement, however extreme, counts for more than the draws that it was fitted on.
+
+    Attributes:
+        knots: (K) values from the worst to the best: increasing if more is better, otherwise decreasing.
+        losses: (K − 1) what is lost from each knot to the one before it; not negative.
+        missing: what is lost if it was not measured; not negative.
+    """
+
+    knots: tuple[float, ...]
+    losses: tuple[float, ...]
+    missing: float
+
+    def lost(self, values: FloatArray) -> FloatArray:
+        """Return how far each value (N,) stays behind the best one on each step, (N, K), the last for missing ones."""
+        return steps_behind(values, self.knots)
+
+    def contributions(self, values: FloatArray) -> FloatArray:
+        """Return the contributions (N,) of values (N,), NaN where missing."""
+        found: FloatArray = -self.lost(values) @ np.array([*self.losses, self.missing])
+        return found
+
+
+def steps_behind(values: FloatArray, knots: tuple[float, ...]) -> FloatArray:
+    """Return for values (N,) which part of each step between knots they lack, (N, K); the last column marks NaN."""
+    behind = np.zeros((len(values), len(knots)))
+    known = np.isfinite(values)
+    for step, (worse, better) in enumerate(pairwise(knots)):
+        behind[known, step] = np.clip((better - values[known]) / (better - worse), 0.0, 1.0)
+    behind[~known, -1] = 1.0
+    return behind
+
+
+@dataclass(frozen=True)
+class Model:
+    """The fitted model.
+
+    Attributes:
+        intercept: logarithm of the odds of a camera whose evidence is the best in everything.
+        terms: measurement to what it contributes.
+    """
+
+    intercept: float
+    terms: Mapping[str, Term]
+
+    def contributions(self, row: Mapping[str, float]) -> dict[str, float]:
+        """Return what each measurement of a row adds to the logarithm of the odds; 0 or less."""
+        return {
+            name: float(term.contributions(np.array([row.get(name, np.nan)]))[0]) for name, term in self.terms.items()
+        }
+
+    def probability(self, row: Mapping[str, float]) -> float:
+        """Return the probability that a camera with this evidence is right."""
+        return float(1 / (1 + np.exp(-self.intercept - sum(self.contributions(row).values()))))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as a JSON object."""
+        terms = {
+            name: {"knots": list(term.knots), "losses": list(term.losses), "missing": term.missing}
+            for name, term in self.terms.items()
+        }
+        return {"intercept": self.intercept, "terms": terms}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> Model:
+        """Return the model from the result of `to_json`."""
+        terms = {
+            name: Term(tuple(term["knots"]), tuple(term["losses"]), term["missing"])
+            for name, term in content["terms"].items()
+        }
+        return Model(content["intercept"], terms)

@@ -1,0 +1,111 @@
+"""Fit the model of evidence, and compare it with the rules.
+
+Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
+
+FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds. The script prints, for all families
+and for each, how many right cameras are doubted and how many wrong ones are not, by the rules of `poses.verify` and by
+the model; cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. A
+camera is doubted if p is below `MISS_COST` / (1 + `MISS_COST`). `--picture FILE` draws the reliability diagram.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.benchmarks.belief.fitting import (
+    SIGNS,
+    Cameras,
+    Outcome,
+    area_under_roc,
+    calibration_error,
+    cameras_of,
+    fit,
+    left_out,
+    probabilities,
+)
+
+FloatArray = NDArray[np.float64]
+
+MISS_COST = 5.0
+"""Cost of a wrong camera that is not doubted, relative to that of a right one that is."""
+BINS = 10
+
+
+def read(files: Sequence[Path]) -> Cameras:
+    """Return the cameras of files of measured captures."""
+    return cameras_of([json.loads(line) for file in files for line in file.read_text().splitlines()])
+
+
+def doubted(probability: FloatArray) -> NDArray[np.bool_]:
+    """Return which cameras are doubted."""
+    return np.asarray(probability < MISS_COST / (1 + MISS_COST))
+
+
+def show(title: str, cameras: Cameras, probability: FloatArray) -> None:
+    """Print the outcomes of the rules and of the model, for each family and for all."""
+    captures = len(np.unique(cameras.capture))
+    print(f"\n{title}: {len(cameras.right)} cameras of {captures} solutions")
+    print("| family | judged by | right | wrong | right, doubted | wrong, not doubted | calibration error | ROC |")
+    print("|---" * 8 + "|")
+    for family in ("all", *np.unique(cameras.family)):
+        mine = np.full(len(cameras.right), True) if family == "all" else cameras.family == family
+        own, right = probability[mine], cameras.right[mine]
+        rules, model = Outcome.of(right, cameras.doubted[mine]), Outcome.of(right, doubted(own))
+        print(f"{rules.line(f'{family} | rules')} – | – |")
+        quality = f"{calibration_error(own, right):.3f} | {area_under_roc(own, right):.3f}"
+        print(f"{model.line(f'{family} | model')} {quality} |")
+
+
+def draw(path: Path, probability: FloatArray, right: NDArray[np.bool_]) -> None:
+    """Write a reliability diagram: how many cameras are right, by their probability."""
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(5, 5))
+    number = np.minimum((probability * BINS).astype(int), BINS - 1)
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    for each in np.unique(number):
+        inside = number == each
+        share, count = right[inside].mean(), int(inside.sum())
+        error = np.sqrt(share * (1 - share) / count)
+        axes.errorbar(probability[inside].mean(), share, yerr=error, fmt="o", color="C0")
+        axes.annotate(str(count), (probability[inside].mean(), share), textcoords="offset points", xytext=(6, -10))
+    axes.set(xlabel="probability that a camera is right", ylabel="share of cameras that are right")
+    figure.savefig(path, bbox_inches="tight", dpi=150)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    """Fit, compare and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("fit", nargs="+", type=Path)
+    parser.add_argument("--fresh", nargs="*", type=Path, default=[])
+    parser.add_argument("--penalty", type=float, default=1.0, help="on the squared losses")
+    parser.add_argument("--coefficients", type=Path, help="file for the fitted model")
+    parser.add_argument("--picture", type=Path, help="file for the reliability diagram")
+    options = parser.parse_args()
+    cameras = read(options.fit)
+    probability = left_out(cameras, penalty=options.penalty)
+    show("Families left out of the fit", cameras, probability)
+    model = fit(cameras, penalty=options.penalty)
+    print(f"\n{len(model.terms)} of {len(SIGNS)} measurements count")
+    for name, term in model.terms.items():
+        print(f"  {name:22s} {term.knots} {term.losses} missing {term.missing}")
+    if options.fresh:
+        fresh = read(options.fresh)
+        probability = probabilities(model, fresh)
+        show("Fresh draws", fresh, probability)
+        cameras = fresh
+    if options.coefficients:
+        options.coefficients.write_text(json.dumps(model.to_json(), indent=1) + "\n")
+    if options.picture:
+        draw(options.picture, probability, cameras.right)
+
+
+if __name__ == "__main__":
+    main()
