@@ -140,14 +140,16 @@ class _Libraries:
 
     Attributes:
         modules: the modules.
-        content: the names in all modules, and the objects with these names.
+        names: the names in all modules.
+        objects: the objects with these names.
         python: the functions that are written in Python.
         codes: the code of each of those.
         functions: of each module, its functions and classes by name.
     """
 
     modules: list[ModuleType]
-    content: list[object]
+    names: list[str]
+    objects: list[object]
     python: list[FunctionType]
     codes: list[object]
     functions: Mapping[str, Mapping[str, _Function]]
@@ -159,31 +161,31 @@ class _Libraries:
         if _LATEST and _LATEST[0].are_unchanged(found):
             return _LATEST[0]
         modules = [*found.values()]
-        content, functions = _content(modules), {name: _functions_of(module) for name, module in found.items()}
+        names, objects = _content(modules)
+        functions = {name: _functions_of(module) for name, module in found.items()}
         known = [known for module in functions.values() for known in module.values() if known.code is not None]
         python, codes = [each.value for each in known], [each.code for each in known]
-        _LATEST[:] = [_Libraries(modules, content, python, codes, functions)]
+        _LATEST[:] = [_Libraries(modules, names, objects, python, codes, functions)]
         return _LATEST[0]
 
     def are_unchanged(self, modules: Mapping[str, ModuleType]) -> bool:
         """Return whether the same modules hold the same objects, and functions have the same code."""
+        if [*modules.values()] != self.modules:
+            return False
+        names, objects = _content(self.modules)
         return (
-            _same(self.modules, [*modules.values()])
-            and _same(self.content, _content(self.modules))
-            and _same(self.codes, [*map(attrgetter("__code__"), self.python)])
+            names == self.names
+            and all(map(is_, objects, self.objects))  # arrays are neither equal nor different
+            and [*map(attrgetter("__code__"), self.python)] == self.codes
         )
 
 
 _LATEST: list[_Libraries] = []
 
 
-def _content(modules: list[ModuleType]) -> list[object]:
+def _content(modules: list[ModuleType]) -> tuple[list[str], list[object]]:
     held = [*map(vars, modules)]
-    return [*chain.from_iterable(held), *chain.from_iterable(map(dict.values, held))]
-
-
-def _same(known: list[Any], present: list[Any]) -> bool:
-    return len(known) == len(present) and all(map(is_, known, present))
+    return [*chain.from_iterable(held)], [*chain.from_iterable(map(dict.values, held))]
 
 
 @dataclass(frozen=True)
@@ -194,11 +196,18 @@ class _Setting:
 
 
 def _library_modules() -> dict[str, ModuleType]:
-    return {
-        name: module
-        for name, module in list(sys.modules.items())
-        if name.partition(".")[0] in _LIBRARIES and type(module) is ModuleType and module.__name__ == name
-    }
+    loaded = dict(sys.modules)
+    if not (_CHOSEN and [*loaded] == [*_CHOSEN[0]] and all(map(is_, loaded.values(), _CHOSEN[0].values()))):
+        chosen = {
+            name: module
+            for name, module in loaded.items()
+            if name.partition(".")[0] in _LIBRARIES and type(module) is ModuleType and module.__name__ == name
+        }
+        _CHOSEN[:] = [loaded, chosen]
+    return _CHOSEN[1]
+
+
+_CHOSEN: list[dict[str, ModuleType]] = []
 
 
 def _functions_of(module: ModuleType) -> dict[str, _Function]:
