@@ -44,7 +44,7 @@ from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_tour import tour
 from pano_mvs.stages.source_video import video
-from pano_mvs.stages.structure import scene_planes, structure
+from pano_mvs.stages.structure import prior, scene_planes, structure
 from pano_mvs.stages.views import nearest
 
 __all__ = [
@@ -97,6 +97,7 @@ __all__ = [
     "poses_files",
     "position",
     "previews",
+    "prior",
     "ranges",
     "refine",
     "retrieval",

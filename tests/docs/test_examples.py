@@ -23,6 +23,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
+from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.io.images.tours import write_tour
 from tests.io.images.videos import tiny_video
 
@@ -133,6 +134,7 @@ def folder(tmp_path: Path) -> Path:
     for name in FILES:
         (tmp_path / name).touch()
     write_tour(tmp_path / "tour", "Marzipano")
+    shutil.copy(GREY_NETWORK, tmp_path / "network.onnx")
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:

@@ -10,11 +10,13 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene.level_panorama import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
+from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.io.images.tours import tiny_tour
 from tests.io.images.videos import tiny_video
 from tests.stages.rig_images import tiny_rig_capture, tiny_rig_panorama
 
 SETTINGS: dict[str, dict[str, Any]] = {
+    "depth.prior": {"network": str(GREY_NETWORK)},
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.localise": {"path": "{capture}/phone"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},

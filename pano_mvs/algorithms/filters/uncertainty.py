@@ -28,7 +28,7 @@ _MIN_ERROR_PX, _MIN_ROUGH_PX = 0.02, 0.01
 _ROUGH_POWER = 0.25
 # Near steps like this, in ln range, a pixel may have the range of the other surface.
 _STEP, _STEP_WEIGHT, _STEP_POWER = 0.1, 5.0, 1 / 3
-_LEAST, _MOST = 0.0005, 0.5
+LEAST_UNCERTAINTY, MOST_UNCERTAINTY = 0.0005, 0.5
 
 
 def confirmed_uncertainty(
@@ -65,7 +65,9 @@ def confirmed_uncertainty(
     sigma *= np.maximum(_roughness(consistent, ranges, rough) * motion, _MIN_ROUGH_PX) ** _ROUGH_POWER
     sigma *= (1 + _STEP_WEIGHT * _share(step > _STEP, wide)) ** _STEP_POWER
     sigma *= _SCALE / motion
-    return np.where(consistent, np.clip(sigma, _LEAST, _MOST), UNCONFIRMED_UNCERTAINTY).astype(np.float16)
+    return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(
+        np.float16
+    )
 
 
 def _roughness(consistent: Mask, ranges: NDArray[np.float32], radius: int) -> FloatArray:
@@ -103,7 +105,7 @@ def replaced_uncertainty(
     with np.errstate(invalid="ignore"):
         share = ranges[changed] / before.range[changed] - 1
         moved = np.hypot(before.uncertainty[changed].astype(np.float32), share)
-    moved = np.clip(moved, _LEAST, _MOST)
+    moved = np.clip(moved, LEAST_UNCERTAINTY, MOST_UNCERTAINTY)
     confirmed = (confidence[changed] >= CONSISTENT_CONFIDENCE[0]) & np.isfinite(moved)
     found = np.where(valid, before.uncertainty, np.float16(np.nan))
     found[changed] = np.where(confirmed, moved, np.float32(UNCONFIRMED_UNCERTAINTY)).astype(np.float16)

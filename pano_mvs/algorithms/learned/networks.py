@@ -64,7 +64,7 @@ class Networks:
             UsageError: if the file is missing or damaged, or the provider is not installed.
         """
         path = self._path(file)
-        return Network(_session(path, path.stat().st_mtime_ns, self.provider))
+        return open_network(path, self.provider)
 
     def check(self) -> None:
         """Check all files and the provider, so that nothing is computed in vain.
@@ -97,6 +97,17 @@ class Networks:
 PACKAGED = Networks()
 
 
+def open_network(path: Path, provider: Provider = "cpu") -> Network:
+    """Return the network of an ONNX file, loaded once per process.
+
+    Raises:
+        UsageError: if the file is missing or damaged, or the provider is not installed.
+    """
+    if not is_file(path):
+        raise UsageError(f"{path}: there is no such file. Give the path of a network in the ONNX format")
+    return Network(_session(path, path.stat().st_mtime_ns, provider))
+
+
 class Network:
     """A network that is ready to run.
 
@@ -113,6 +124,19 @@ class Network:
         """The names and numbers of axes of the inputs and outputs."""
         ends = (*self._session.get_inputs(), *self._session.get_outputs())
         return [f"{one.name} ({len(one.shape)} axes)" for one in ends]
+
+    def picture_input(self) -> tuple[str, list[int | None]]:
+        """Return the name and shape of the only input, a picture (1, 3, h, w); None for sizes that are left open.
+
+        Raises:
+            UsageError: if the network has other inputs.
+        """
+        inputs = self._session.get_inputs()
+        shape = [size if isinstance(size, int) else None for size in inputs[0].shape]
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(shape) != 4 or shape[1] not in {3, None}:
+            found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs)
+            raise UsageError(f"the network must have one input of float32 (1, 3, height, width), but has {found}")
+        return inputs[0].name, shape
 
     def __call__(self, **inputs: NDArray[np.generic]) -> list[Array]:
         """Return the outputs in their order."""
