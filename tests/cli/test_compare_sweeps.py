@@ -15,6 +15,11 @@ KNOWN = "pano_mvs: 1\nname: both\nextends: [compare_sweeps, fixed.yaml]\n"
 FIXED = """\
 pano_mvs: 1
 stages:
+  weak: null
+  learned: null
+  likely: null
+  rematched: null
+  merged: null
   refined: null
   levelled: null
   verified: {correct: false, in: {poses: points}}

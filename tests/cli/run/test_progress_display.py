@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import threading
 from pathlib import Path
 
@@ -164,3 +165,16 @@ def test_lines_are_repeated_by_a_thread_until_the_run_ends() -> None:
         assert ended.wait(60)
     count = len(calls)
     assert count >= 3
+
+
+def test_lines_do_not_end_up_in_what_a_unit_printed(tmp_path: Path) -> None:
+    """With executor `serial`, the output of a unit is captured by redirecting the file that the lines go to."""
+    shown, log = tmp_path / "shown", tmp_path / "log"
+    with shown.open("w") as stream, log.open("w") as unit:
+        display = ProgressDisplay(Console(file=stream, width=80))
+        with display:
+            os.dup2(unit.fileno(), stream.fileno())
+            display.print_line()
+        assert display.console.file is stream
+    assert "starting" in shown.read_text()
+    assert log.read_text() == ""
