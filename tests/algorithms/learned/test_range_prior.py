@@ -99,6 +99,7 @@ def test_the_uncertainty_is_the_error_that_was_measured() -> None:
     found, error = fill_from_prior(given, GUIDE, noisy.astype(np.float32), output="range")
     assert 0.025 < error < 0.04
     assert found.uncertainty is not None
+    assert given.uncertainty is not None
     np.testing.assert_allclose(found.uncertainty[HOLE & (found.range != given.range)], error, rtol=1e-3)
     np.testing.assert_array_equal(found.uncertainty[~HOLE], given.uncertainty[~HOLE])
 
@@ -109,10 +110,10 @@ def test_a_network_sees_the_panorama_at_its_own_size_without_a_seam(width: int) 
     smooth = (100 + 90 * ray_grid(SIZE)[..., 0])[..., None].repeat(3, axis=-1).astype(np.uint8)
     network = open_network(GREY_NETWORK)
     settings = {"mean": (0.5, 0.5, 0.5), "std": (0.25, 0.25, 0.25)}
-    values = network_values(network, smooth, width=width, **settings)  # type: ignore[arg-type]
+    values = network_values(network, smooth, width=width, **settings)
     assert values.shape == SIZE
     np.testing.assert_allclose(values, (smooth[..., 0] / 255 - 0.5) / 0.25, atol=0.08)
-    turned = network_values(network, np.roll(smooth, 64, axis=1), width=width, **settings)  # type: ignore[arg-type]
+    turned = network_values(network, np.roll(smooth, 64, axis=1), width=width, **settings)
     np.testing.assert_allclose(turned, np.roll(values, 64, axis=1), atol=0.02)
 
 
