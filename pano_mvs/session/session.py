@@ -41,19 +41,16 @@ def presets_folder() -> Path:
     return inside if is_folder(inside) else package.parent / "workflows"
 
 
-def _check_images(images: Path) -> None:
-    """Check that there is a folder of images, or a video.
-
-    Raises:
-        InputError: if there is neither.
-    """
+def _images_mistake(images: Path) -> str:
+    """Return why a path is neither a folder of images nor a video; "" if it is one."""
     if is_folder(images):
-        return
+        return ""
     if not exists(images):
         denied = f"cannot be read ({problem_of(images)})" if is_denied(images) else "there is no such folder or video"
-        raise InputError(f"--images {images}: {denied}")
+        return f"--images {images}: {denied}"
     if images.suffix.lower() not in VIDEO_SUFFIXES:
-        raise InputError(f"--images {images}: this is a file; give the folder that contains the images, or a video")
+        return f"--images {images}: this is a file; give the folder that contains the images, or a video"
+    return ""
 
 
 def open_session(
@@ -80,13 +77,15 @@ def open_session(
     if images == "":
         raise InputError("--images: the name of the folder is empty. Give the folder that holds the panoramas")
     images = None if images is None else Path(images)
-    if images is not None:
-        _check_images(images)
+    mistake = None if images is None else _images_mistake(images)
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except InvalidWorkflowError as error:
-        raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
+        first = [mistake] if mistake else []
+        raise WorkflowError([*first, *error.problems, *wiring_problems(error.stages, error.unknown)]) from None
+    if mistake:
+        raise InputError(mistake)
     if images is not None and not is_folder(images) and workflow.stages["images"].spec.name != _VIDEO_SOURCE:
         raise InputError(
             f"--images {images}: this is a video. Use the preset walk, or "

@@ -100,9 +100,14 @@ class ExtendsReader:
             base: folder that its relative paths start from.
             chain: the files that extend each other up to this one, which is last; empty if the text is not a file.
         """
-        root = parse_yaml(text, shown_as)
+        root = parse_yaml(text, shown_as, self.problems)
         if not isinstance(root.value, dict):
-            raise WorkflowError([f"{root.place}: a workflow must be a mapping with the keys {', '.join(TOP_KEYS)}"])
+            raise WorkflowError(
+                [
+                    *self.problems.lines,
+                    f"{root.place}: a workflow must be a mapping with the keys {', '.join(TOP_KEYS)}",
+                ]
+            )
         self._check_top(root)
         for item in self._extended(root):
             path = self._find(item, base)
@@ -149,6 +154,9 @@ class ExtendsReader:
             self.read(read_text(path), str(path), path.parent, chain=(*chain, real))
         except InputError as error:
             self.problems.add(item.place, f"extends: {error}")
+        except WorkflowError as error:  # the file is not YAML, or too large; this one may have further mistakes
+            known = len(self.problems.lines)
+            self.problems.lines += error.problems[known if error.problems[:known] == self.problems.lines else 0 :]
 
     def _check_top(self, root: Located) -> None:
         for key, node in root.value.items():

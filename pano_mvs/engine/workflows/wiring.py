@@ -57,28 +57,34 @@ class Graph:
         return Graph(order, self.edges, self.axes, only, is_part=True)
 
 
-def wire(workflow: Workflow) -> Graph:
+def wire(workflow: Workflow, *, unknown: Collection[str] = ()) -> Graph:
     """Connect every port as `in:` says, or else to the nearest earlier stage that produces its kind.
+
+    Args:
+        workflow: its stages.
+        unknown: names of further stages of which nothing is known, because they have errors. What they may produce or
+            need is not reported.
 
     Raises:
         WorkflowError: with every error: unknown stages or ports in `in:`, kinds that do not fit, inputs that no stage
             produces, ambiguity, cycles.
     """
-    wirer = _Wirer(workflow)
+    wirer = _Wirer(workflow, unknown)
     edges = {name: wirer.connect(entry) for name, entry in workflow.stages.items()}
     order = wirer.sort(edges)
     axes: dict[str, Axis] = {}
-    for name in order if not wirer.problems else ():
-        axes[name] = wirer.axis(workflow.stages[name], edges[name], axes)
+    for name in order:
+        if name not in wirer.broken and all(edge.producer in axes for edge in edges[name].values()):
+            axes[name] = wirer.axis(workflow.stages[name], edges[name], axes)
     if wirer.problems:
         raise WorkflowError(wirer.problems)
     return Graph(order, edges, axes)
 
 
-def wiring_problems(stages: Mapping[str, StageEntry]) -> list[str]:
-    """Return the errors in the connections of stages, even if their settings are wrong."""
+def wiring_problems(stages: Mapping[str, StageEntry], unknown: Collection[str] = ()) -> list[str]:
+    """Return the errors in the connections of stages, even if their settings, or other stages, are wrong."""
     try:
-        wire(Workflow("", None, "", dict(stages)))
+        wire(Workflow("", None, "", dict(stages)), unknown=unknown)
     except WorkflowError as error:
         return error.problems
     return []
@@ -96,8 +102,10 @@ def _delivers(entry: StageEntry, port: Port) -> bool | None:
 
 
 class _Wirer:
-    def __init__(self, workflow: Workflow) -> None:
+    def __init__(self, workflow: Workflow, unknown: Collection[str]) -> None:
         self.stages = workflow.stages
+        self.unknown = unknown
+        self.broken: set[str] = set()
         self.problems: list[str] = []
         self.ancestors: dict[str, set[str]] = {}
 
@@ -120,6 +128,9 @@ class _Wirer:
 
     def _named(self, entry: StageEntry, port: Port) -> Edge | None:
         name = entry.policy.inputs[port.name]
+        if name in self.unknown:
+            self.broken.add(entry.name)
+            return None
         place = f"in.{port.name}"
         producer = self.stages.get(name)
         if producer is None:
@@ -135,6 +146,9 @@ class _Wirer:
         return Edge(port, name, exploded)
 
     def _nearest(self, entry: StageEntry, port: Port) -> Edge | None:
+        if self.unknown:
+            self.broken.add(entry.name)
+            return None
         names = list(self.stages)
         earlier = [self.stages[name] for name in names[: names.index(entry.name)]]
         candidates = [stage for stage in earlier if _delivers(stage, port) is not None]
@@ -205,4 +219,5 @@ class _Wirer:
         return found
 
     def _problem(self, entry: StageEntry, place: str, message: str) -> None:
+        self.broken.add(entry.name)
         self.problems.append(f"{entry.places.get(place, entry.place)}: {message}")

@@ -97,10 +97,16 @@ def load_workflow(
 
 
 class InvalidWorkflowError(WorkflowError):
-    """A workflow with errors; `stages` has its entries if all their stages exist, so that `wire` can check them too."""
+    """A workflow with errors.
 
-    def __init__(self, problems: list[str], stages: dict[str, StageEntry]) -> None:
+    Attributes:
+        stages: its entries whose stage exists, so that their connections can be checked.
+        unknown: names of the other entries.
+    """
+
+    def __init__(self, problems: list[str], stages: dict[str, StageEntry], unknown: frozenset[str]) -> None:
         self.stages = stages
+        self.unknown = unknown
         super().__init__(problems)
 
 
@@ -131,7 +137,8 @@ class WorkflowReader:
             self.problems.add(files[-1].root.place, "no stage is left")
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
         if self.problems.lines:
-            raise InvalidWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
+            written = {name for file in files for name, node in file.stages.items() if node.value is not None}
+            raise InvalidWorkflowError(self.problems.lines, stages, frozenset({*written, *entries} - set(stages)))
         root = files[-1].root
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
@@ -198,14 +205,26 @@ class WorkflowReader:
         policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name=name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
         params = self._validate(spec.params_type, own, node, name=name)
-        if params is not None:
-            self._check_files(params, node, name)
+        self._check_files(params or self._valid_part(spec.params_type, own, node), node, name)
         places = {key: item.place for key, item in node.value.items()}
         wiring = node.value.get("in")
         if wiring is not None and isinstance(wiring.value, dict):
             places.update({f"in.{port}": item.place for port, item in wiring.value.items()})
         # Continue after errors in settings, so that the connections are checked too.
         return StageEntry(name, spec, params or Params(), policy or Policy(use=spec.name), node.key_place, places)
+
+    def _valid_part(self, model: type[Params], values: dict[str, Any], node: Located) -> Params:
+        """Return settings without those that are wrong, so that the files of the others are checked too."""
+        context = {"base": self.base, "bases": self._bases(node)}
+        try:
+            return model.model_validate(values, context=context)
+        except ValidationError as error:
+            wrong = {problem["loc"][0] for problem in error.errors() if problem["loc"]}
+        kept = {key: value for key, value in values.items() if key not in wrong}
+        try:
+            return model.model_validate(kept, context=context)
+        except ValidationError:
+            return Params()
 
     def _check_files(self, params: Params, node: Located, name: str) -> None:
         for key, paths in files_of(params).items():

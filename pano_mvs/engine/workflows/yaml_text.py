@@ -97,12 +97,13 @@ class Problems:
             raise WorkflowError(self.lines)
 
 
-def parse_yaml(text: str, name: str) -> Located:
+def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Located:
     """Return the document in a YAML 1.2 text.
 
     Args:
         text: the YAML.
         name: name of the text in messages, such as its path.
+        problems: receives errors that leave the rest readable, such as a key that occurs twice; None raises them.
 
     Raises:
         WorkflowError: with every error found, as `name:line:column: message`.
@@ -122,9 +123,10 @@ def parse_yaml(text: str, name: str) -> Located:
         raise WorkflowError([f"{name}: not valid YAML ({type(error).__name__}: {_shortened(str(error))})"]) from None
     if root is None:
         raise WorkflowError([f"{name}:1:1: the file is empty"])
-    builder = _Builder(name)
+    builder = _Builder(name, Problems() if problems is None else problems)
     located = builder.build(root, 0)
-    builder.problems.raise_if_any()
+    if problems is None:
+        builder.problems.raise_if_any()
     return located
 
 
@@ -170,9 +172,9 @@ def _unreadable(text: str) -> str:
 class _Builder:
     """Turns ruamel's nodes into located values, and collects errors."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, problems: Problems) -> None:
         self.name = name
-        self.problems = Problems()
+        self.problems = problems
         self.count = 0
 
     def build(self, node: Node, depth: int) -> Located:
