@@ -356,10 +356,11 @@ def share(
     to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to write the page to.")],
     title: Annotated[str, typer.Option("--title", help="Heading; default: the name of OUT.", show_default=False)] = "",
     points: Annotated[
-        int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: all.")
+        int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: none.")
     ] = 5_000_000,
     triangles: Annotated[
-        int, typer.Option("--triangles", min=0, help="Maximum number of triangles of a mesh without texture; 0: all.")
+        int,
+        typer.Option("--triangles", min=0, help="Maximum number of triangles of a mesh without texture; 0: none."),
     ] = 300_000,
     width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 4096,
     quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,

@@ -21,6 +21,7 @@ from pano_mvs.io.meshes.glb_writer import write_glb
 from pano_mvs.io.meshes.obj_writer import write_mtl, write_obj
 from pano_mvs.io.meshes.picture_data import SUFFIXES, TextureFormat, encoded_texture
 from pano_mvs.io.meshes.textured_arrays import TexturedArrays
+from pano_mvs.io.meshes.usdz_writer import write_usdz
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.pose_groups import split_groups
@@ -56,7 +57,9 @@ class TexturedParams(MeshParams):
     detail: float = Field(
         default=1.0, gt=0, le=4, description="texels per pixel of the panoramas, as they see most of the surface"
     )
-    formats: tuple[Literal["glb", "obj"], ...] = Field(default=("glb", "obj"), description="file formats of the mesh")
+    formats: tuple[Literal["glb", "obj", "usdz"], ...] = Field(
+        default=("glb", "obj"), description="file formats of the mesh"
+    )
     texture_format: TextureFormat = Field(default="jpeg", description="file format of the texture")
     jpeg_quality: int = Field(default=92, ge=1, le=100, description="quality of a JPEG texture")
     frame: Literal["upright", "world"] = Field(
@@ -203,6 +206,9 @@ def _write(
     if "glb" in params.formats:
         files[target(".glb")] = folder / "mesh.glb"
         write_glb(files[target(".glb")], arrays, picture, form=params.texture_format)
+    if "usdz" in params.formats:
+        files[target(".usdz")] = folder / "mesh.usdz"
+        write_usdz(files[target(".usdz")], arrays, picture, form=params.texture_format)
     if "obj" in params.formats:
         texture = target(SUFFIXES[params.texture_format])
         files |= {target(".obj"): folder / "mesh.obj", target(".mtl"): folder / "mesh.mtl", texture: folder / "texture"}

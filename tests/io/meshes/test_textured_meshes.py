@@ -1,20 +1,25 @@
-"""GLB and OBJ files of textured meshes, as trimesh reads them."""
+"""GLB and OBJ files of textured meshes as trimesh reads them, and USDZ as Pixar's library does."""
 
 from __future__ import annotations
 
 import hashlib
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
+from pxr import Ar, Usd, UsdGeom, UsdShade
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.io.meshes.glb_writer import write_glb
 from pano_mvs.io.meshes.obj_writer import write_mtl, write_obj
 from pano_mvs.io.meshes.picture_data import TextureFormat, encoded_texture
 from pano_mvs.io.meshes.textured_arrays import TexturedArrays
+from pano_mvs.io.meshes.usdz_writer import write_usdz
 from tests.algorithms.mesh.box import box
 
 
@@ -45,6 +50,40 @@ def test_another_program_reads_the_glb(tmp_path: Path, form: TextureFormat) -> N
     picture = np.asarray(visual.material.baseColorTexture.convert("RGB"))
     assert np.abs(picture.astype(int) - texture()).mean() < (4 if form == "jpeg" else 1e-9)
     assert visual.material.doubleSided
+
+
+@pytest.mark.parametrize("form", ["png", "jpeg"])
+def test_the_library_of_pixar_reads_the_usdz(tmp_path: Path, form: TextureFormat) -> None:
+    mesh, path = arrays(), tmp_path / "a.usdz"
+    write_usdz(path, mesh, encoded_texture(texture(), form, quality=95), form=form)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    surface = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
+    np.testing.assert_array_equal(np.array(surface.GetPointsAttr().Get()), mesh.positions)
+    np.testing.assert_array_equal(np.array(surface.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), mesh.faces)
+    np.testing.assert_array_equal(np.array(surface.GetExtentAttr().Get())[0], mesh.positions.min(axis=0))
+    uv = np.array(UsdGeom.PrimvarsAPI(surface).GetPrimvar("st").Get())
+    np.testing.assert_allclose(uv, np.column_stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]]), atol=1e-6)
+    material, _ = UsdShade.MaterialBindingAPI(surface).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0]
+    (source,) = shader.GetInput("emissiveColor").GetConnectedSources()[0]
+    file = UsdShade.Shader(source.source).GetInput("file").Get()
+    with Ar.GetResolver().OpenAsset(Ar.ResolvedPath(file.resolvedPath)) as asset:
+        picture = np.asarray(Image.open(io.BytesIO(bytes(asset.GetBuffer()))).convert("RGB"))
+    assert np.abs(picture.astype(int) - texture()).mean() < (4 if form == "jpeg" else 1e-9)
+
+
+def test_the_usdz_is_an_aligned_archive_and_always_the_same(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_usdz(tmp_path / f"{name}.usdz", arrays(), encoded_texture(texture(), "png", quality=95), form="png")
+    assert (tmp_path / "a.usdz").read_bytes() == (tmp_path / "b.usdz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.usdz") as archive:
+        assert archive.testzip() is None
+        data = (tmp_path / "a.usdz").read_bytes()
+        for entry in archive.infolist():
+            assert entry.compress_type == zipfile.ZIP_STORED
+            assert data.index(archive.read(entry)) % 64 == 0
 
 
 def test_the_box_stays_watertight(tmp_path: Path) -> None:
