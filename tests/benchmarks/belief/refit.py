@@ -2,7 +2,8 @@
 
 Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
 
-FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds. The script prints, for all families
+FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds; FIT may also be `evidence.csv`, the
+table of the captures that docs/benchmarks.md is about. The script prints, for all families
 and for each, how many right cameras are doubted and how many wrong ones are not, by the rules of `poses.verify` and by
 the model; cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. A
 camera is doubted if p is below `MISS_COST` / (1 + `MISS_COST`). `--picture FILE` draws the reliability diagram.
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.benchmarks.belief.fitting import (
+    PENALTY,
     SIGNS,
     Cameras,
     Outcome,
@@ -28,6 +30,8 @@ from tests.benchmarks.belief.fitting import (
     fit,
     left_out,
     probabilities,
+    read_table,
+    write_table,
 )
 
 FloatArray = NDArray[np.float64]
@@ -38,7 +42,9 @@ BINS = 10
 
 
 def read(files: Sequence[Path]) -> Cameras:
-    """Return the cameras of files of measured captures."""
+    """Return the cameras of files of measured captures, or of one table."""
+    if files[0].suffix == ".csv":
+        return read_table(files[0])
     return cameras_of([json.loads(line) for file in files for line in file.read_text().splitlines()])
 
 
@@ -85,11 +91,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("fit", nargs="+", type=Path)
     parser.add_argument("--fresh", nargs="*", type=Path, default=[])
-    parser.add_argument("--penalty", type=float, default=1.0, help="on the squared losses")
+    parser.add_argument("--penalty", type=float, default=PENALTY, help="on the squared losses")
     parser.add_argument("--coefficients", type=Path, help="file for the fitted model")
+    parser.add_argument("--table", type=Path, help="CSV file for the measurements of all cameras of FIT")
     parser.add_argument("--picture", type=Path, help="file for the reliability diagram")
     options = parser.parse_args()
     cameras = read(options.fit)
+    if options.table:
+        write_table(options.table, cameras)
     probability = left_out(cameras, penalty=options.penalty)
     show("Families left out of the fit", cameras, probability)
     model = fit(cameras, penalty=options.penalty)
