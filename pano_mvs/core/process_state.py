@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from operator import attrgetter, is_
 from types import FunctionType, ModuleType
@@ -235,8 +236,11 @@ def _set_numpy_random(state: tuple[Any, ...]) -> None:
     _library("numpy").random.set_state((name, _library("numpy").frombuffer(keys, "uint32"), *rest))
 
 
+_SIGNALS = [*map(int, signal.valid_signals())]
+
+
 def _handlers() -> dict[int, Any]:
-    return {number: signal.getsignal(number) for number in signal.valid_signals()}
+    return {number: signal.getsignal(number) for number in _SIGNALS}
 
 
 def _set_handlers(handlers: dict[int, Any]) -> None:
@@ -264,20 +268,24 @@ def _set_environment(variables: dict[str, str]) -> None:
     os.environ.update(variables)
 
 
+@cache
+def _mathematics() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
+
+
 def _float_environment() -> _FloatEnvironment:
     buffer = ctypes.create_string_buffer(_FENV_BYTES)
     rounding = -1
     with suppress(OSError, AttributeError):  # no such library here
-        mathematics = ctypes.CDLL(None)
-        mathematics.fegetenv(buffer)
-        rounding = mathematics.fegetround()
+        _mathematics().fegetenv(buffer)
+        rounding = _mathematics().fegetround()
     smallest = sys.float_info.min
     return _FloatEnvironment(rounding, smallest * 0.5 > 0, buffer)
 
 
 def _set_float_environment(state: _FloatEnvironment) -> None:
     with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).fesetenv(state.buffer)
+        _mathematics().fesetenv(state.buffer)
 
 
 @dataclass(frozen=True)
