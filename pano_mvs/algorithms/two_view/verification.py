@@ -36,9 +36,8 @@ _ROTATION_SHARE = 0.9
 _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
-# Of the pairs that learned matches verify in an empty house, 43 of 44 true ones turn the zenith by less than this, and
-# 67 of 74 false ones by more; nineteen of twenty true ones have fewer false alarms, as many false ones more.
-_MAX_ZENITH_RAD, _MAX_LOG10_AGAINST_ZENITH = float(np.deg2rad(1.5)), -50.0
+# Of learned matches: about where a pair is as likely right as wrong, see `tests.benchmarks.poses.tours.pair_evidence`.
+_MAX_LOG10_LEARNED = -50.0
 
 
 @checks_settings
@@ -66,10 +65,10 @@ def verify_pair(
     pose, both images are tried as upright ones, as tripods and sensors keep them: a heading and two matches then
     determine a relative pose, so that far fewer true matches are more than chance (see `upright_poses`).
 
-    A network matches by the arrangement of key points as well, so that its false matches agree with one another far
-    more often than shuffled ones. Its views are levelled by vertical lines. If both images have learned key points, a
-    pose that does not turn one zenith into the other must therefore be all the more significant, and no pose is sought
-    that does so by construction.
+    A network matches by the arrangement of key points as well, so that its false matches, such as those of equal doors
+    and windows, agree with one another far more often than shuffled ones, mostly on a pose that keeps an upright camera
+    upright. If both images have learned key points, a pose must therefore be far more significant, and upright poses
+    are not sought.
 
     Args:
         first: key points of the first image.
@@ -89,7 +88,9 @@ def verify_pair(
         tried: together with other pairs, they may be more than chance.
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, _zeniths(first, second))
+    learned = bool(first.learned and second.learned)
+    most = _MAX_LOG10_LEARNED if learned else MAX_LOG10_FALSE_ALARMS
+    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, most)
     count = len(matches_idx)
     if count < max(min_inliers, MIN_MATCHES):
         return pair.failed(f"{count} {plural(count, 'match', 'matches')}, {max(min_inliers, MIN_MATCHES)} needed")
@@ -99,7 +100,7 @@ def verify_pair(
     )
     minimal = SOLVERS[solver]
     tried = [pair.evidence(pose.second_from_first, sample=minimal.sample, models=minimal.models)] if pose else []
-    if refine and pair.zeniths is None and not any(tried):
+    if refine and not learned and not any(tried):
         tried += [
             pair.evidence(upright, sample=_UPRIGHT_SAMPLE, models=_UPRIGHT_MODELS)
             for upright in upright_poses(p, q, rng=rng, threshold_rad=pair.threshold_rad)
@@ -156,7 +157,7 @@ def verify_pose(
         min_inliers: minimum number of independent inliers.
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, _zeniths(first, second))
+    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers)
     length = float(np.linalg.norm(pose.translation))
     if length <= 0 or len(matches_idx) < min_inliers:
         return pair.failed(f"{_agreeing(len(matches_idx), len(p))}, {min_inliers} needed")
@@ -184,7 +185,7 @@ class _Evidence:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """The matches of a pair, (M, 2), their unit bearings, (M, 3), and the zeniths of both images, (2, 3), if known."""
+    """The matches of a pair, (M, 2), and their unit bearings, (M, 3)."""
 
     matches_idx: NDArray[np.int32]
     p: FloatArray
@@ -192,7 +193,7 @@ class _Pair:
     rng: np.random.Generator
     threshold_rad: float
     min_inliers: int
-    zeniths: FloatArray | None
+    max_log10_false_alarms: float = MAX_LOG10_FALSE_ALARMS
 
     def failed(self, reason: str) -> TwoView:
         """Return the falsy value of the pair with all its matches."""
@@ -224,9 +225,7 @@ class _Pair:
             models_per_sample=models,
         )
         enough = witnesses >= self.min_inliers
-        if self.zeniths is None or angle_between(pose.rotation @ self.zeniths[0], self.zeniths[1]) < _MAX_ZENITH_RAD:
-            return _Evidence(pose, count, witnesses, alarms, enough)
-        return _Evidence(pose, count, witnesses, alarms, enough, _MAX_LOG10_AGAINST_ZENITH)
+        return _Evidence(pose, count, witnesses, alarms, enough, self.max_log10_false_alarms)
 
     def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
         """Return the geometry of a pose with inliers, and the parallax of each inlier in radians."""
@@ -263,11 +262,6 @@ class _Pair:
         view, parallax = self.view(evidence)
         reason = _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)
         return self.failed(reason) if reason else view
-
-
-def _zeniths(first: Features, second: Features) -> FloatArray | None:
-    """Return the zeniths of two images with learned key points, (2, 3), in their camera frames; else None."""
-    return np.array([first.up, second.up]) if first.learned and second.learned else None
 
 
 def _from_one_place(

@@ -79,17 +79,17 @@ def test_a_known_pose_needs_fewer_matches_than_a_search() -> None:
     assert "8 needed" in nowhere.reason
 
 
-def test_learned_matches_that_tip_the_zenith_must_be_far_more_than_chance() -> None:
-    """A network's false matches agree with one another; hardly ever do they keep a level camera level."""
-    tipped, first, second = _pair(true=40, count=90, tilt_deg=8.0)
-    plain = verify_pair(first, second, _all(90), rng=np.random.default_rng(0))
-    assert plain
-    assert -50 < plain.log10_false_alarms < -6
-    level, other = (replace(one, learned=len(one)) for one in (first, second))
-    assert "may be chance" in verify_pair(level, other, _all(90), rng=np.random.default_rng(0)).reason
-    up = tipped.rotation @ np.array([0.0, -1.0, 0.0])
-    turned = replace(other, up=(float(up[0]), float(up[1]), float(up[2])))
-    assert verify_pair(level, turned, _all(90), rng=np.random.default_rng(0))
+def test_learned_matches_must_be_far_more_than_chance() -> None:
+    """A network's false matches, such as those of equal doors, agree with one another, also on upright poses."""
+    for true, tilt_deg in ((40, 8.0), (40, 0.0)):
+        _, first, second = _pair(true=true, count=90, tilt_deg=tilt_deg)
+        plain = verify_pair(first, second, _all(90), rng=np.random.default_rng(0))
+        assert plain
+        assert -50 < plain.log10_false_alarms < -6
+        level, other = (replace(one, learned=len(one)) for one in (first, second))
+        found = verify_pair(level, other, _all(90), rng=np.random.default_rng(0))
+        assert "may be chance" in found.reason
+        assert found.alternatives
     _, first, second = _pair(true=90, count=90, tilt_deg=8.0)
     level, other = (replace(one, learned=len(one)) for one in (first, second))
     assert verify_pair(level, other, _all(90), rng=np.random.default_rng(0))

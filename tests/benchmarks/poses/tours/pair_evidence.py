@@ -1,0 +1,111 @@
+"""How significant wrong learned pairs are: `python -m tests.benchmarks.poses.tours.pair_evidence DIR …`.
+
+Each DIR is a capture with truth.json, see `tests.benchmarks.poses.tours.measure`. Each panorama is matched with those
+that have the most similar learned key points, as `matches.lightglue` does. The best relative pose of each pair is right
+if it agrees with the truth to 3° and 6°, or to 6° and 15° where the truth was drawn by hand. The table shows right and
+wrong pairs by log₁₀ of their false alarms. Below is where a logistic regression on the logarithm of this exponent gives
+even odds, which is the limit of `verify_pair` for learned matches. Results stay in DIR/pairs, also those of a run that
+was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.optimize import minimize
+
+from pano_mvs.algorithms.features.tangent import extract_sift
+from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
+from pano_mvs.algorithms.learned.lightglue import match_learned
+from pano_mvs.algorithms.learned.weak_images import learned_pairs
+from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.poses.frame.vertical_lines import up_of_panorama
+from pano_mvs.algorithms.two_view.verification import verify_pair
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
+from pano_mvs.scene import Features, TwoView
+from tests.benchmarks.poses.precision import cached
+from tests.benchmarks.poses.tours.measure import read_truth
+
+EDGES = (-np.inf, -200.0, -100.0, -75.0, -50.0, -35.0, -25.0, -15.0, -6.0, np.inf)
+_EXACT_DEG, _DRAWN_DEG = (3.0, 6.0), (6.0, 15.0)
+
+
+def keypoints(picture: Path) -> Features:
+    """Return the SIFT and the learned key points of a panorama."""
+    stored = cv2.imread(str(picture))
+    assert stored is not None, picture
+    image = np.ascontiguousarray(stored[..., ::-1])
+    mask = np.ones(image.shape[:2], np.bool_)
+    return joined(extract_sift(image, mask), extract_aliked(image, mask, up=up_of_panorama(image, mask).up))
+
+
+def candidates(first: Features, second: Features) -> np.ndarray:
+    """Return the matches of both kinds of key points, as `matches.lightglue` finds them."""
+    own = match_features(first.without_learned(), second.without_learned())
+    return np.concatenate([own, match_learned(first, second)])
+
+
+def best_pose(view: TwoView) -> Rigid3 | None:
+    """Return the best relative pose of a pair, verified or not; None if there is no hypothesis."""
+    best = view if view else next(iter(view.alternatives), None)
+    return None if best is None else Rigid3(best.rotation, best.direction)
+
+
+def judged_pairs(capture: Path, *, neighbours: int) -> Iterator[tuple[float, bool]]:
+    """Yield log₁₀ of the false alarms of each pair with a hypothesis, and whether its pose is right."""
+    truth = read_truth(capture)
+    assert truth is not None, f"{capture} has no truth.json with headings"
+    poses, limits = truth
+    most = _EXACT_DEG if limits[0] < 2 else _DRAWN_DEG
+    folder = capture / "pairs"
+    found: Mapping[str, Features] = {
+        name: cached(folder / f"{name}.pkl", partial(keypoints, capture / "images" / name)) for name in sorted(poses)
+    }
+    for first, second in learned_pairs(found, neighbours=neighbours).pairs:
+        ends = found[first], found[second]
+        matches = cached(folder / f"{first}_{second}.pkl", partial(candidates, *ends))
+        view = verify_pair(*ends, matches, rng=np.random.default_rng(0))
+        pose, true = best_pose(view), poses[second] @ poses[first].inverse()
+        if pose is not None:
+            turned = geodesic_angle(pose.rotation, true.rotation)
+            off = angle_between(pose.translation, true.translation)
+            yield view.log10_false_alarms, bool(np.all(np.rad2deg([turned, off]) < most))
+
+
+def even_exponent(exponents: np.ndarray, right: np.ndarray) -> float:
+    """Return the exponent at which a pair is as likely right as wrong, by logistic regression; NaN if all are alike."""
+    if right.all() or not right.any():
+        return float("nan")
+    x, sign = np.log(np.maximum(-exponents, 1.0)), np.where(right, 1.0, -1.0)
+
+    def loss(line: np.ndarray) -> float:
+        # The weak prior keeps the slope finite if a limit separates all pairs.
+        return float(np.logaddexp(0, -sign * (line[0] + line[1] * x)).sum() + 0.01 * line[1] ** 2)
+
+    offset, slope = minimize(loss, np.zeros(2)).x
+    return float(-np.exp(-offset / slope))
+
+
+def main() -> None:
+    """Print the table of the captures that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="+", type=Path, metavar="DIR")
+    parser.add_argument("--neighbours", type=int, default=8)
+    given = parser.parse_args()
+    pairs = [pair for capture in given.captures for pair in judged_pairs(capture, neighbours=given.neighbours)]
+    exponents, right = np.array([one for one, _ in pairs]), np.array([one for _, one in pairs], np.bool_)
+    print("| log₁₀ of the false alarms | right | wrong |\n|---|---|---|")
+    for low, high in pairwise(EDGES):
+        inside = (exponents > low) & (exponents <= high)
+        print(f"| {low:g} to {high:g} | {int((inside & right).sum())} | {int((inside & ~right).sum())} |")
+    print(f"even odds at {even_exponent(exponents, right):.0f}")
+
+
+if __name__ == "__main__":
+    main()
