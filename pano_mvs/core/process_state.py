@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
 from operator import attrgetter, is_
 from types import FunctionType, ModuleType
 from typing import Any
@@ -141,16 +140,14 @@ class _Libraries:
 
     Attributes:
         modules: the modules.
-        names: the names in all modules.
-        objects: the objects with these names.
+        content: of each module, its objects by name.
         python: the functions that are written in Python.
         codes: the code of each of those.
         functions: of each module, its functions and classes by name.
     """
 
     modules: list[ModuleType]
-    names: list[str]
-    objects: list[object]
+    content: list[dict[str, Any]]
     python: list[FunctionType]
     codes: list[object]
     functions: Mapping[str, Mapping[str, _Function]]
@@ -162,31 +159,26 @@ class _Libraries:
         if _LATEST and _LATEST[0].are_unchanged(found):
             return _LATEST[0]
         modules = [*found.values()]
-        names, objects = _content(modules)
+        content = [dict(vars(module)) for module in modules]
         functions = {name: _functions_of(module) for name, module in found.items()}
         known = [known for module in functions.values() for known in module.values() if known.code is not None]
         python, codes = [each.value for each in known], [each.code for each in known]
-        _LATEST[:] = [_Libraries(modules, names, objects, python, codes, functions)]
+        _LATEST[:] = [_Libraries(modules, content, python, codes, functions)]
         return _LATEST[0]
 
     def are_unchanged(self, modules: Mapping[str, ModuleType]) -> bool:
         """Return whether the same modules hold the same objects, and functions have the same code."""
-        if [*modules.values()] != self.modules:
+        try:
+            return (
+                [*modules.values()] == self.modules
+                and [*map(vars, self.modules)] == self.content
+                and [*map(attrgetter("__code__"), self.python)] == self.codes
+            )
+        except Exception:  # another array, say, is neither equal nor different
             return False
-        names, objects = _content(self.modules)
-        return (
-            names == self.names
-            and all(map(is_, objects, self.objects))  # arrays are neither equal nor different
-            and [*map(attrgetter("__code__"), self.python)] == self.codes
-        )
 
 
 _LATEST: list[_Libraries] = []
-
-
-def _content(modules: list[ModuleType]) -> tuple[list[str], list[object]]:
-    held = [*map(vars, modules)]
-    return [*chain.from_iterable(held)], [*chain.from_iterable(map(dict.values, held))]
 
 
 @dataclass(frozen=True)

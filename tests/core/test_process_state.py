@@ -60,6 +60,18 @@ def test_changes_are_named_and_undone(what: str, monkeypatch: pytest.MonkeyPatch
     assert (cv2.remap is not None, math.floor(0.5), text.plural(2, "file")) == (True, 0, "files")
 
 
+def test_values_that_cannot_be_compared_hide_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text, "table", np.zeros(2), raising=False)
+    before = ProcessState.now()
+    monkeypatch.setattr(text, "table", np.ones(2))
+    assert not before.restore()
+    monkeypatch.setattr(text, "shortened", str)
+    assert str(before.restore()) == "pano_mvs.core.text.shortened"
+    after = ProcessState.now()
+    monkeypatch.setattr(text, "plural", str)
+    assert str(after.restore()) == "pano_mvs.core.text.plural"
+
+
 def test_only_what_decides_results_counts_against_built_in_stages() -> None:
     before = ProcessState.now()
     random.seed(1)
