@@ -32,7 +32,7 @@ from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import photographs, scale_cloud, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge, weak
-from pano_mvs.stages.pairs import exhaustive, learned, position, retrieval, sequential, vlad
+from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import exchange, patchmatch, plain_surfaces
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
@@ -50,6 +50,7 @@ from pano_mvs.stages.views import nearest
 __all__ = [
     "aliked",
     "apply",
+    "automatic",
     "bilateral_solver",
     "brute_force",
     "colmap",

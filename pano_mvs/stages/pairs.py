@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.neighbours import (
+    automatic_pairs,
     east_north_m,
     loop_closing_pairs,
+    most_pairs,
     position_pairs,
     retrieval_pairs,
 )
@@ -22,9 +29,11 @@ from pano_mvs.api import (
     InputError,
     InputPath,
     Names,
+    One,
     Pairs,
     Panorama,
     Params,
+    Poses,
     UsageError,
     arguments_from,
     params_from,
@@ -33,8 +42,61 @@ from pano_mvs.api import (
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
 
+_BYTES_OF_A_PAIR = 64  # the most of eight matrices of float64 that `automatic_pairs` and its parts hold at a time
 
-@stage("pairs.exhaustive")
+
+@params_from(automatic_pairs)
+class AutoParams(Params):
+    """Settings of pairs.auto."""
+
+
+def _memory_of_auto(params: AutoParams, inputs: Mapping[str, Any]) -> int:
+    count = len(inputs["descriptors"])
+    return _BYTES_OF_A_PAIR * count**2 if most_pairs(count, _candidates(params)) < count * (count - 1) // 2 else 0
+
+
+def _candidates(params: AutoParams) -> int:
+    return int(arguments_from(automatic_pairs, params)["candidates"])
+
+
+@stage(
+    "pairs.auto", memory=_memory_of_auto, expected_units=lambda params, images: most_pairs(images, _candidates(params))
+)
+def automatic(
+    descriptors: All[GlobalDescriptor],
+    images: All[Panorama],
+    poses: One[Poses] | None,
+    params: AutoParams,
+    ctx: Context,
+) -> Pairs:
+    """Match all pairs of up to 57 images; in larger captures, match each image with at most 28 others.
+
+    These are chosen by the order of the capture if consecutive images are similar, by the positions of GPS or of an
+    earlier stage that returns poses, and by similarity.
+    """
+    settings = arguments_from(automatic_pairs, params)
+    if most_pairs(len(descriptors), settings["candidates"]) < len(descriptors) * (len(descriptors) - 1) // 2:
+        positions = gps_positions(images) if poses is None else dict(zip(poses.names, poses.centers, strict=True))
+    else:
+        positions = {}
+    pairs, reason = automatic_pairs(descriptors, positions, **settings)
+    ctx.metric("pairs", len(pairs.pairs))
+    if reason:
+        count = len(descriptors)
+        ctx.note(
+            f"{len(pairs.pairs):,} of the {count * (count - 1) // 2:,} pairs of {count} images are matched, at most "
+            f"{settings['candidates']} for each (candidates of pairs.auto): {reason}"
+        )
+    return pairs
+
+
+def gps_positions(images: Mapping[str, Panorama]) -> dict[str, NDArray[np.float64]]:
+    """Return the positions of the images that have a GPS fix, (2,) metres east and north of their mean."""
+    located = {name: image.position_lla for name, image in images.items() if image.position_lla is not None}
+    return dict(zip(located, east_north_m(list(located.values())), strict=True))
+
+
+@stage("pairs.exhaustive", expected_units=lambda _, images: images * (images - 1) // 2)
 def exhaustive(images: Names[Features]) -> Pairs:
     """Match every image with every other one; for up to about 60 images."""
     return exhaustive_pairs(images)
@@ -119,8 +181,7 @@ def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pai
         place = dict(zip(model.names, model.centers, strict=True))
         positions = {name: place[known] for name, known in match_image_names(images, model.names).items()}
     else:
-        located = {name: image.position_lla for name, image in images.items() if image.position_lla is not None}
-        positions = dict(zip(located, east_north_m(list(located.values())), strict=True))
+        positions = gps_positions(images)
     if not positions:
         raise InputError(
             "no image has a position: the files contain no GPS fix. Use pairs.sequential, pairs.retrieval or "

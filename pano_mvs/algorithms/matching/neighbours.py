@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pano_mvs.algorithms.matching.pairs import sequential_pairs
+from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.settings import Setting, checks_settings
@@ -20,6 +20,7 @@ from pano_mvs.scene import Features, GlobalDescriptor, Pairs
 FloatArray = NDArray[np.float64]
 
 _SHORTLISTED = 20
+_WINDOW, _NEAREST = 5, 10  # the defaults of pairs.sequential and pairs.position
 
 
 @checks_settings
@@ -127,6 +128,65 @@ def loop_closing_pairs(
     return sequential_pairs(names, window=window, loop=loop)
 
 
+@checks_settings
+def automatic_pairs(
+    descriptors: Mapping[str, GlobalDescriptor],
+    positions: Mapping[str, FloatArray],
+    *,
+    candidates: Annotated[
+        int, Setting("number of images to match each one with; all pairs are matched while these are no more", ge=1)
+    ] = 28,
+) -> tuple[Pairs, str]:
+    """Return every pair while there are few, and else a bounded number for each image from all that the capture offers.
+
+    An image is paired with the ones that follow it, if at least half of the images are
+    among the most similar ones of the image before. To these are added the images that are nearest by position (of
+    images at one place, the most similar ones), and as many of the most similar ones as are left of `candidates`; these
+    close loops. Separate groups are joined by the most similar links.
+
+    Args:
+        descriptors: image name to its global descriptor, in the capture's order.
+        positions: image name to position in one frame and unit; some or all may be missing.
+        candidates: each image adds at most this number of pairs.
+
+    Returns:
+        The pairs, and what they were chosen by; "" for all pairs.
+
+    Raises:
+        UsageError: if the number of candidates is less than 1.
+    """
+    names, count = tuple(descriptors), len(descriptors)
+    if most_pairs(count, candidates) == count * (count - 1) // 2:
+        return exhaustive_pairs(names), ""
+    looks = _dissimilarities(names, descriptors, candidates)
+    left, chosen, reasons = np.full(count, candidates), np.eye(count, dtype=np.bool_), list[str]()
+    following = _share_that_follow(looks)
+    if following >= 0.5:
+        window = min(_WINDOW, candidates)
+        for step in range(1, window + 1):
+            chosen |= np.eye(count, k=step, dtype=np.bool_) | np.eye(count, k=-step, dtype=np.bool_)
+        left -= window
+        reasons.append(f"the next {window} in order, because {100 * following:.0f} % look like the one before")
+    located = np.array([name in positions for name in names])
+    if located.any():
+        places = np.array([positions[name] for name in names if name in positions], np.float64)
+        apart = np.full((count, count), np.inf)
+        apart[np.ix_(located, located)] = _squared_distances(places)
+        nearest = np.where(located, np.minimum(_NEAREST, left), 0)
+        _choose(chosen, nearest, looks, apart)
+        left -= nearest
+        reasons.append(f"the {nearest.max()} nearest by the positions of {np.count_nonzero(located)}")
+    _choose(chosen, left, looks)
+    links = _joined(np.argwhere(np.triu(chosen, 1)), looks)
+    reasons.append(f"{'the rest' if reasons else f'the {candidates} most similar'} by their key points")
+    return _named(names, {(a, b) for a, b in links.tolist()}), ", ".join(reasons)
+
+
+def most_pairs(images: int, candidates: int) -> int:
+    """Return the most pairs that `automatic_pairs` chooses before it joins separate groups."""
+    return min(candidates * images, images * (images - 1) // 2)
+
+
 def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
     """Return the links of each item to its nearest ones, and the shortest ones that join separate groups.
 
@@ -137,7 +197,11 @@ def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
     Returns:
         (M, 2) positions, first before second, sorted, no link twice.
     """
-    links = _nearest(distances, neighbours)
+    return _joined(_nearest(distances, neighbours), distances)
+
+
+def _joined(links: NDArray[np.intp], distances: FloatArray) -> NDArray[np.intp]:
+    """Return links and the shortest ones that join separate groups, sorted."""
     # scipy does not treat a zero as an edge; existing links already cost less than anything else.
     cost = distances - distances.min() + distances.max() + 1.0
     np.fill_diagonal(cost, 0)
@@ -171,6 +235,29 @@ def _nearest(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
     finite = np.isfinite(apart[rows, columns])
     links = np.sort(np.stack([rows[finite], columns[finite]], axis=1), axis=1)
     return np.unique(links, axis=0)
+
+
+def _share_that_follow(looks: FloatArray) -> float:
+    """Return the share of images that are among the most similar ones of the image before them; by chance few are."""
+    apart = looks.copy()
+    np.fill_diagonal(apart, np.inf)
+    following = np.diagonal(apart, offset=1)
+    return float(np.mean(np.count_nonzero(apart[:-1] < following[:, None], axis=1) < _WINDOW))
+
+
+def _choose(
+    chosen: NDArray[np.bool_], counts: NDArray[np.intp], looks: FloatArray, apart: FloatArray | None = None
+) -> None:
+    """Add to `chosen`, (N, N), for each image the nearest others that are not chosen, at most (N,) counts of them.
+
+    Of those at equal distances, or without distances, the ones that are least dissimilar come first.
+    """
+    free = np.where(chosen, np.inf, looks if apart is None else apart)
+    order = np.argsort(free, axis=1, kind="stable") if apart is None else np.lexsort((looks, free), axis=1)
+    order = order[:, : counts.max()]
+    taken = np.isfinite(np.take_along_axis(free, order, axis=1)) & (np.arange(order.shape[1]) < counts[:, None])
+    rows, columns = np.repeat(np.arange(len(free)), taken.sum(axis=1)), order[taken]
+    chosen[rows, columns] = chosen[columns, rows] = True
 
 
 def _squared_distances(places: FloatArray) -> FloatArray:

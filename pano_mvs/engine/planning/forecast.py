@@ -9,6 +9,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.unit_times import CaptureSize, ExpectedUnit, UnitTimes
 from pano_mvs.engine.planning.plan import StagePlan
 from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.stage import INDEX_PORT
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
@@ -79,6 +80,7 @@ def forecast(
         _of_stage(
             plan,
             workflow.stages[plan.name],
+            index=_index_of(plan.name, workflow, graph),
             axis=graph.axes[plan.name],
             after=tuple(sorted({edge.producer for edge in graph.edges[plan.name].values()})),
             size=size,
@@ -93,6 +95,7 @@ def _of_stage(
     plan: StagePlan,
     entry: StageEntry,
     *,
+    index: StageEntry | None,
     axis: Axis,
     after: tuple[str, ...],
     size: CaptureSize,
@@ -108,18 +111,34 @@ def _of_stage(
         plan.name,
         after,
         cached=len(plan.cached),
-        units=_units(plan, axis, size.images, histories=histories, settings=settings),
+        units=_units(plan, axis, size.images, index=index, histories=histories, settings=settings),
         unit_s=None if unit is None else unit.seconds,
         unit_bytes=None if unit is None else unit.stored_bytes,
     )
 
 
-def _units(plan: StagePlan, axis: Axis, images: int, *, histories: Sequence[UnitTimes], settings: str) -> int | None:
-    """Return the expected number of units to compute: as planned, or for an open stage as in earlier runs."""
+def _index_of(name: str, workflow: Workflow, graph: Graph) -> StageEntry | None:
+    """Return the stage that decides the units of another one; None if there is none."""
+    edge = graph.edges[name].get(INDEX_PORT)
+    return None if edge is None else workflow.stages[edge.producer]
+
+
+def _units(
+    plan: StagePlan,
+    axis: Axis,
+    images: int,
+    *,
+    index: StageEntry | None,
+    histories: Sequence[UnitTimes],
+    settings: str,
+) -> int | None:
+    """Return the expected number of units to compute: as planned, or for an open stage by its index or earlier runs."""
     if not plan.open:
         return len(plan.run) + len(plan.may_run)
     if axis is not Axis.PAIR:
         return images
+    if index is not None and index.spec.expected_units is not None:
+        return index.spec.expected_units(index.params, images)
     found = (history.expected_pairs(plan.use, images, settings=settings) for history in histories)
     return next((count for count in found if count is not None), None)
 

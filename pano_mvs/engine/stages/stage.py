@@ -49,6 +49,9 @@ ListItems = Callable[[Any], Iterable[SourceItem]]
 MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
 """Returns the bytes that a unit needs, given its params and its inputs by port ({"item": SourceItem} for a source)."""
 
+ExpectedUnits = Callable[[Any, int], int]
+"""Returns the number of units that an index is expected to hold, given its params and the number of images."""
+
 
 @dataclass(frozen=True, slots=True)
 class StageSpec:
@@ -69,6 +72,7 @@ class StageSpec:
         memory_needed: returns the memory that a unit needs, if it depends on settings and inputs.
         every_image: whether the stage has a unit for images without neighbours as well; see `stage`.
         needs: distributions that must be installed, by the module that each provides.
+        expected_units: of a stage that returns an index, for plans; None if only earlier runs show it.
     """
 
     name: str
@@ -85,6 +89,7 @@ class StageSpec:
     memory_needed: MemoryNeeded | None = None
     every_image: bool = False
     needs: Mapping[str, str] = field(default_factory=dict)
+    expected_units: ExpectedUnits | None = None
 
     @property
     def doc(self) -> str:
@@ -138,6 +143,7 @@ def stage(
     memory: str | int | MemoryNeeded = 0,
     every_image: bool = False,
     needs: Mapping[str, str] | None = None,
+    expected_units: ExpectedUnits | None = None,
 ) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
@@ -154,6 +160,9 @@ def stage(
     `needs` names what must be installed, as module to distribution, such as `{"cv2": "opencv-python-headless"}`. A
     workflow with the stage is refused before anything runs if one is missing.
 
+    `expected_units` is for a stage that returns an index, such as the pairs to match: a function `(params, images) ->
+    units` by which `plan` states the work of the stages that follow it, before the index exists.
+
     Raises:
         PluginError: if the function does not have the signature of a stage.
     """
@@ -163,7 +172,8 @@ def stage(
         spec = _spec(name, function, signature, version=version, memory=memory)
         if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
             raise PluginError(f"stage {name!r} ({spec.origin}): every_image needs ports annotated Each and Near")
-        setattr(function, _ATTRIBUTE, replace(spec, every_image=every_image, needs=dict(needs or {})))
+        spec = replace(spec, every_image=every_image, needs=dict(needs or {}), expected_units=expected_units)
+        setattr(function, _ATTRIBUTE, spec)
         return function
 
     return decorate

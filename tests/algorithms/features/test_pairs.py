@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import (
+    automatic_pairs,
     east_north_m,
     loop_closing_pairs,
+    most_pairs,
     nearest_links,
     position_pairs,
     retrieval_pairs,
 )
-from pano_mvs.algorithms.matching.pairs import sequential_pairs
+from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.errors import UsageError
@@ -224,3 +226,48 @@ def test_numbers_of_neighbours_are_checked(looks: dict[str, GlobalDescriptor]) -
     for wrong in calls:
         with pytest.raises(UsageError, match="at least 1"):
             wrong()
+
+
+def shuffled(looks: Mapping[str, GlobalDescriptor]) -> dict[str, GlobalDescriptor]:
+    return {name: looks[name] for name in np.random.default_rng(3).permutation(sorted(looks)).tolist()}
+
+
+def test_few_images_are_all_paired(looks: dict[str, GlobalDescriptor]) -> None:
+    pairs, reason = automatic_pairs(looks, {})
+    assert (set(pairs.pairs), reason) == (set(exhaustive_pairs(list(looks)).pairs), "")
+
+
+@pytest.mark.parametrize("candidates", [3, 10])
+def test_many_images_have_bounded_pairs_of_the_same_place(
+    walk: PathCapture, looks: dict[str, GlobalDescriptor], candidates: int
+) -> None:
+    pairs, reason = automatic_pairs(shuffled(looks), {}, candidates=candidates)
+    pairs.check()
+    assert groups(looks, pairs.pairs) == 1
+    assert len(pairs.pairs) <= most_pairs(len(looks), candidates) + len(looks) - 1
+    apart = [np.linalg.norm(walk.poses[a].center - walk.poses[b].center) for a, b in pairs.pairs]
+    assert np.mean(np.array(apart) < SIGHT) > 0.8  # by chance it would be 0.35
+    assert "order" not in reason
+
+
+def test_order_counts_where_images_look_like_those_before(looks: dict[str, GlobalDescriptor]) -> None:
+    pairs, reason = automatic_pairs(looks, {}, candidates=7)
+    assert set(sequential_pairs(list(looks), window=5).pairs) <= set(pairs.pairs)
+    assert reason.startswith("the next 5 in order")
+
+
+def test_positions_count_where_images_have_them(looks: dict[str, GlobalDescriptor]) -> None:
+    """Half of the images have positions, at random, so that nothing else would pair those that are nearest."""
+    rng = np.random.default_rng(4)
+    places = {name: rng.normal(size=2) for name in list(looks)[::2]}
+    pairs, reason = automatic_pairs(shuffled(looks), places, candidates=12)
+    nearest = position_pairs(list(places), places, neighbours=10).pairs
+    assert {frozenset(pair) for pair in nearest} <= {frozenset(pair) for pair in pairs.pairs}
+    assert f"positions of {len(places)}" in reason
+
+
+def test_of_images_at_one_place_the_similar_ones_are_paired(looks: dict[str, GlobalDescriptor]) -> None:
+    at_one_place = dict.fromkeys(looks, np.zeros(2))
+    mixed = shuffled(looks)
+    pairs, _ = automatic_pairs(mixed, at_one_place, candidates=10)
+    assert pairs.pairs == automatic_pairs(mixed, {}, candidates=10)[0].pairs

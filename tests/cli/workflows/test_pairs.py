@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -61,3 +62,27 @@ def test_pictures_without_positions_are_a_clear_error(pano_mvs: Command, capture
     assert outcome.code != 0
     assert "no image has a position" in outcome.flat
     assert "pairs.retrieval" in outcome.flat
+
+
+def test_pairs_are_bounded_by_themselves_and_the_plan_knows_how_many(pano_mvs: Command, capture: Path) -> None:
+    Path("pairs.yaml").write_text(
+        WORKFLOW.format(images=capture / "images", selector="auto, candidates: 1", looks=LOOKS, features="sift_tangent")
+    )
+    plan = pano_mvs("plan", "pairs.yaml", "--out", "out")
+    assert re.search(r"matches\W+matches.brute_force\W+about 4\b", plan.flat), plan.flat
+    outcome = pano_mvs("run", "pairs.yaml", "--out", "out", "--until", "matches")
+    assert "of the 6 pairs of 4 images are matched, at most 1 for each" in outcome.flat
+    found = run_json(Path("out"))["stages"]
+    assert next(stage for stage in found if stage["name"] == "matches")["run"] in (3, 4)
+
+
+def test_known_poses_choose_pairs(pano_mvs: Command, capture: Path) -> None:
+    """Poses from a file before the selector are positions, if there are too many images to match all pairs."""
+    text = WORKFLOW.format(
+        images=capture / "images", selector="auto, candidates: 1", looks=LOOKS, features="orb_tangent"
+    )
+    known = f"  known:    {{use: poses.from_model, path: {capture / 'truth' / 'poses.json'}}}\n"
+    Path("pairs.yaml").write_text(text.replace("  pairs:", known + "  pairs:"))
+    outcome = pano_mvs("run", "pairs.yaml", "--out", "out", "--until", "pairs")
+    assert outcome.code == 0, outcome.text
+    assert "nearest by the positions of 4" in outcome.flat
