@@ -100,11 +100,16 @@ def ran(result: RunResult) -> dict[str, int]:
 
 @pytest.fixture
 def toy(tmp_path: Path) -> Toy:
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "plug.py").write_text(PLUGIN)
-    (tmp_path / "helper.py").write_text(HELPER)
-    (tmp_path / "wf.yaml").write_text(WORKFLOW)
-    made = Toy(tmp_path)
+    return toy_in(tmp_path)
+
+
+def toy_in(folder: Path) -> Toy:
+    """Write a toy capture into a folder."""
+    (folder / "capture").mkdir()
+    (folder / "plug.py").write_text(PLUGIN)
+    (folder / "helper.py").write_text(HELPER)
+    (folder / "wf.yaml").write_text(WORKFLOW)
+    made = Toy(folder)
     for number in range(1, 6):
         made.number(f"{number}.txt", str(10 * number))
     return made

@@ -70,6 +70,36 @@ def collect(
     collect_cache(open_cache(cache), Console(), delete=delete, unused=unused, older_than=older_than)
 
 
+@cache_app.command("push")
+@guarded
+def push(
+    url: Annotated[str, typer.Argument(help="Folder, or URL such as s3://bucket/cache or ssh://host/folder.")],
+    cache: CacheOption = None,
+) -> None:
+    """Copy results to another place, from which `cache pull` fetches them; what is there is not copied again.
+
+    Every file is checked against its digest first.
+    """
+    from pano_mvs.cli.cache.command import open_cache, push_cache
+
+    push_cache(open_cache(cache), Console(), url)
+
+
+@cache_app.command("pull")
+@guarded
+def pull(
+    url: Annotated[str, typer.Argument(help="Folder or URL that `cache push` has written.")],
+    cache: CacheOption = None,
+) -> None:
+    """Copy results from another place into the cache, so that a run of the same images goes on with them.
+
+    Every file is checked against its digest; damaged ones are refused.
+    """
+    from pano_mvs.cli.cache.command import cache_root, pull_cache
+
+    pull_cache(cache_root(cache), Console(), url)
+
+
 @cache_app.command("pin")
 @guarded
 def pin(

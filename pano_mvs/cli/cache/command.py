@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.maintenance import GarbageCollection, collect, size_on_disk, usage_of, verify
+from pano_mvs.engine.cache.remote import Copied, RemoteCache
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.results.summary import CACHE_VARIABLE
 
@@ -27,14 +31,50 @@ _UNPROVEN = (
 )
 
 
+def cache_root(cache: Path | None) -> Path:
+    """Return the folder given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder."""
+    variable = os.environ.get(CACHE_VARIABLE)
+    return cache or (Path(variable) if variable else Path(".pano-mvs"))
+
+
+def push_cache(store: Store, console: Console, url: str) -> None:
+    """Copy what a remote cache lacks to it."""
+    with _copying(console) as progress:
+        copied = RemoteCache(url).push(store, progress)
+    _print_copied(copied, url, console)
+
+
+def pull_cache(root: Path, console: Console, url: str) -> None:
+    """Copy what a cache, which need not exist yet, lacks from a remote one."""
+    remote = RemoteCache(url)
+    with _copying(console) as progress:
+        copied = remote.pull(Store(root), progress)
+    _print_copied(copied, str(root), console)
+
+
+@contextmanager
+def _copying(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar, and yield what moves it."""
+    columns = TextColumn("copying"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bars:
+        bar = bars.add_task("copying", total=None)
+        yield lambda done, total: bars.update(bar, completed=done, total=total)
+
+
+def _print_copied(copied: Copied, to: str, console: Console) -> None:
+    files = f"{copied.files} {plural(copied.files, 'file')}, {size_text(copied.size_bytes)}"
+    console.print(
+        f"copied to {escape(to)}: {files}; {copied.present} were there already", highlight=False, soft_wrap=True
+    )
+
+
 def open_cache(cache: Path | None) -> Store:
     """Open the cache given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
 
     Raises:
         UsageError: if there is none.
     """
-    variable = os.environ.get(CACHE_VARIABLE)
-    root = cache or (Path(variable) if variable else Path(".pano-mvs"))
+    root = cache_root(cache)
     if not is_file(root / "layout.json"):
         if is_denied(root / "layout.json"):
             raise UsageError(f"{root}: this folder cannot be listed (permission denied). Correct its permissions")

@@ -241,6 +241,18 @@ class Packs:
         return True
 
 
+def values_of(pack: Path, index: Path) -> Iterator[Packed]:
+    """Return the values of a pack by an index, which may be in another place.
+
+    Raises:
+        ValueError: if the index is damaged.
+    """
+    entries = _read_index(index)
+    if entries is None:
+        raise ValueError(f"{index} is damaged")
+    return _values(pack, entries)
+
+
 def _values(pack: Path, entries: NDArray[Any]) -> Iterator[Packed]:
     for high, low, offset, size, time_s, kind in entries.tolist():
         yield Packed(pack, offset, size, f"{high:016x}{low:016x}", _KINDS[kind], time_s)
