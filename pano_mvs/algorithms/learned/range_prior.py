@@ -115,14 +115,14 @@ def fill_from_prior(
         return range_map, float("inf")
     errors, constants = [], []
     for part, other in zip(parts, reversed(parts), strict=True):
-        aligned = _aligned(range_map, guide, prior, np.where(other, weight, 0), output=output).range[part]
+        aligned = _aligned(range_map, guide, prior, weight=np.where(other, weight, 0), output=output).range[part]
         error = np.abs(np.log(aligned / range_map.range[part]))
         errors.append(np.where(np.isfinite(error), error, np.inf))
         constants.append(np.abs(np.log(range_map.range[part] / np.median(range_map.range[other]))))
     error, constant = (_NORMAL * float(np.median(np.concatenate(each))) for each in (errors, constants))
     if not error < constant:
         return range_map, float("inf")
-    laid = _aligned(range_map, guide, prior, np.where(known, weight, 0), output=output)
+    laid = _aligned(range_map, guide, prior, weight=np.where(known, weight, 0), output=output)
     filled = laid.valid & (range_map.confidence < FILLED_CONFIDENCE[1]) & (True if valid is None else valid)
     result = with_ranges(
         range_map,
@@ -137,7 +137,7 @@ def fill_from_prior(
 
 
 def _aligned(
-    range_map: RangeMap, guide: NDArray[np.uint8], prior: NDArray[np.float32], weight: FloatArray, *, output: Output
+    range_map: RangeMap, guide: NDArray[np.uint8], prior: NDArray[np.float32], *, weight: FloatArray, output: Output
 ) -> RangeMap:
     """Return the ranges of a network after alignment to the pixels with a weight; confidences are those of a fill."""
     known = weight > 0
