@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sharp_scale import sharp_halvings
+from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.scene import Record
 from pano_mvs.testing.scenes import window_room

@@ -155,5 +155,5 @@ def test_exempt_functions_are_recognised() -> None:
     (command,) = functions_of("algorithms/sweep/sweep.py", source)
     assert command.decorators == {"guarded", "command"}
     assert not command.is_compiled
-    for module in ("algorithms/sweep/numba/tiles.py", "geometry/kernels_sphere.py"):
+    for module in ("algorithms/sweep/numba/arguments.py", "geometry/kernels_sphere.py"):
         assert [one.is_compiled for one in functions_of(module, source)] == [True]

@@ -15,8 +15,7 @@ def sharpness(picture: NDArray[np.uint8]) -> float:
     Only a band of 45° around the equator is used: rows near the poles are stretched, and show tripods and sky. The
     division makes frames with different exposure comparable. Only frames of the same scene are comparable.
 
-    Args:
-        picture: (H, W, 3) uint8, in any order of the channels; the seam wraps.
+    `picture`: (H, W, 3) uint8, in any order of the channels; the seam wraps.
 
     Returns:
         A number that is 0 for an image without structure, and decreases with motion blur and defocus.

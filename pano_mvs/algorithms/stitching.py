@@ -1,4 +1,4 @@
-"""Stitch the pictures of two calibrated fisheye lenses to an equirectangular panorama."""
+"""Pictures of two-lens cameras: recognise raw recordings, and stitch calibrated fisheye pictures to a panorama."""
 
 from __future__ import annotations
 
@@ -13,6 +13,30 @@ from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, ray_from_pixel
 
+_SIZE_HW = (128, 256)
+_DARK, _BRIGHT = 24, 40
+_MIN_DARK_SHARE = 0.97
+
+
+def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
+    """Return whether an image with aspect ratio 2:1 shows two fisheye circles side by side instead of a panorama.
+
+    Such an image is black outside of the two circles, at the top and the bottom, but not inside of them. In a panorama,
+    the same areas are bands around the seam and the middle from pole to pole, and contain sky and floor.
+
+    `picture`: (H, 2 H, 3) uint8.
+    """
+    grey = cv2.cvtColor(cv2.resize(picture, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
+    rows, columns = np.mgrid[: _SIZE_HW[0], : _SIZE_HW[0]]
+    radius = np.hypot(rows + 0.5 - _SIZE_HW[0] / 2, columns + 0.5 - _SIZE_HW[0] / 2) / (_SIZE_HW[0] / 2)
+    inside, outside = np.tile(radius < 0.9, 2), np.tile(radius > 1.1, 2)
+    upper, lower = outside.copy(), outside.copy()
+    upper[_SIZE_HW[0] // 2 :] = lower[: _SIZE_HW[0] // 2] = False
+    dark = grey < _DARK
+    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _MIN_DARK_SHARE
+    return bool(is_dark_around and np.median(grey[inside]) > _BRIGHT)
+
+
 # Pictures with more pixels per radian than this times those of the panorama are reduced first, against aliasing.
 _MAX_DENSITY = 1.25
 
@@ -26,11 +50,8 @@ def stitch_lenses(
     is where both lenses see equally far inside their fields of view. In a strip around it, as wide as `blend_deg` of
     the rig, their pictures are mixed.
 
-    Args:
-        pictures: the picture of each lens, (H, W, 3) uint8.
-        rig: the rig.
-        size_hw: (height, width) of the panorama.
-        threads: number of threads.
+    `pictures`: the picture of each lens, (H, W, 3) uint8. `rig`: the rig. `size_hw`: (height, width) of the panorama.
+    `threads`: number of threads.
 
     Returns:
         (H, W, 3) uint8, black where no lens sees, and (H, W) bool, False there.
@@ -66,9 +87,8 @@ def stitch_lenses(
 def lens_weights(margins_rad: FloatArray, *, blend_rad: float) -> FloatArray:
     """Return the weight of each lens, (..., 2): they sum to 1 where a lens sees, and are 0 elsewhere.
 
-    Args:
-        margins_rad: (..., 2) angle by which the direction is inside of each field of view, −inf if it is not seen.
-        blend_rad: width of the strip around the seam in which both weights are positive.
+    `margins_rad`: (..., 2) angle by which the direction is inside of each field of view, −inf if it is not seen.
+    `blend_rad`: width of the strip around the seam in which both weights are positive.
     """
     seen = np.isfinite(margins_rad)
     first, second = np.moveaxis(np.where(seen, margins_rad, 0.0), -1, 0)

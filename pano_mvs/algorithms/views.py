@@ -42,7 +42,6 @@ def select_views(
 
     Args:
         poses: of all registered images, with or without points.
-        sources: maximum number of sources of a reference.
         min_angle_deg: points seen under a smaller angle from the two centres are ignored.
         max_angle_deg: points seen under a larger angle are ignored.
 

@@ -12,7 +12,7 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
 
 from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
-from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
+from pano_mvs.algorithms.sweep.costs import register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.algorithms.sweep.winner import Winners

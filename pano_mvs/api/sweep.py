@@ -7,18 +7,16 @@ hypotheses, windows and constants of the costs.
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
-from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
-from pano_mvs.algorithms.sweep.costs.kernels_constants import (
+from pano_mvs.algorithms.sweep.costs import census_weight, register_sweep_cost
+from pano_mvs.algorithms.sweep.edge_support import average_volume
+from pano_mvs.algorithms.sweep.kernels_constants import (
     GREY_WEIGHT,
     MAX_COLOR_COST,
     MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
 )
-from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
-from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.preparation import SweepInput, source_weights
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 

@@ -13,8 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.rendering.cloud import draw_cloud
-from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, inside_camera, viewpoints
+from pano_mvs.algorithms.rendering import Viewpoint, draw_cloud, inside_camera, viewpoints
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.rendering.viewpoints import horizontal_axes
+from pano_mvs.algorithms.rendering import horizontal_axes
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.records import PosesSummary

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, facing
+from pano_mvs.algorithms.rendering import Viewpoint, facing
 
 _PAPER = (238, 241, 244)
 _ARRAYS = ("points", "normals", "colors")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.floor_plan.storeys import find_storeys
+from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.upright import world_up, z_up_from_world
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pano_mvs.algorithms.filters.view_doubts import Agreement, view_doubts
+from pano_mvs.algorithms.filters.consistency import Agreement, view_doubts
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.session.final_stages import chain_of, latest

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
-from pano_mvs.algorithms.filters.confidence import require_confidence
 from pano_mvs.algorithms.filters.consistency import checked_with_agreement
+from pano_mvs.algorithms.filters.data_term import require_confidence
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
-from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
-from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
-from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.patchmatch.free_space import respect_free_space
-from pano_mvs.algorithms.sharp_scale import sharp_halvings
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.patchmatch.exchange import respect_free_space
+from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group

@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
-from pano_mvs.algorithms.fusion.settings import FusionSettings
-from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.algorithms.photograph_colors import PhotographColors, PhotographColorSettings
+from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
+from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.api import (
     All,

@@ -8,10 +8,8 @@ from pydantic import Field
 
 from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges
 from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.patchmatch.second_round import refine_plain_surfaces
-from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
-from pano_mvs.algorithms.plain_scale import coarser_levels
-from pano_mvs.algorithms.sharp_scale import sharp_halvings
+from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale, refine_plain_surfaces
+from pano_mvs.algorithms.scales import coarser_levels, sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.stages.memory import bytes_per_pixel

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pano_mvs.algorithms.points.samples import sample_surface
-from pano_mvs.algorithms.points.tracking import track_points
+from pano_mvs.algorithms.points.tracking import sample_surface, track_points
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, Poses, RangeMap, arguments_from, params_from, stage
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from pydantic import Field
 
-from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.sky import MAX_SOURCES, sky_pixels
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
+from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures

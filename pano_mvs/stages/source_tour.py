@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pano_mvs.algorithms.faces.cube import panorama_from_cube
+from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.images.tours import FACES, list_scenes
 from pano_mvs.scene.image_files.image_file import decode_image, write_png

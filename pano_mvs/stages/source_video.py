@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
-from pano_mvs.algorithms.keyframes import parallax, selection
-from pano_mvs.algorithms.keyframes.parallax import REDUCED_HW, reduced_grey
-from pano_mvs.algorithms.keyframes.selection import KeyframeSettings, SmallFrame, select_keyframes
+from pano_mvs.algorithms import keyframes
+from pano_mvs.algorithms.keyframes import REDUCED_HW, KeyframeSettings, SmallFrame, reduced_grey, select_keyframes
 from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.paths import is_folder
@@ -205,9 +204,9 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
     """
     settings = KeyframeSettings(params.motion_deg, params.min_s, params.max_s)
     usable = _usable(path, info, params)
-    code = [digest_from_file(Path(str(module.__file__))) for module in (parallax, selection)]
+    code = digest_from_file(Path(str(keyframes.__file__)))
     known = keyframe_file(
-        path, [*vars(settings).values(), params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, *code]
+        path, [*vars(settings).values(), params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, code]
     )
     times = read_times(known)
     if times is None:

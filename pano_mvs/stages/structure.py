@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from pano_mvs.algorithms.learned.networks import Provider, open_network
 from pano_mvs.algorithms.learned.range_prior import fill_from_prior, network_values
 from pano_mvs.algorithms.structure.lay import lay_structure
-from pano_mvs.algorithms.structure.structure import find_structure
+from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.api import (
     All,
     Context,

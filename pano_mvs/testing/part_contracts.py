@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS
-from pano_mvs.algorithms.sweep.costs.cost import SweepCost, checked_cost
-from pano_mvs.algorithms.sweep.costs.registry import BUILTIN, SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs import BUILTIN, SWEEP_COSTS, SweepCost, checked_cost
 from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.stages.registry import Registry

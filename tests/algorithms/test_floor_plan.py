@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, WallCells
-from pano_mvs.algorithms.floor_plan.storeys import Storey, find_storeys
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, Storey, WallCells, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import Walls, wall_lines
 from tests.algorithms.floor_plan_rooms import HEIGHT, L_SHAPE, RoomCloud, room_cloud, walls_of
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.free_space import respect_free_space
+from pano_mvs.algorithms.patchmatch.exchange import respect_free_space
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room

@@ -35,7 +35,7 @@ def test_every_kernel_module_has_a_test_and_no_marker_names_another() -> None:
     for path in TESTS.rglob("test_*.py"):
         for module in marked_modules(path.read_text(encoding="utf-8")):
             files_by_module[module].append(path.name)
-    assert len(kernels) > 30
+    assert len(kernels) > 20
     assert sorted(kernels - set(files_by_module)) == [], "no test compares these with a plain counterpart"
     assert sorted(set(files_by_module) - kernels) == [], "there are no such kernel modules"
 

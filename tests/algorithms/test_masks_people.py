@@ -12,11 +12,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
-from pano_mvs.algorithms.masks import person_network
+from pano_mvs.algorithms.masks import person_views
 from pano_mvs.algorithms.masks.areas import dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.people import people
-from pano_mvs.algorithms.masks.person_network import SIDE_PX, person_presence, person_probability
-from pano_mvs.algorithms.masks.person_views import SeenPanorama, rolled, stereographic_look
+from pano_mvs.algorithms.masks.person_views import (
+    SIDE_PX,
+    SeenPanorama,
+    person_presence,
+    person_probability,
+    rolled,
+    stereographic_look,
+)
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.testing.persons import Drawn, draw_people, person
@@ -120,7 +126,7 @@ def test_wrong_arrays_are_refused(wrong: NDArray[np.uint8]) -> None:
 
 
 def test_a_damaged_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(person_network, "_POSE", (person_network._POSE[0], "another digest"))
+    monkeypatch.setattr(person_views, "_POSE", (person_views._POSE[0], "another digest"))
     with pytest.raises(StoreError, match=r"pose_landmark_lite.*Install pano-mvs again"):
         person_presence(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
 

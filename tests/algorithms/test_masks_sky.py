@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, share_of_sphere
-from pano_mvs.algorithms.masks.sky import confirmed_parts, sky_pixels
-from pano_mvs.algorithms.masks.sky_colors import sharpened_sky, sky_colors
+from pano_mvs.algorithms.masks.sky import confirmed_parts, sharpened_sky, sky_colors, sky_pixels
 from pano_mvs.algorithms.masks.sky_comparison import compare_with_source, errors_of_area
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama, rotation_from_rotvec
@@ -174,19 +173,11 @@ def test_masked_pixels_are_not_sky(blue: Views) -> None:
 def test_the_sky_rolls_with_the_picture(blue: Views) -> None:
     pictures, ranges, poses = blue
     picture, turn = roll_panorama(pictures[0], 37)
-    rolled = (
-        [picture, *pictures[1:]],
-        ranges,
-        [Rigid3(turn, np.zeros(3)) @ poses[0], *poses[1:]],
-    )
+    rolled = ([picture, *pictures[1:]], ranges, [Rigid3(turn, np.zeros(3)) @ poses[0], *poses[1:]])
     known = measured(ranges[0])
     moved = RangeMap(np.roll(known.range, 37, axis=1), np.roll(known.confidence, 37, axis=1))
     straight, back = found_in(blue), np.roll(found_in(rolled, range_map=moved), -37, axis=1)
     assert (straight != back).mean() < 0.01
-
-
-def test_the_same_input_gives_the_same_sky(blue: Views) -> None:
-    assert np.array_equal(found_in(blue), found_in(blue))
 
 
 def test_sizes_must_agree(blue: Views) -> None:

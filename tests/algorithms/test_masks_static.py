@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.frame_agreement import color_difference, evenly_spread_pairs, frame_agreement
-from pano_mvs.algorithms.masks.static_content import MIN_VIEWS, reduced_to_width, static_content
+from pano_mvs.algorithms.masks.static_content import (
+    MIN_VIEWS,
+    color_difference,
+    evenly_spread_pairs,
+    frame_agreement,
+    reduced_to_width,
+    static_content,
+)
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle
 from pano_mvs.testing.rig import RIGS, with_rig

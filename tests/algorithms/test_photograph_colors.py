@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.fuse import join_clouds
-from pano_mvs.algorithms.photograph_colors import PhotographColors, PhotographColorSettings
+from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.photograph_undistortion import undistorted_photograph
+from pano_mvs.algorithms.photographs import undistorted_photograph
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room

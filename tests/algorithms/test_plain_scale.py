@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
-from pano_mvs.algorithms.plain_scale import coarser_levels, ranges_of_levels, with_coarser, without_detail
-from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, reduced_range_map
+from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale
+from pano_mvs.algorithms.scales import (
+    coarser_levels,
+    enlarged_range_map,
+    ranges_of_levels,
+    reduced,
+    reduced_range_map,
+    with_coarser,
+    without_detail,
+)
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.scenes import weak_room
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.patchmatch.second_round import plain_and_changed, refine_plain_surfaces
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.patchmatch.sharp_refine import refine_at_scale
-from pano_mvs.algorithms.sharp_scale import enlarged_range_map, reduced, reduced_range_map, sharp_halvings
+from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale
+from pano_mvs.algorithms.scales import enlarged_range_map, reduced, reduced_range_map, sharp_halvings
 from pano_mvs.geometry import Rigid3, pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room

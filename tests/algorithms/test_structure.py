@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.structure.lay import lay_structure
-from pano_mvs.algorithms.structure.structure import find_structure
+from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap

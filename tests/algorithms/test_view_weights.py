@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.patchmatch.view_weights import ViewWeights
+from pano_mvs.algorithms.patchmatch.refine import ViewWeights, refine_range
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from pano_mvs.algorithms.filters import bilateral_solver as solver
-from pano_mvs.algorithms.filters.confidence import confidence_weight
-from pano_mvs.algorithms.filters.sphere.cells import sphere_cells
+from pano_mvs.algorithms.filters.bilateral_solver import sphere_cells
+from pano_mvs.algorithms.filters.data_term import confidence_weight
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.mesh.decimate import decimated
+from pano_mvs.algorithms.mesh.surface import Mesh, decimated
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
-from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.evaluation.meshes.held_out import HeldOutScores, held_out_scores
 from pano_mvs.scene import PointCloud, RangeMap

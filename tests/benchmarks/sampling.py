@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.numba.packing import pack_colors
+from pano_mvs.algorithms.sweep.numba.arguments import pack_colors
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, sample_rgb_block
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 

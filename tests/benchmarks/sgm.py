@@ -13,7 +13,7 @@ from functools import partial
 import numba
 import numpy as np
 
-from pano_mvs.algorithms.sweep.backends.compiled_aggregation import winners_by_paths
+from pano_mvs.algorithms.sweep.backends.numba_backend import winners_by_paths
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from tests.benchmarks.sampling import cpu_seconds

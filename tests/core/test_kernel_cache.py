@@ -48,7 +48,7 @@ assert config.CACHE_DIR == str(kernel_cache_folder())
 """
 KERNELS = {
     "geometry.kernels_sphere": ("wrapped_row", "wrapped_row(-1, 4)"),
-    "algorithms.filters.kernels_components": (
+    "algorithms.filters.kernels_fill": (
         "label_surfaces",
         "import numpy; label_surfaces(numpy.ones((8, 16), numpy.float32), 1.0)",
     ),
@@ -71,7 +71,7 @@ def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, firs
 
 COMPILE = """
 import numpy
-from pano_mvs.algorithms.filters.kernels_components import label_surfaces
+from pano_mvs.algorithms.filters.kernels_fill import label_surfaces
 from pano_mvs.core.kernel_cache import compilation_time, count_compiled
 print("ready", flush=True)
 label_surfaces(numpy.ones((8, 16), numpy.float32), 1.0)

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.mesh.atlas import unwrapped
+from pano_mvs.algorithms.mesh.surface import Mesh
 from pano_mvs.algorithms.mesh.texture import balanced_views, textured
-from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.algorithms.mesh.view_quality import PaintView
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.meshes.held_out import held_out_scores, rendered_panorama

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.cells import SphereCells
+from pano_mvs.algorithms.filters.bilateral_solver import SphereCells
 
 
 def corner_weights(cells: SphereCells, row: int, column: int) -> NDArray[np.float64]:

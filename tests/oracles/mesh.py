@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.mesh.atlas import Texels
-from pano_mvs.algorithms.mesh.kernels_texture import MIN_COSINE, RANGE_TOLERANCE, SLOPE_PX
+from pano_mvs.algorithms.mesh.kernels_mesh import MIN_COSINE, RANGE_TOLERANCE, SLOPE_PX
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
 
 FloatArray = NDArray[np.float64]

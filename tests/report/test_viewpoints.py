@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.rendering.cloud import draw_cloud
-from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, facing, horizontal_axes, inside_camera, viewpoints
+from pano_mvs.algorithms.rendering import Viewpoint, draw_cloud, facing, horizontal_axes, inside_camera, viewpoints
 
 UP = np.array([0.0, -1.0, 0.0])
 SIZE_HW = (60, 96)

@@ -13,8 +13,7 @@ import pytest
 import trimesh
 
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
-from pano_mvs.algorithms.fusion.settings import FusionSettings
-from pano_mvs.algorithms.fusion.view import FusionView
+from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
 from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_files.image_file import write_png

@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from pano_mvs.algorithms.faces.levelled import Facing, level_from_world, turned_panorama
+from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import Context, Pose, Poses, RangeMap
 from pano_mvs.geometry import Rigid3, ray_from_pixel, ray_grid, rotate_panorama, rotation_from_rotvec
 from pano_mvs.io.images.containers import read_container

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
-from pano_mvs.algorithms.faces.pictures import face_image
+from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.faces.cube import CUBE
+from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.keyframes.selection import select_keyframes
+from pano_mvs.algorithms.keyframes import select_keyframes
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.io.images.video import describe_video, frames_between

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.icosahedron import face_corners
+from pano_mvs.algorithms.faces.layout import face_corners
 from pano_mvs.geometry import pad_panorama, pixel_from_ray
 
 FloatArray = NDArray[np.float64]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.icosahedron import beyond_face_rad, tangent_tiles
+from pano_mvs.algorithms.faces.layout import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.tile_sampling import owned_pixels, sample_tile

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.icosahedron import beyond_face_rad, tangent_tiles
+from pano_mvs.algorithms.faces.layout import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty
-from pano_mvs.algorithms.filters.view_doubts import Agreement
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
@@ -19,6 +18,85 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+
+_NEIGHBOURS = 4
+# Relative to the agreement of its neighbours. Cameras with true poses had 0.64 or more (rendered and synthetic rooms,
+# including plain ones; 4 to 9 views, 2 to 8 sources), lowest at the edge of a capture; cameras half a metre off had at
+# most 0.47.
+_MIN_SHARE_OF_NEIGHBOURS = 0.55
+# Cameras with true poses had at most 0.62, cameras half a metre off 0.63 or more. This is not sufficient alone: it
+# excludes views that agree little because their errors scatter.
+_MIN_ONE_WAY = 0.55
+# If neighbours agree with no view either, or little can be compared, nothing can be concluded.
+_MIN_AGREED, _MIN_COMPARED = 0.1, 0.2
+_MIN_VIEWS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Agreement of a view's sources with its ranges, by solid angle.
+
+    `compared`: share of the sphere with a range that at least one source can compare with its own. `agreed`: share of
+    that with which at least one source agrees. `seen_through`: share of that with which no source agrees and behind
+    which at least three quarters of the comparing sources, and at least two, see something farther away. `hidden`:
+    likewise with something nearer, which occludes it.
+    """
+
+    compared: float
+    agreed: float
+    seen_through: float
+    hidden: float
+
+    @property
+    def one_way(self) -> float:
+        """The share that the sources contradict unanimously in one direction."""
+        return self.seen_through + self.hidden
+
+
+def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArray[np.float64]]) -> dict[str, str]:
+    """Return the views with doubtful poses, with the reason.
+
+    A view is doubtful if its sources agree with a much smaller share of its ranges than is usual for the views around
+    it, and if they contradict most of the rest in one direction. Matching errors scatter; a wrong pose moves
+    everything.
+
+    `agreements`: view name to agreement. `centers`: (3,) camera centres of the views of one world frame; views without
+    one are not judged.
+    """
+    names = [name for name in agreements if name in centers and agreements[name].compared >= _MIN_COMPARED]
+    if len(names) < _MIN_VIEWS:
+        return {}
+    places = np.array([centers[name] for name in names])
+    agreed = np.array([agreements[name].agreed for name in names])
+    doubts = {}
+    for idx, (name, around) in enumerate(zip(names, nearest_views(places), strict=True)):
+        usual = float(np.median(agreed[around]))
+        one_way = agreements[name].one_way
+        if usual >= _MIN_AGREED and agreed[idx] < _MIN_SHARE_OF_NEIGHBOURS * usual and one_way >= _MIN_ONE_WAY:
+            doubts[name] = (
+                f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: {100 * usual:.0f} "
+                f"%) and contradict {100 * one_way:.0f} % in one direction"
+            )
+    return doubts
+
+
+def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
+    """Yield for each view the indices of the four nearest other views, nearest first; ties in their order.
+
+    `places`: (N, 3) camera centres, at least two.
+    """
+    from scipy.spatial import cKDTree
+
+    count = min(_NEIGHBOURS, len(places) - 1)
+    tree = cKDTree(places)
+    # The view itself is among the results, unless more than `count` others coincide with it.
+    farthest = np.asarray(tree.query(places, k=count + 1)[0])[:, -1]
+    for idx, place in enumerate(places):
+        # Slightly more than the distance of the last one, so that rounding does not exclude ones at the same distance.
+        within = np.array(sorted(tree.query_ball_point(place, farthest[idx] * (1 + 1e-9))), np.int64)
+        within = within[within != idx]
+        yield within[np.argsort(np.linalg.norm(places[within] - place, axis=1), kind="stable")[:count]]
+
 
 # Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
@@ -95,18 +173,9 @@ def checked_with_agreement(
         reference_pose: its cam_from_world.
         sources: range maps, (H', W') each, in any order: the result does not depend on it.
         source_poses: cam_from_world of each.
-        max_relative_error: largest |s − |X'|| / |X'|.
-        max_reprojection_px: largest angle between pixel and reprojection, in pixels of the reference at the equator.
         max_reprojection_deg: the same in degrees; the larger of the two counts. Poses, stitching and soft panoramas
             limit the accuracy of matches to an angle, so that a limit in pixels alone confirms less the more pixels
             there are. 0.35° is a pixel at 1024 columns.
-        min_support: smallest S; one source supports a pixel with at most 1, and with 0.85 at 0.28 times the maximum
-            reprojection error.
-        min_motion_px: smallest μ, in pixels of the reference at the equator.
-        min_views: number of sources that must agree.
-        remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` sources
-            contradict.
-        min_contradictions: number of sources that must contradict; at most the number of sources.
 
     Returns:
         The checked range map with the uncertainty of its ranges (`confirmed_uncertainty`), and the agreement of the
@@ -185,16 +254,13 @@ def compare_with_sources(
 ) -> Comparison:
     """Return the agreement of the sources with ranges of the reference, as in `checked_with_agreement`.
 
-    Args:
-        ranges: (H, W) float32, NaN is left out.
-        sources: range maps; filled pixels are left out.
-        source_from_reference: pose of each.
-        max_relative_error: largest relative difference of ranges that agree.
-        max_angle: largest angle between pixel and reprojection, in radians.
+    `ranges`: (H, W) float32, NaN is left out. `sources`: range maps; filled pixels are left out.
+    `source_from_reference`: pose of each. `max_relative_error`: largest relative difference of ranges that agree.
+    `max_angle`: largest angle between pixel and reprojection, in radians.
     """
     import numba  # slow to import
 
-    from pano_mvs.algorithms.filters.kernels_reprojection import compare_rows  # compiles on import
+    from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows  # compiles on import
 
     shape = ranges.shape
     comparison = Comparison(
@@ -232,15 +298,12 @@ def agreeing_sources(
 ) -> NDArray[np.uint8]:
     """Return the number of sources that agree with each point, (N,), as in `compare_with_sources`.
 
-    Args:
-        points: (N, 3) in the reference frame.
-        sources: ranges (H, W) that were seen, NaN is left out; see `seen_ranges`.
-        source_from_reference: pose of each.
-        max_relative_error: largest relative difference of ranges that agree.
-        max_angle: largest angle between pixel and reprojection, in radians.
-        most: as many sources are enough; more are not counted.
+    `points`: (N, 3) in the reference frame. `sources`: ranges (H, W) that were seen, NaN is left out; see
+    `seen_ranges`. `source_from_reference`: pose of each. `max_relative_error`: largest relative difference of ranges
+    that agree. `max_angle`: largest angle between pixel and reprojection, in radians. `most`: as many sources are
+    enough; more are not counted.
     """
-    from pano_mvs.algorithms.filters.kernels_reprojection import count_agreeing  # compiles on import
+    from pano_mvs.algorithms.ranges.kernels_agreement import count_agreeing  # compiles on import
 
     agreeing = np.zeros(len(points), np.uint8)
     limits = max_relative_error, max_angle, _MAX_SURFACE_STEP

@@ -12,10 +12,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.data_term import data_term, require_guide
-from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.algorithms.filters.settings import Domain
-from pano_mvs.algorithms.filters.sphere.box import box_spread, box_sum
+from pano_mvs.algorithms.filters.data_term import Domain, data_term, require_guide
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.sphere_windows import box_spread, box_sum
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -45,11 +44,6 @@ def guided_range(
     Args:
         range_map: (H, W) with even W, the full sphere.
         guide: (H, W, 3) RGB panorama.
-        radius: radius of the windows, in pixels at the equator.
-        epsilon: ε in grey levels: smaller contrasts are smoothed, larger ones are preserved as edges.
-        domain: quantity that is linear in the colours: "inverse" (1/range) or "range".
-        fill: whether invalid pixels within reach of a window with data get a range (confidence 1–63); else they stay
-            invalid.
 
     Raises:
         UsageError: if guide and range map differ in size, or a setting is out of bounds.
@@ -78,12 +72,8 @@ def guided_values(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the filtered values and the mean weight within reach, (H, W) each; there is no value if the weight is 0.
 
-    Args:
-        target: (H, W) values, any finite value where the weight is 0.
-        weight: (H, W) in [0, 1].
-        guide: (H, W, 3) colours.
-        radius: radius of the windows.
-        epsilon: ε.
+    `target`: (H, W) values, any finite value where the weight is 0. `weight`: (H, W) in [0, 1]. `guide`: (H, W, 3)
+    colours. `radius`: radius of the windows. `epsilon`: ε.
     """
     # Colours centred on the middle of their scale lose no digits in the differences of sums below.
     colors = guide - 128.0

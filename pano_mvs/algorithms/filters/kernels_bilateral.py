@@ -60,7 +60,7 @@ def _find_or_add(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int,
     return count
 
 
-@kernel
+@inlined
 def _bits_for(count: int) -> int:
     """Return the size of a table, as a power of two, that stays at most half full."""
     bits = 4

@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.channels import largest_channel
-from pano_mvs.algorithms.filters.data_term import require_guide
-from pano_mvs.algorithms.filters.holes import large_holes
-from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.algorithms.filters.settings import MaxHoleDeg
+from pano_mvs.algorithms.filters.data_term import MaxHoleDeg, require_guide
+from pano_mvs.algorithms.filters.fill import large_holes
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.sphere_windows import largest_channel
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
@@ -83,14 +82,6 @@ def lay_planes(
         range_map: (H, W) with even W, the full sphere.
         guide: (H, W, 3) RGB panorama.
         rng: draws the hypotheses.
-        contrast: maximum difference in grey levels between the darkest and the brightest pixel around a pixel of a
-            plain surface.
-        min_area_deg2: minimum area of a part, in square degrees; smaller ones are unchanged.
-        max_relative_error: maximum relative difference of pixels on the plane.
-        min_share: minimum share of reliable pixels on the plane, by solid angle.
-        parallel_share: share of reliable pixels on a plane below which a parallel one is preferred; 0: never.
-        min_confidence: minimum confidence of reliable pixels; 128 is consistent.
-        max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`): a sky is not a wall.
 
     Raises:
         UsageError: if guide and range map differ in size, or a setting is out of bounds.
@@ -136,12 +127,8 @@ def lay_planes(
 class _PlaneFit:
     """The plane of one plain part.
 
-    Attributes:
-        surface: (H, W) its pixels.
-        rays: (N, 3) of reliable pixels in and around it, drawn by weight.
-        inverse: (N,) their 1 / range.
-        plane: (3,), 1 / range = plane · ray.
-        on_plane: (N,) which of the reliable pixels are on it.
+    `surface`: (H, W) its pixels. `rays`: (N, 3) of reliable pixels in and around it, drawn by weight. `inverse`: (N,)
+    their 1 / range. `plane`: (3,), 1 / range = plane · ray. `on_plane`: (N,) which of the reliable pixels are on it.
     """
 
     surface: Mask
@@ -215,7 +202,7 @@ def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: floa
 
 def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[np.int64], Mask]:
     """Return the index of each pixel's plain part, (H, W), −1 for none, and which pixels have no contrast."""
-    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+    from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
 
     radius = max(1, round(guide.shape[0] / 128))
     padded = pad_panorama(guide, 4 * radius).astype(np.float32)
@@ -234,11 +221,8 @@ def fit_plane(
 ) -> tuple[FloatArray, Mask]:
     """Return the plane a (3,), 1 / r = a · ray, with most inliers, and the inliers.
 
-    Args:
-        rays: (N, 3) unit rays, N ≥ 3.
-        inverse: (N,) 1 / range along each.
-        max_relative_error: largest |a · ray − 1 / r| · r of a point on the plane.
-        rng: draws the triples.
+    `rays`: (N, 3) unit rays, N ≥ 3. `inverse`: (N,) 1 / range along each. `max_relative_error`: largest |a · ray − 1 /
+    r| · r of a point on the plane. `rng`: draws the triples.
     """
     triples = rng.integers(0, len(rays), (_HYPOTHESES, 3))
     bases = rays[triples]

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
@@ -27,13 +27,11 @@ def remove_speckles(
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        max_size_px: size of the largest surface to remove, in pixels at the equator.
-        max_relative_step: largest step within a surface, relative to the nearer range.
 
     Raises:
         UsageError: if a limit is out of bounds.
     """
-    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+    from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
 
     height, width = range_map.range.shape
     labels = label_surfaces(np.ascontiguousarray(range_map.range), max_relative_step)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.algorithms.sphere_windows import box_sum
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -47,13 +47,9 @@ def confirmed_uncertainty(
     the roughness of the surface: the rms relative deviation of the confirmed ranges within 2 pixels from their means,
     so that ρ M is in pixels. d is the share of pixels at steps of the range within 8 pixels.
 
-    Args:
-        consistent: (H, W) pixels that other views confirm.
-        ranges: (H, W), finite where consistent.
-        support: (H, W) sum of the supports of the sources.
-        squared_error: (H, W) sum of supports times squared reprojection errors, in pixels².
-        motion: (H, W) M in pixels.
-        step: (H, W) ln(largest / smallest range) around the pixel.
+    `consistent`: (H, W) pixels that other views confirm. `ranges`: (H, W), finite where consistent. `support`: (H, W)
+    sum of the supports of the sources. `squared_error`: (H, W) sum of supports times squared reprojection errors, in
+    pixels². `motion`: (H, W) M in pixels. `step`: (H, W) ln(largest / smallest range) around the pixel.
     """
     near, rough, wide = (
         max(1, min(radius, len(ranges) // 2 - 1)) for radius in (_PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS)
@@ -93,10 +89,8 @@ def replaced_uncertainty(
     A change of a confirmed range by a share δ adds to its uncertainty: hypot(σ, δ). Other changed ranges, and ranges of
     pixels that had none, are as uncertain as unconfirmed ones.
 
-    Args:
-        before: the range map with the ranges that were replaced.
-        ranges: (H, W) the new ranges, NaN is invalid.
-        confidence: (H, W) the new confidences.
+    `before`: the range map with the ranges that were replaced. `ranges`: (H, W) the new ranges, NaN is invalid.
+    `confidence`: (H, W) the new confidences.
     """
     if before.uncertainty is None:
         return None
@@ -110,3 +104,23 @@ def replaced_uncertainty(
     found = np.where(valid, before.uncertainty, np.float16(np.nan))
     found[changed] = np.where(confirmed, moved, np.float32(UNCONFIRMED_UNCERTAINTY)).astype(np.float16)
     return found
+
+
+def with_ranges(
+    range_map: RangeMap, ranges: NDArray[np.float32], confidence: NDArray[np.uint8] | None = None
+) -> RangeMap:
+    """Return a range map with other ranges (H, W), and other confidences if given.
+
+    Normals are kept where the range did not change; for the uncertainty see `replaced_uncertainty`. The sky gets no
+    range.
+    """
+    confidence = range_map.confidence if confidence is None else confidence
+    if range_map.sky is not None:
+        ranges = np.where(range_map.sky, np.float32(np.nan), ranges)
+        confidence = np.where(range_map.sky, np.uint8(0), confidence)
+    normals = range_map.normals_in_cam
+    if normals is not None:
+        normals = normals.copy()
+        normals[ranges != range_map.range] = np.nan
+    uncertainty = replaced_uncertainty(range_map, ranges, confidence)
+    return RangeMap(ranges, confidence, normals, uncertainty, range_map.sky)

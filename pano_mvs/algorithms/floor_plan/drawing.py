@@ -42,13 +42,9 @@ def draw_plan(
 ) -> NDArray[np.uint8]:
     """Return the picture of a plan (H + strip, W, 3) RGB: the strip below the plan has the scale bar.
 
-    Args:
-        photo: (H, W, 3) RGB orthophoto.
-        known: (H, W) pixels that show something; others are white.
-        extent: of the orthophoto.
-        walls: (N, 2, 2) ends of wall lines.
-        cameras: (M, 2) positions of cameras.
-        unit: of lengths, beside the scale bar.
+    `photo`: (H, W, 3) RGB orthophoto. `known`: (H, W) pixels that show something; others are white. `extent`: of the
+    orthophoto. `walls`: (N, 2, 2) ends of wall lines. `cameras`: (M, 2) positions of cameras. `unit`: of lengths,
+    beside the scale bar.
     """
     height, width = extent.size_hw
     image = np.full((height + strip_px(extent.size_hw), width, 3), _PAPER, np.uint8)

@@ -59,12 +59,9 @@ class _Line:
 def wall_lines(cells: WallCells, *, min_share: float, min_length: float, max_gap: float, snap: float) -> Walls:
     """Return the straight walls among cells of a plan.
 
-    Args:
-        cells: with vertical surfaces.
-        min_share: least share of the height between floor and ceiling.
-        min_length: shorter lines are left out.
-        max_gap: gaps in a line up to this are closed.
-        snap: ends are moved to the corner with another wall if it is at most this far away.
+    `cells`: with vertical surfaces. `min_share`: least share of the height between floor and ceiling. `min_length`:
+    shorter lines are left out. `max_gap`: gaps in a line up to this are closed. `snap`: ends are moved to the corner
+    with another wall if it is at most this far away.
     """
     left = cells.only(cells.shares >= min_share)
     if not len(left.xy):

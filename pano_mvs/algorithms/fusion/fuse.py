@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.fusion.normals import normals_from_range
-from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces
 from pano_mvs.algorithms.fusion.view import (
     ConfidentView,
+    FusionSettings,
     FusionView,
     ViewWindow,
     confident_view,
@@ -22,6 +21,7 @@ from pano_mvs.algorithms.fusion.view import (
     nearest_views,
 )
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
+from pano_mvs.algorithms.sphere_windows import columns_per_step
 from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import PointCloud
@@ -43,10 +43,8 @@ _MAX_SUPPORT_STEP = 0.03
 def fuse_views(views: Sequence[FusionView], settings: FusionSettings | None = None, *, threads: int = 1) -> PointCloud:
     """Fuse views into a cloud of the points on which they agree.
 
-    Args:
-        views: the views; see `fuse_stream` for many views.
-        settings: settings of the fusion; None: the defaults.
-        threads: number of threads; the result does not depend on it.
+    `views`: the views; see `fuse_stream` for many views. `settings`: settings of the fusion; None: the defaults.
+    `threads`: number of threads; the result does not depend on it.
 
     Raises:
         UsageError: if a view's arrays disagree.
@@ -67,11 +65,8 @@ def fuse_stream(
     order of the views, merged by voxels if `voxel_size` is set, and smoothed (`smooth_surfaces`). The result does not
     depend on what is cached.
 
-    Args:
-        poses: cam_from_world of all views.
-        load: position of a view to the view; called again if it was dropped from the cache.
-        settings: as in `fuse_views`.
-        threads: as in `fuse_views`.
+    `poses`: cam_from_world of all views. `load`: position of a view to the view; called again if it was dropped from
+    the cache. `settings`: as in `fuse_views`. `threads`: as in `fuse_views`.
 
     Raises:
         UsageError: as `fuse_views`.
@@ -112,12 +107,9 @@ def fuse_reference(
     largest of theirs, its uncertainty the smallest, because views that confirm each other share their errors. The
     result is not smoothed.
 
-    Args:
-        reference: the view that contributes the points.
-        earlier: neighbouring views that come before it.
-        later: neighbouring views that come after it.
-        settings: as in `fuse_views`; `neighbours` and `voxel_size` are ignored.
-        threads: as in `fuse_views`.
+    `reference`: the view that contributes the points. `earlier`: neighbouring views that come before it. `later`:
+    neighbouring views that come after it. `settings`: as in `fuse_views`; `neighbours` and `voxel_size` are ignored.
+    `threads`: as in `fuse_views`.
 
     Returns:
         The points in the world frame, in the order of the reference's pixels.
@@ -270,7 +262,7 @@ def _uncertainty_of(source: ConfidentView, reference: ConfidentView) -> NDArray[
 
 def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), that become points."""
-    from pano_mvs.algorithms.fusion.kernels_support import find_supported  # compiles on import
+    from pano_mvs.algorithms.fusion.kernels_fuse import find_supported  # compiles on import
 
     shape = reference.ranges.shape
     seen = np.isfinite(reference.ranges)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
-from pano_mvs.core.kernels import kernel
+from pano_mvs.algorithms.fusion.kernels_fuse import solve_symmetric
+from pano_mvs.core.kernels import inlined, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -28,7 +28,7 @@ _MAX_OFF_CENTER = 0.3
 _MIN_NEIGHBOURS = 6
 
 
-@kernel
+@inlined
 def column_range(keys: IntArray, starts: IntArray, key: int) -> tuple[int, int]:
     """Return where the points of a cell and of those before and behind it begin and end; their keys are successive."""
     first = int(np.searchsorted(keys, key - 1))
@@ -38,7 +38,7 @@ def column_range(keys: IntArray, starts: IntArray, key: int) -> tuple[int, int]:
     return starts[first], starts[end]
 
 
-@kernel
+@inlined
 def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, float, float]:
     """Return two unit vectors perpendicular to a normal and to each other."""
     x, y, z = float(normal[0]), float(normal[1]), float(normal[2])
@@ -58,11 +58,8 @@ def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, f
 def find_cells(points: NDArray[np.float32], least: NDArray[np.float32], edge: float, shape: IntArray) -> IntArray:
     """Return the key of the cell, (N,), of each point: cells have this edge, from 1 in each axis, and rows of cells.
 
-    Args:
-        points: (N, 3).
-        least: (3,) the least coordinates.
-        edge: of a cell.
-        shape: (3,) number of cells in each axis, with one more on either side.
+    `points`: (N, 3). `least`: (3,) the least coordinates. `edge`: of a cell. `shape`: (3,) number of cells in each
+    axis, with one more on either side.
     """
     keys = np.empty(len(points), np.int64)
     for i in range(len(points)):
@@ -116,13 +113,9 @@ def find_starts(own: IntArray) -> tuple[IntArray, IntArray]:
 def gather_neighbours(cloud: Cloud, cells: Cells, cell: int, most: int, near: NDArray[np.float32]) -> int:
     """Write the points around a cell, in blocks of `BLOCK`, and return how many there are.
 
-    Args:
-        cloud: see `find_heights`.
-        cells: see `find_heights`.
-        cell: key of the cell.
-        most: number of points of a column that count, evenly among them.
-        near: (blocks · 7 · BLOCK,) written: in each block positions, normals and standard deviations, one after the
-            other.
+    `cloud`: see `find_heights`. `cells`: see `find_heights`. `cell`: key of the cell. `most`: number of points of a
+    column that count, evenly among them. `near`: (blocks · 7 · BLOCK,) written: in each block positions, normals and
+    standard deviations, one after the other.
     """
     points, normals, sigmas = cloud
     keys, starts, _, steps, order = cells
@@ -153,15 +146,10 @@ def weigh_block(
 ) -> None:
     """Weigh a block of neighbours of a point, in a loop that can be vectorised.
 
-    Args:
-        near: see `gather_neighbours`.
-        first: where the block begins.
-        count: number of points in it.
-        own: the point, its normal, and its standard deviation.
-        axes: two unit vectors perpendicular to the normal.
-        radius: within which neighbours count.
-        weighed: (4 · BLOCK,) written: weights, 0 if unused; heights along the normal; and positions along the axes, in
-            radii.
+    `near`: see `gather_neighbours`. `first`: where the block begins. `count`: number of points in it. `own`: the point,
+    its normal, and its standard deviation. `axes`: two unit vectors perpendicular to the normal. `radius`: within which
+    neighbours count. `weighed`: (4 · BLOCK,) written: weights, 0 if unused; heights along the normal; and positions
+    along the axes, in radii.
     """
     px, py, pz, nx, ny, nz, sigma = own
     ux, uy, uz, vx, vy, vz = axes
@@ -213,16 +201,12 @@ def find_heights(
 ) -> None:
     """Write the heights of the surface above the points order[chosen[first:end]]; 0 where it is undefined.
 
-    Args:
-        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations.
-        radii: (N,) radius within which neighbours count.
-        chosen: positions in the order of the cells of points, the radii of which are at most the edge of a cell.
-        cells: keys of the occupied cells, where the points of each begin (and the last ends), (N,) the key of the cell
-            of each point in order, the differences to the keys of the 9 columns of three cells around a cell, and the
-            order of the points.
-        most: number of points of a column that count, evenly among them.
-        heights: (N,) written, along the normal.
-        part: first and end.
+    `cloud`: (N, 3) points, (N, 3) normals and (N,) standard deviations. `radii`: (N,) radius within which neighbours
+    count. `chosen`: positions in the order of the cells of points, the radii of which are at most the edge of a cell.
+    `cells`: keys of the occupied cells, where the points of each begin (and the last ends), (N,) the key of the cell of
+    each point in order, the differences to the keys of the 9 columns of three cells around a cell, and the order of the
+    points. `most`: number of points of a column that count, evenly among them. `heights`: (N,) written, along the
+    normal. `part`: first and end.
     """
     points, normals, sigmas = cloud
     own, steps, order = cells[2], cells[3], cells[4]

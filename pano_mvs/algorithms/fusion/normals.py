@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion.view import held_rays
+from pano_mvs.algorithms.sphere_windows import columns_per_step
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
@@ -29,13 +29,10 @@ def normals_from_range(
     k steps away whose inverse range differs by more than k · `max_relative_step` is on another surface and has no
     weight; nearer ones have Tukey's biweight of that ratio.
 
-    Args:
-        range_map: a range map, or its ranges (H, W) with even W; NaN is invalid.
-        radius: half the width of the window in pixels at the equator.
-        max_relative_step: largest relative step of the range from one pixel to the next on one surface.
-        given: (H, W, 3) known normals, NaN where unknown; None: all unknown.
-        wanted: (H, W) pixels at which to fit a plane; None: all.
-        threads: number of threads; the result does not depend on it.
+    `range_map`: a range map, or its ranges (H, W) with even W; NaN is invalid. `radius`: half the width of the window
+    in pixels at the equator. `max_relative_step`: largest relative step of the range from one pixel to the next on one
+    surface. `given`: (H, W, 3) known normals, NaN where unknown; None: all unknown. `wanted`: (H, W) pixels at which to
+    fit a plane; None: all. `threads`: number of threads; the result does not depend on it.
 
     Returns:
         (H, W, 3) float32 in the camera frame; NaN if the range is invalid or fewer than 5 pixels of the window are on
@@ -44,7 +41,7 @@ def normals_from_range(
     Raises:
         UsageError: if the ranges are not (H, W) with even W, or the radius is out of range.
     """
-    from pano_mvs.algorithms.fusion.kernels_normals import fit_normals  # compiles on import
+    from pano_mvs.algorithms.fusion.kernels_fuse import fit_normals  # compiles on import
 
     ranges = range_map.range if isinstance(range_map, RangeMap) else range_map
     if ranges.ndim != 2 or ranges.shape[1] % 2 or not 1 <= radius <= ranges.shape[0]:

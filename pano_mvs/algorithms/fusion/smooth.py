@@ -38,10 +38,8 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     point moves by the height of the plane, at most by σ/2. σ is at most 3 % of the distance of the nearest camera.
     Points with less than 0.5 %, and points whose neighbours are few or all on one side, stay where they are.
 
-    Args:
-        cloud: N points of one group; unchanged if it has no uncertainty.
-        centers: (M, 3) camera centres in the world.
-        threads: number of threads; the result does not depend on it.
+    `cloud`: N points of one group; unchanged if it has no uncertainty. `centers`: (M, 3) camera centres in the world.
+    `threads`: number of threads; the result does not depend on it.
     """
     if cloud.uncertainty is None or len(cloud) == 0:
         return cloud
@@ -67,14 +65,10 @@ def surface_heights(
 ) -> FloatArray:
     """Return the heights (N,) along their normals of the planes of their neighbours above points; 0 if undefined.
 
-    Args:
-        points: (N, 3), N ≥ 1.
-        normals: (N, 3) unit vectors.
-        sigmas: (N,) standard deviations, positive.
-        chosen: indices of the points whose heights are wanted; those of others are 0. None: all.
-        per_column: of each of the 9 columns of three cells around a point, this many points count; the edge of a cell
-            is at least the reach of the point.
-        threads: as in `smooth_surfaces`.
+    `points`: (N, 3), N ≥ 1. `normals`: (N, 3) unit vectors. `sigmas`: (N,) standard deviations, positive. `chosen`:
+    indices of the points whose heights are wanted; those of others are 0. None: all. `per_column`: of each of the 9
+    columns of three cells around a point, this many points count; the edge of a cell is at least the reach of the
+    point. `threads`: as in `smooth_surfaces`.
     """
     from pano_mvs.algorithms.fusion.kernels_smooth import find_heights  # compiles on import
 

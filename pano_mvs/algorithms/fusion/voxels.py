@@ -21,9 +21,8 @@ def thin_by_voxels(cloud: PointCloud, voxel_size: float) -> PointCloud:
     normalised, or the first one if they cancel; the numbers of views and the confidences are maxima, the uncertainties
     minima.
 
-    Args:
-        cloud: N points.
-        voxel_size: edge of a voxel in scene units; voxels are aligned with the world's axes and its origin.
+    `cloud`: N points. `voxel_size`: edge of a voxel in scene units; voxels are aligned with the world's axes and its
+    origin.
 
     Raises:
         UsageError: if the voxel size is not positive.
@@ -37,12 +36,9 @@ def thin_by_voxels(cloud: PointCloud, voxel_size: float) -> PointCloud:
 class _Voxels:
     """Voxels in the order in which they first appeared.
 
-    Attributes:
-        places: (G, 3) int64.
-        sums: (G, 10) of weights, and of weighted positions, normals and colours.
-        first_normals: (G, 3) float32.
-        largest: (G, 2) uint8 number of views and confidence.
-        uncertainties: (G,) float32, the smallest of each voxel.
+    `places`: (G, 3) int64. `sums`: (G, 10) of weights, and of weighted positions, normals and colours. `first_normals`:
+    (G, 3) float32. `largest`: (G, 2) uint8 number of views and confidence. `uncertainties`: (G,) float32, the smallest
+    of each voxel.
     """
 
     places: NDArray[np.int64]

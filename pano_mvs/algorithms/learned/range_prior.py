@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
-from pano_mvs.algorithms.filters.confidence import confidence_weight
-from pano_mvs.algorithms.filters.data_term import require_guide
-from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.algorithms.filters.uncertainty import LEAST_UNCERTAINTY, MOST_UNCERTAINTY
+from pano_mvs.algorithms.filters.data_term import confidence_weight, require_guide
+from pano_mvs.algorithms.filters.uncertainty import LEAST_UNCERTAINTY, MOST_UNCERTAINTY, with_ranges
 from pano_mvs.algorithms.learned.networks import Network
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.errors import UsageError

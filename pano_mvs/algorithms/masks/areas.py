@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.algorithms.sphere_windows import box_sum
 from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle
 
 
 def area_labels(pixels: Mask) -> NDArray[np.int64]:
     """Return the connected area of each pixel, across the seam and the poles, (H, W); −1 elsewhere."""
-    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+    from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
 
     labels = label_surfaces(np.where(pixels, np.float32(1), np.float32(np.nan)), 1.0)
     return np.asarray(labels).reshape(pixels.shape)
@@ -38,9 +38,7 @@ def share_of_sphere(pixels: Mask) -> float:
 def border_shares(labels: NDArray[np.int64], pixels: Mask) -> NDArray[np.float64]:
     """Return for each label the share of its area's border, by length, that lies on some pixels.
 
-    Args:
-        labels: (H, W) as returned by `area_labels`.
-        pixels: (H, W).
+    `labels`: (H, W) as returned by `area_labels`. `pixels`: (H, W).
 
     Returns:
         (H W,), 0 for labels that are not in use.

@@ -30,11 +30,8 @@ _DARK_LEVEL = 4.0
 class OtherView:
     """Another view of the capture.
 
-    Attributes:
-        picture: (H, W, 3) uint8 RGB.
-        valid: (H, W), False is ignored.
-        range_map: its ranges, of any size.
-        pose: source_from_reference.
+    `picture`: (H, W, 3) uint8 RGB. `valid`: (H, W), False is ignored. `range_map`: its ranges, of any size. `pose`:
+    source_from_reference.
     """
 
     picture: Picture
@@ -70,10 +67,8 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     that see it, after a factor per channel, and the lightest and the darkest colours within 1.4°, are what can be
     expected there. Where the panorama's own ranges are confirmed, what the views show at these is expected as well.
 
-    Args:
-        picture: (H, W, 3) uint8 RGB, the reference.
-        range_map: its ranges, of the same size.
-        others: views around it, of the same size.
+    `picture`: (H, W, 3) uint8 RGB, the reference. `range_map`: its ranges, of the same size. `others`: views around it,
+    of the same size.
     """
     size_hw = (picture.shape[0], picture.shape[1])
     grid_hw = (size_hw[0] // 2, size_hw[1] // 2)
@@ -106,9 +101,7 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
 def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
     """Return the plane of the ground, n·x = h with n nearly straight down, as (4,): n and h; None without one.
 
-    Args:
-        known: (H, W) ranges of the panorama; NaN is unknown.
-        seen: (V, h, w) ranges as other views see them from there.
+    `known`: (H, W) ranges of the panorama; NaN is unknown. `seen`: (V, h, w) ranges as other views see them from there.
     """
     points = np.concatenate([_low_points(ranges) for ranges in (known, *seen)])
     if len(points) < _MIN_GROUND_POINTS:
@@ -188,12 +181,8 @@ def _differences(
 ) -> tuple[Plane, Plane]:
     """Return the differences of colour and the expected colours of pixels; NaN where fewer than two, or no, views see.
 
-    Args:
-        own: (H, W, 3) colours of the reference, see `_smooth`.
-        ranges: (H, W), NaN if not known.
-        others: the other views.
-        around: `_colors_around` of each.
-        colors_at: (H, W), where expected colours are wanted.
+    `own`: (H, W, 3) colours of the reference, see `_smooth`. `ranges`: (H, W), NaN if not known. `others`: the other
+    views. `around`: `_colors_around` of each. `colors_at`: (H, W), where expected colours are wanted.
 
     Returns:
         (H, W) grey levels, and (H, W, 3).

@@ -53,9 +53,8 @@ _BESIDE_MASK = 0.15
 class Moving:
     """What moves through the scene, (H, W) each.
 
-    Attributes:
-        pixels: what is found, dilated.
-        shadow: the shadows beside it, or nothing if they were not asked for; a part of `pixels`.
+    `pixels`: what is found, dilated. `shadow`: the shadows beside it, or nothing if they were not asked for; a part of
+    `pixels`.
     """
 
     pixels: Mask
@@ -89,11 +88,6 @@ def moving_pixels(
         range_map: its ranges, of the same size, checked against those of the other views.
         others: two or more views around it.
         valid: (H, W), False is masked already.
-        passers_by: whether to find people who do not reach to the nadir.
-        vehicles: whether to find vehicles, where there is no ceiling.
-        shadows: whether to find shadows beside what is found.
-        min_area_deg2: minimum size of an area.
-        margin_deg: angle by which areas are dilated.
 
     Raises:
         UsageError: if the arrays differ in size, or a setting is out of bounds.

@@ -28,16 +28,13 @@ def areas_of_color(
     Args:
         picture: (H, W, 3) uint8 RGB, the full sphere.
         color_rgb: the colour.
-        tolerance: maximum difference of each channel, in grey levels, to allow for compression artefacts.
-        min_area_deg2: minimum area in square degrees, to exclude dark corners and lamps.
-        margin_px: width in pixels by which areas are dilated, to include their blurred edges.
 
     Raises:
         UsageError: if the image is not an (H, W, 3) uint8 array, or a setting is out of bounds.
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise UsageError(f"an image must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
-    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+    from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
 
     alike = np.asarray((np.abs(picture.astype(np.int16) - np.array(color_rgb, np.int16)) <= tolerance).all(axis=-1))
     if not alike.any():

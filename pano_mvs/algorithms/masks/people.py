@@ -2,25 +2,121 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights
-from pano_mvs.algorithms.masks.person_below import people_below
 from pano_mvs.algorithms.masks.person_upright import upright_people
-from pano_mvs.algorithms.masks.person_views import MAP_HW, WIDTH, Look, Map, SeenPanorama, look, rolled
+from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, look, rolled
 from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
 
-__all__ = ["WIDTH", "people", "person_at"]
-
-
 _DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# Fields of view, and the rotations of each.
+_NARROW_DEG, _NARROW_ROLLS_DEG = 90.0, (0.0, 90.0, 180.0, 270.0)
+_WIDE_DEG, _WIDE_ROLLS_DEG = 120.0, (0.0, 90.0)
+# A person reaches to within this angle of the nadir.
+_REACH_DEG = 30.0
+_BELONGS_BELOW = 0.5
+# What the narrow views give for the pixels of a person: on average, and at least. Furniture fails in some rotation.
+# What contains the nadir itself, such as a rig, may fail in one, but has to be outlined in all views.
+_MIN_PROBABILITY, _MIN_ONE_PROBABILITY = 0.75, 0.5
+_AT_NADIR_DEG, _MIN_PROBABILITY_AT_NADIR = 2.0, 0.6
+# How much of a person all views outline: the narrow ones, all, all without anybody detected.
+_MIN_NARROW_OUTLINE, _MIN_OUTLINE, _CERTAIN_OUTLINE = 0.65, 0.75, 0.85
+# The wide views may fail if one of the views shows a person for certain.
+_MIN_WIDE_PROBABILITY, _MIN_PRESENCE_BELOW, _CERTAIN_PRESENCE = 0.6, 0.5, 0.9
+
+
+def people_below(seen: SeenPanorama, min_area_deg2: float) -> Mask:
+    """Return the pixels, `MAP_HW`, of people below the camera.
+
+    Two networks look straight down, in several rotations and with two fields of view: one segments people, the other
+    outlines what is in the middle. They have to agree on an area, and the second has to detect a person.
+    """
+    nobody = np.zeros(MAP_HW, np.bool_)
+    narrow, wide = _looks()
+    probable = [each.on_map(seen.probability(each)) for each in narrow]
+    if not _areas_below(np.mean(probable, axis=0), min_area_deg2):
+        return nobody
+    outlined = [each.on_map(seen.outline(each)) for each in narrow]
+    areas = _areas_below(_mean_map([*probable, *outlined], narrow * 2), min_area_deg2)
+    if not any(_likely(probable, outlined, area, min_outline=_MIN_NARROW_OUTLINE) for area in areas):
+        return nobody
+    probable += [each.on_map(seen.probability(each)) for each in wide]
+    outlined += [each.on_map(seen.outline(each)) for each in wide]
+    areas = _areas_below(_mean_map([*probable, *outlined], (narrow + wide) * 2), min_area_deg2)
+    areas = [area for area in areas if _likely(probable, outlined, area, min_outline=_MIN_OUTLINE)]
+    if not areas:
+        return nobody
+    accepted = [area for area in areas if _accepted(seen, probable, outlined, area=area)]
+    return np.logical_or.reduce(accepted) if accepted else nobody
+
+
+def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline: float) -> bool:
+    """Return whether the networks find a person in an area, in the narrow views and in all views."""
+    found = _means(probable[: len(_NARROW_ROLLS_DEG)], area)
+    if np.mean(_means(outlined, area)) < min_outline:
+        return False
+    if _off_nadir_deg()[area].min() < _AT_NADIR_DEG and np.mean(found) >= _MIN_PROBABILITY_AT_NADIR:
+        return True
+    return bool(np.mean(found) >= _MIN_PROBABILITY and min(found) >= _MIN_ONE_PROBABILITY)
+
+
+def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, area: Mask) -> bool:
+    """Return whether an area that is likely is a person, or what is fixed below the camera."""
+    at_nadir = _off_nadir_deg()[area].min() < _AT_NADIR_DEG
+    if at_nadir and np.mean(_means(outlined, area)) >= _CERTAIN_OUTLINE:
+        return True
+    wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= _MIN_WIDE_PROBABILITY
+    least = _MIN_PRESENCE_BELOW if at_nadir or wide_agree else _CERTAIN_PRESENCE
+    narrow, wide = _looks()
+    return any(seen.presence(each) >= least for each in narrow + wide)
+
+
+def _areas_below(mean: Map, min_area_deg2: float) -> list[Mask]:
+    """Return the connected areas near the nadir that are probable and large enough."""
+    labels, weights = area_labels(mean > _BELONGS_BELOW), pixel_weights(MAP_HW)
+    near = np.unique(labels[(_off_nadir_deg() < _REACH_DEG) & (labels >= 0)])
+    least = min_area_deg2 / (4 * np.pi * np.degrees(1) ** 2) * weights.sum()
+    areas = (labels == label for label in near)
+    return [area for area in areas if weights[area].sum() >= least]
+
+
+def _means(maps: list[Map], area: Mask) -> list[float]:
+    """Return the mean of each map over what it shows of an area."""
+    weights = pixel_weights(MAP_HW)[area]
+    return [float(np.average(values[area], weights=weights)) for values in maps]
+
+
+def _mean_map(maps: list[Map], looks: tuple[Look, ...]) -> Map:
+    """Return the weighted mean of maps; 0 where no view looks."""
+    total = np.sum([each.weight * values for values, each in zip(maps, looks, strict=True)], axis=0)
+    weight = np.sum([each.weight for each in looks], axis=0)
+    return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
+
+
+@cache
+def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
+    narrow, wide = (
+        tuple(look(rolled(_DOWN, float(np.radians(roll))), fov_deg) for roll in rolls)
+        for fov_deg, rolls in ((_NARROW_DEG, _NARROW_ROLLS_DEG), (_WIDE_DEG, _WIDE_ROLLS_DEG))
+    )
+    return narrow, wide
+
+
+@cache
+def _off_nadir_deg() -> NDArray[np.float64]:
+    return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(MAP_HW)[..., 1], -1, 1))))
+
+
 # An area is seen again in the middle of views of its own, this many times as wide.
 _VIEW_OF_EXTENT = 2.4
 _MIN_FOV_DEG, _MAX_FOV_DEG = 40.0, 110.0
@@ -50,10 +146,6 @@ def people(
 
     Args:
         picture: (H, W, 3) uint8 RGB, the full sphere, up to within some 20°.
-        passers_by: whether to find people at a distance, too; without it, only those whose feet are within about two
-            metres of the camera.
-        min_area_deg2: minimum size of a person.
-        margin_deg: angle by which people are dilated, to include their soft edges.
 
     Returns:
         (h, w) bool, with `WIDTH` columns or those of a smaller picture.
@@ -72,10 +164,8 @@ def people(
 def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, Mask]:
     """Return the mean probability of a person over an area, in views of its own, and the pixels of the person.
 
-    Args:
-        seen: the panorama.
-        area: (H, W) bool, not empty.
-        least: if the first view gives less than half of this probability, the others are left out.
+    `seen`: the panorama. `area`: (H, W) bool, not empty. `least`: if the first view gives less than half of this
+    probability, the others are left out.
 
     Returns:
         The probability, 0 if it is too low, or unless a person is detected in one of the views; and (H, W) bool.

@@ -10,8 +10,7 @@ import numpy as np
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
-from pano_mvs.algorithms.masks.person_network import SIDE_PX
-from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, rolled, stereographic_look
+from pano_mvs.algorithms.masks.person_views import MAP_HW, SIDE_PX, Look, Map, SeenPanorama, rolled, stereographic_look
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.geometry import pixel_from_ray
 
@@ -77,11 +76,8 @@ def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, pas
     middle of views of its own, rolled and mirrored: these have to agree on it, to detect a person, and a second network
     has to find a person there.
 
-    Args:
-        seen: the panorama.
-        known: (H, W) people who are found already, `MAP_HW`.
-        min_area_deg2: the smallest person.
-        passers_by: whether to find people whose feet are far from the camera.
+    `seen`: the panorama. `known`: (H, W) people who are found already, `MAP_HW`. `min_area_deg2`: the smallest person.
+    `passers_by`: whether to find people whose feet are far from the camera.
     """
     found = known.copy()
     candidates = [_candidate(seen.outline(each), each) for each in _ring()]
@@ -158,11 +154,7 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
     return mean if np.mean(overlaps) >= _MIN_OVERLAP else None
 
 
-def _is_present(
-    seen: SeenPanorama,
-    candidate: _Candidate,
-    views: tuple[tuple[float, bool, float, float], ...],
-) -> bool:
+def _is_present(seen: SeenPanorama, candidate: _Candidate, views: tuple[tuple[float, bool, float, float], ...]) -> bool:
     """Return whether a person is detected in all views of a candidate but one."""
     missed = 0
     for roll_deg, mirrored, wider, lower in views:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.channels import largest_channel
+from pano_mvs.algorithms.sphere_windows import largest_channel
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, sample_panorama
 
 Colors = NDArray[np.float32]
@@ -47,12 +47,8 @@ def compare_with_source(
 ) -> Comparison:
     """Look a source up from a reference.
 
-    Args:
-        reference: (H, W, 3) uint8.
-        ranges: (H, W) of the reference, NaN without.
-        source: (Hs, Ws, 3) uint8.
-        source_valid: (Hs, Ws), False is ignored.
-        source_from_reference: the pose of the source.
+    `reference`: (H, W, 3) uint8. `ranges`: (H, W) of the reference, NaN without. `source`: (Hs, Ws, 3) uint8.
+    `source_valid`: (Hs, Ws), False is ignored. `source_from_reference`: the pose of the source.
     """
     size_hw = (reference.shape[0], reference.shape[1])
     colors = smoothed(source)
@@ -109,11 +105,9 @@ def pixel_errors(
 
     Each is the least of all sources, since others may be occluded. Infinite without a source, or without a range.
 
-    Args:
-        picture: (H, W, 3) uint8, the reference.
-        area: (H, W), the pixels that give the factor of each channel.
-        comparisons: with the sources.
-        area_at_infinity: whether these pixels are infinitely far away, or at their ranges.
+    `picture`: (H, W, 3) uint8, the reference. `area`: (H, W), the pixels that give the factor of each channel.
+    `comparisons`: with the sources. `area_at_infinity`: whether these pixels are infinitely far away, or at their
+    ranges.
     """
     own = smoothed(picture)
     errors = []

@@ -17,11 +17,9 @@ _EXPECTED_UTILIZATION = 0.75
 class Atlas:
     """A mesh whose vertices have positions in a texture; a vertex on the border of charts occurs once for each.
 
-    Attributes:
-        vertex: (N,) int32 index of the vertex of the mesh at each vertex of the atlas.
-        uv: (N, 2) float32 position in the texture, (0, 0) its upper-left and (1, 1) its lower-right corner.
-        faces: (F, 3) int32 positions in `vertex`; the triangles of the mesh, in its order.
-        size_hw: (height, width) of the texture in texels.
+    `vertex`: (N,) int32 index of the vertex of the mesh at each vertex of the atlas. `uv`: (N, 2) float32 position in
+    the texture, (0, 0) its upper-left and (1, 1) its lower-right corner. `faces`: (F, 3) int32 positions in `vertex`;
+    the triangles of the mesh, in its order. `size_hw`: (height, width) of the texture in texels.
     """
 
     vertex: NDArray[np.int32]
@@ -40,10 +38,8 @@ class Atlas:
 class Texels:
     """The texels in the charts of an atlas.
 
-    Attributes:
-        pixel: (T,) int32 index of each texel in the texture, row by row.
-        triangle: (T,) int32 its triangle.
-        weights: (T, 2) float32 weights of the triangle's second and third corner at the texel's centre.
+    `pixel`: (T,) int32 index of each texel in the texture, row by row. `triangle`: (T,) int32 its triangle. `weights`:
+    (T, 2) float32 weights of the triangle's second and third corner at the texel's centre.
     """
 
     pixel: NDArray[np.int32]
@@ -54,11 +50,8 @@ class Texels:
 def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels_per_unit: float, max_px: int) -> Atlas:
     """Return the charts of a mesh in one texture.
 
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3), at least one.
-        texels_per_unit: resolution of the texture: texels per scene unit.
-        max_px: largest width and height of the texture; it lowers the resolution.
+    `vertices`: (V, 3). `faces`: (F, 3), at least one. `texels_per_unit`: resolution of the texture: texels per scene
+    unit. `max_px`: largest width and height of the texture; it lowers the resolution.
     """
     xatlas = import_module("xatlas")
     corners = vertices.astype(np.float64)[faces]
@@ -77,7 +70,7 @@ def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels
 
 def texels_of(atlas: Atlas) -> Texels:
     """Return the texels whose centres are in a chart."""
-    from pano_mvs.algorithms.mesh.kernels_raster import draw_charts  # compiles on import
+    from pano_mvs.algorithms.mesh.kernels_mesh import draw_charts  # compiles on import
 
     triangle = np.full(atlas.size_hw, -1, np.int32)
     weights = np.zeros((*atlas.size_hw, 2), np.float32)

@@ -13,15 +13,106 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
 
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
-from pano_mvs.algorithms.mesh.fill_texture import fill_unseen, spread_over_gaps, vertex_colors
 from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality
 from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import pad_panorama
+
+_GREY = 128.0
+_TEXELS_OF_PART = 1 << 20  # bounds the memory
+
+
+def vertex_colors(
+    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], vertices: int
+) -> FloatImage:
+    """Return the colour of each vertex, (V, 3): the mean of the texels around it that are seen, by their weights.
+
+    A vertex without such texels has the mean of its neighbours along the edges, as have those in turn (the discrete
+    Laplace equation). A part of the mesh that nobody sees has the mean of all colours.
+
+    `colors`: (T, 3) colours of the texels. `seen`: (T,) the texels whose colours are known. `texels`: the texels.
+    `faces`: (F, 3) triangles of the mesh. `vertices`: the number V of vertices.
+    """
+    sums, totals = np.zeros((vertices, 3)), np.zeros(vertices)
+    for first in range(0, len(seen), _TEXELS_OF_PART):
+        part = slice(first, first + _TEXELS_OF_PART)
+        shown = seen[part]
+        triangle, weights = texels.triangle[part][shown], texels.weights[part][shown].astype(np.float64)
+        for corner, weight in enumerate((1 - weights.sum(axis=1), weights[:, 0], weights[:, 1])):
+            vertex = faces[triangle, corner]
+            totals += np.bincount(vertex, weight, vertices)
+            for channel in range(3):
+                sums[:, channel] += np.bincount(vertex, weight * colors[part][shown, channel], vertices)
+    known = totals > 1e-3
+    result = np.full((vertices, 3), _GREY if not known.any() else 0.0)
+    if not known.any():
+        return result.astype(np.float32)
+    result[known] = sums[known] / totals[known, None]
+    result[~known] = result[known].mean(axis=0)
+    _diffuse(result, known, faces)
+    return result.astype(np.float32)
+
+
+def fill_unseen(
+    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], of_vertices: FloatImage
+) -> None:
+    """Give the texels that are not seen the colour between those of their triangle's vertices, in place."""
+    for first in range(0, len(seen), _TEXELS_OF_PART):
+        part = slice(first, first + _TEXELS_OF_PART)
+        hidden = ~seen[part]
+        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
+        second, third = weights[:, :1], weights[:, 1:]
+        corners = of_vertices[faces[triangle]]
+        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
+
+
+def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return a texture whose other texels have the colour of the nearest filled one.
+
+    Lookups at the borders of charts, and smaller levels of the texture, then mix no foreign colour.
+
+    `texture`: (H, W, 3) or (H, W). `filled`: (H, W) bool.
+    """
+    if filled.all() or not filled.any():
+        return texture
+    gaps = np.where(filled, np.uint8(0), np.uint8(1))
+    _, labels = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
+    source = np.zeros(int(labels.max()) + 1, np.int32)
+    source[labels[filled]] = np.flatnonzero(filled)
+    flat = texture.reshape(filled.size, -1)
+    return np.asarray(flat[source[labels.ravel()]].reshape(texture.shape))
+
+
+def _diffuse(colors: NDArray[np.float64], known: NDArray[np.bool_], faces: NDArray[np.int32]) -> None:
+    """Solve the Laplace equation for the vertices whose colours are not known, in place."""
+    links = _links(faces, len(colors))
+    _, part = connected_components(links, directed=False)
+    reached = np.isin(part, np.unique(part[known]))
+    wanted = np.flatnonzero(~known & reached)
+    if not len(wanted):
+        return
+    degrees = np.asarray(links.sum(axis=1)).ravel()
+    rows = links[wanted]
+    system = (diags_array(degrees[wanted]) - rows[:, wanted]).tocsc()
+    right = rows[:, np.flatnonzero(known)] @ colors[known]
+    colors[wanted] = np.asarray(spsolve(system, right)).reshape(-1, 3)
+
+
+def _links(faces: NDArray[np.int32], count: int) -> csr_array:
+    """Return the adjacency of vertices, (count, count), 1 for an edge."""
+    starts, ends = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    both = np.concatenate([starts, ends]), np.concatenate([ends, starts])
+    links = coo_array((np.ones(2 * len(starts)), both), shape=(count, count)).tocsr()
+    links.data[:] = 1
+    return links
+
 
 _ROUNDS = 30
 # Darker or brighter values are clipped or noisy.
@@ -40,9 +131,8 @@ def view_gains(colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Flo
     found alternately, with weights 1 / (1 + (residual / 0.15)²) against moved things and reflections. The mean of the
     logarithms is 0.
 
-    Args:
-        colors: (V, P, 3) colours of points as each panorama sees them, 0 to 255.
-        weights: (V, P) weights, 0 where a panorama does not see the point.
+    `colors`: (V, P, 3) colours of points as each panorama sees them, 0 to 255. `weights`: (V, P) weights, 0 where a
+    panorama does not see the point.
     """
     usable = (weights > 0) & (colors.min(axis=-1) > _DARKEST) & (colors.max(axis=-1) < _BRIGHTEST)
     usable &= usable.sum(axis=0) > 1
@@ -84,12 +174,9 @@ _LEAST_SHARPNESS = 0.25
 class TexturedMesh:
     """A mesh with a texture.
 
-    Attributes:
-        vertices_in_world: (V, 3) float32.
-        faces: (F, 3) int32.
-        atlas: positions in the texture.
-        texture: (H, W, 3) uint8 RGB.
-        seen: (H, W) bool, the texels that a panorama sees; the others are filled with colours from around them.
+    `vertices_in_world`: (V, 3) float32. `faces`: (F, 3) int32. `atlas`: positions in the texture. `texture`: (H, W, 3)
+    uint8 RGB. `seen`: (H, W) bool, the texels that a panorama sees; the others are filled with colours from around
+    them.
     """
 
     vertices_in_world: NDArray[np.float32]
@@ -103,11 +190,9 @@ class TexturedMesh:
 class ViewBalance:
     """What makes panoramas comparable.
 
-    Attributes:
-        gains: (V, 3) factors of the colour channels.
-        worths: (V,) weight of each panorama by its sharpness, at most 1.
-        density: pixels per scene unit at which the panoramas see the surface, the upper quartile of all triangles at
-            their best.
+    `gains`: (V, 3) factors of the colour channels. `worths`: (V,) weight of each panorama by its sharpness, at most 1.
+    `density`: pixels per scene unit at which the panoramas see the surface, the upper quartile of all triangles at
+    their best.
     """
 
     gains: NDArray[np.float64]
@@ -127,7 +212,7 @@ class Surface:
         self, texels: Texels, view: PaintView, *, worth: float, threads: int
     ) -> Callable[[int, int], tuple[FloatImage, FloatImage, FloatImage]]:
         """Return a function of a span of texels that returns weight, colour without detail, and detail of each."""
-        from pano_mvs.algorithms.mesh.kernels_texture import look_at_texels  # compiles on import
+        from pano_mvs.algorithms.mesh.kernels_mesh import look_at_texels  # compiles on import
 
         size_hw = view.valid.shape[0], view.valid.shape[1]
         pose = view.cam_from_world
@@ -154,12 +239,8 @@ def balanced_views(
 ) -> ViewBalance:
     """Return the exposures and the sharpness of panoramas, and how densely they see a mesh, from reduced copies.
 
-    Args:
-        vertices_in_world: (V, 3).
-        faces: (F, 3), at least one.
-        load: returns a panorama by its index; they are loaded one at a time.
-        views: number of panoramas.
-        threads: number of threads; the result does not depend on it.
+    `vertices_in_world`: (V, 3). `faces`: (F, 3), at least one. `load`: returns a panorama by its index; they are loaded
+    one at a time. `views`: number of panoramas. `threads`: number of threads; the result does not depend on it.
     """
     surface = Surface(vertices_in_world, faces)
     centers = _triangle_centers(len(faces))
@@ -192,13 +273,9 @@ def textured(
 ) -> TexturedMesh:
     """Paint a mesh that was unwrapped.
 
-    Args:
-        vertices_in_world: (V, 3).
-        faces: (F, 3).
-        atlas: of `unwrapped`.
-        load: returns a panorama by its index; they are loaded one at a time.
-        balance: of `balanced_views`.
-        threads: number of threads; the result does not depend on it.
+    `vertices_in_world`: (V, 3). `faces`: (F, 3). `atlas`: of `unwrapped`. `load`: returns a panorama by its index; they
+    are loaded one at a time. `balance`: of `balanced_views`. `threads`: number of threads; the result does not depend
+    on it.
     """
     texels = texels_of(atlas)
     colors, seen = _painted(Surface(vertices_in_world, faces), texels, load, balance=balance, threads=threads)
@@ -232,11 +309,7 @@ class _Painting:
         self._best, self._detail = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
 
     def add(
-        self,
-        look: Callable[[int, int], tuple[FloatImage, FloatImage, FloatImage]],
-        gain: FloatImage,
-        *,
-        threads: int,
+        self, look: Callable[[int, int], tuple[FloatImage, FloatImage, FloatImage]], gain: FloatImage, *, threads: int
     ) -> None:
         """Add what one panorama gives."""
         count = len(self._weights)

@@ -29,11 +29,8 @@ _SMOOTH_PX = 5
 class PaintView:
     """A panorama that gives its colours to a texture.
 
-    Attributes:
-        cam_from_world: its pose.
-        picture: (H, W, 3) uint8 RGB.
-        valid: (H, W) bool; the other pixels are masked and paint nothing.
-        range_map: its ranges, in the size of the picture; None if there are none.
+    `cam_from_world`: its pose. `picture`: (H, W, 3) uint8 RGB. `valid`: (H, W) bool; the other pixels are masked and
+    paint nothing. `range_map`: its ranges, in the size of the picture; None if there are none.
     """
 
     cam_from_world: Rigid3
@@ -48,10 +45,8 @@ def pixel_quality(view: PaintView, surface_ranges: FloatImage, *, feather_px: fl
     It is lower near the border of a surface or of a mask, where ranges are weak, filled or unknown, and much lower
     where the panorama measured something else than the mesh.
 
-    Args:
-        view: the panorama.
-        surface_ranges: (H, W) ranges of the mesh in the panorama, infinite without a surface.
-        feather_px: distance from a border beyond which it has no influence, in pixels.
+    `view`: the panorama. `surface_ranges`: (H, W) ranges of the mesh in the panorama, infinite without a surface.
+    `feather_px`: distance from a border beyond which it has no influence, in pixels.
 
     Raises:
         UsageError: if the sizes differ.

@@ -16,10 +16,9 @@ from pano_mvs.geometry import Rigid3
 class SurfaceView:
     """The nearest surface of a mesh along the ray of each pixel.
 
-    Attributes:
-        ranges: (H, W) float32 distance along the ray through the pixel's centre; infinite without a surface.
-        triangle: (H, W) int32 index of the triangle; −1 without a surface.
-        weights: (H, W, 2) float32 barycentric weights of the triangle's second and third corner.
+    `ranges`: (H, W) float32 distance along the ray through the pixel's centre; infinite without a surface. `triangle`:
+    (H, W) int32 index of the triangle; −1 without a surface. `weights`: (H, W, 2) float32 barycentric weights of the
+    triangle's second and third corner.
     """
 
     ranges: NDArray[np.float32]
@@ -41,17 +40,13 @@ def surface_view(
     d · (a × b) have the sign of a · (b × c), so that no projection plane and no clipping is needed (M. Olano and
     T. Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997).
 
-    Args:
-        vertices_in_world: (V, 3).
-        faces: (F, 3) positions of vertices.
-        cam_from_world: pose of the panorama.
-        size_hw: (height, width) of the panorama.
-        threads: number of threads; the result does not depend on it.
+    `vertices_in_world`: (V, 3). `faces`: (F, 3) positions of vertices. `cam_from_world`: pose of the panorama.
+    `size_hw`: (height, width) of the panorama. `threads`: number of threads; the result does not depend on it.
 
     Raises:
         UsageError: if the size is not that of a full sphere.
     """
-    from pano_mvs.algorithms.mesh.kernels_raster import draw_triangles, pixel_bounds  # compiles on import
+    from pano_mvs.algorithms.mesh.kernels_mesh import draw_triangles, pixel_bounds  # compiles on import
 
     height, width = size_hw
     if width != 2 * height or height < 1:

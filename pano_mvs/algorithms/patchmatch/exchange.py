@@ -11,13 +11,16 @@ the sources missed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources, seen_ranges
+from pano_mvs.algorithms.filters.data_term import MaxHoleDeg, require_confidence
+from pano_mvs.algorithms.filters.fill import large_holes
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.patchmatch.refine import SOURCE_REACH, reference_arrays, source_arrays
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
@@ -26,7 +29,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 # Samples along each side of a window, two pixels apart; their weights and the noise as in `refine_range`.
 _WINDOW, _SIGMA_COLOR, _NOISE = 5, 25.0, 0.4
@@ -40,11 +43,8 @@ _GRAZING = 0.1
 class SourceView:
     """A source with what is known of it.
 
-    Attributes:
-        picture: (H, W, 3) uint8 RGB.
-        range_map: its ranges, (H, W).
-        from_reference: its pose: x_in_source = R x_in_reference + t.
-        mask: (H, W), False where it is ignored, or None.
+    `picture`: (H, W, 3) uint8 RGB. `range_map`: its ranges, (H, W). `from_reference`: its pose: x_in_source = R
+    x_in_reference + t. `mask`: (H, W), False where it is ignored, or None.
     """
 
     picture: Picture
@@ -85,13 +85,8 @@ def exchange_ranges(
         range_map: (H, W) of the reference, full sphere. Pixels without a range stay so.
         reference: (H, W, 3) uint8 RGB.
         sources: one or more.
-        max_relative_error: largest relative difference of ranges that agree; another range is nearer by more.
-        max_reprojection_px: largest reprojection error of ranges that agree, in pixels of the reference.
-        max_reprojection_deg: the same in degrees; the larger of the two counts, as in `checked_with_agreement`.
         min_agreeing: smallest number of sources that agree on a range, including the one that it comes from; all of
             them if there are fewer sources, but one source alone is not enough.
-        min_support: support from which on a pixel is confirmed and keeps its range.
-        agreement: correlation that each source that agrees is worth.
 
     Returns:
         The range map, with confidences unchanged, and the share of its valid pixels that were replaced.
@@ -193,10 +188,8 @@ def project_range_map(
     Every pixel of the source that was seen lands in one pixel of the reference; of those that land in the same one, the
     nearest counts. Where none lands, the range is NaN and the position −1.
 
-    Args:
-        range_map: of the source.
-        from_reference: pose of the source: x_in_source = R x_in_reference + t.
-        size_hw: of the reference.
+    `range_map`: of the source. `from_reference`: pose of the source: x_in_source = R x_in_reference + t. `size_hw`: of
+    the reference.
     """
     from pano_mvs.algorithms.patchmatch.kernels_exchange import land_points
 
@@ -268,10 +261,8 @@ def surface_planes(
 
     A plane faces the camera where the normal is unknown or the surface is seen at a grazing angle.
 
-    Args:
-        ranges: (N,) of the points.
-        normals: (N, 3) of the surfaces, NaN where unknown; or None.
-        rays: (N, 3) unit vectors to the points.
+    `ranges`: (N,) of the points. `normals`: (N, 3) of the surfaces, NaN where unknown; or None. `rays`: (N, 3) unit
+    vectors to the points.
     """
     normal = np.full_like(rays, np.nan) if normals is None else normals.astype(np.float64)
     cosine = np.sum(normal * rays, axis=-1)
@@ -291,3 +282,91 @@ def _check(range_map: RangeMap, reference: Picture, sources: Sequence[SourceView
         shape = source.range_map.range.shape
         if source.picture.shape != (*shape, 3) or (source.mask is not None and source.mask.shape != shape):
             raise UsageError(f"source {idx}: image, mask and range map differ in size; give all of them in one size")
+
+
+# A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
+_SAME_RAY_DEG = 0.7
+
+
+@checks_settings
+def respect_free_space(
+    range_map: RangeMap,
+    pose: Rigid3,
+    sources: Sequence[RangeMap],
+    *,
+    source_poses: Sequence[Rigid3],
+    max_relative_error: Annotated[
+        float, Setting("relative difference of ranges from which on they contradict each other", gt=0, le=0.5)
+    ] = 0.05,
+    max_hole_deg: MaxHoleDeg = 20.0,
+) -> tuple[RangeMap, float, float]:
+    """Replace unconfirmed ranges behind confirmed points of other views, and remove those that other views see through.
+
+    Only confirmed pixels of the sources (confidence 128 or more) count as evidence, and only pixels that were seen but
+    are not confirmed are changed. First, the confirmed points of the sources are projected into the reference. Where
+    the nearest of them is nearer than a pixel's range by more than `max_relative_error`, the pixel takes its range.
+    Then each source is asked for the ranges that remain (`compare_with_sources`): a pixel becomes invalid if more
+    sources see through its point than agree with it. A later filter fills it from its surroundings.
+
+    Args:
+        range_map: (H, W) after `check_consistency`, the full sphere.
+        pose: its cam_from_world.
+        sources: range maps after the same check, in any order: the result does not depend on it.
+        source_poses: cam_from_world of each.
+
+    Returns:
+        The range map, the share of valid pixels with a nearer range, and the share that became invalid. Replaced ranges
+        are weak (confidence 64–127): that a point is visible from elsewhere does not confirm that it is visible here.
+
+    Raises:
+        UsageError: if sources and poses differ in number, or a setting is out of bounds.
+    """
+    if len(sources) != len(source_poses):
+        raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
+    confirmed = [require_confidence(source, min_confidence=CONSISTENT_CONFIDENCE[0]) for source in sources]
+    moved = [other @ pose.inverse() for other in source_poses]
+    weak = (range_map.confidence >= WEAK_CONFIDENCE[0]) & (range_map.confidence <= WEAK_CONFIDENCE[1])
+    nearest = _nearest_points(confirmed, moved, range_map.range.shape)
+    with np.errstate(invalid="ignore"):
+        hidden = weak & (nearest < range_map.range * (1 - max_relative_error))
+    ranges = np.where(hidden, nearest, range_map.range)
+    seen_through = weak & _seen_through(
+        np.where(weak, ranges, np.float32(np.nan)), confirmed, moved, max_relative_error=max_relative_error
+    )
+    seen_through &= ~large_holes(range_map.valid & ~seen_through, max_hole_deg)
+    ranges[seen_through] = np.nan
+    confidence = np.where(hidden, np.uint8(WEAK_CONFIDENCE[1]), range_map.confidence)
+    confidence[seen_through] = 0
+    valid = max(int(range_map.valid.sum()), 1)
+    shares = float((hidden & ~seen_through).sum() / valid), float(seen_through.sum() / valid)
+    return with_ranges(range_map, ranges, confidence), *shares
+
+
+def _nearest_points(
+    sources: Sequence[RangeMap], source_from_reference: Sequence[Rigid3], size_hw: tuple[int, int]
+) -> FloatImage:
+    """Return the nearest range at which a pixel of a source lands in each pixel, (H, W); inf where none lands."""
+    nearest = np.full(size_hw, np.inf, np.float32)
+    for source, moved in zip(sources, source_from_reference, strict=True):
+        landed, _ = project_range_map(replace(source, normals_in_cam=None), moved, size_hw)
+        nearest = np.fmin(nearest, landed)
+    return nearest
+
+
+def _seen_through(
+    ranges: FloatImage,
+    sources: Sequence[RangeMap],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    max_relative_error: float,
+) -> Mask:
+    """Return where more sources see through a point than agree with it, (H, W)."""
+    comparison = compare_with_sources(
+        ranges,
+        sources,
+        source_from_reference,
+        # A source contradicts from twice this error on.
+        max_relative_error=max_relative_error / 2,
+        max_angle=np.radians(_SAME_RAY_DEG),
+    )
+    return np.asarray(comparison.contradicting > comparison.agreeing)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.kernels_reprojection import locate_row
 from pano_mvs.algorithms.patchmatch.kernels_match import STRETCH, Sources, row_matrix
 from pano_mvs.algorithms.patchmatch.kernels_refine import Reference
+from pano_mvs.algorithms.ranges.kernels_agreement import locate_row
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, pixel_at
 
@@ -29,12 +29,10 @@ def land_nearest(
 ) -> None:
     """Keep the nearest point that lands in each pixel of a view, the first of equals.
 
-    Args:
-        places: (3, W) of the points of one row of another view: x, y and distance in this view, see `locate_row`.
-        ranges: (W,) float32 of the points in the other view, NaN is left out.
-        first_row: position of the row's first point among the points of the other view.
-        nearest: (H, W) updated: distance of the nearest point.
-        pixels: (H, W) updated: its position; −1 without any.
+    `places`: (3, W) of the points of one row of another view: x, y and distance in this view, see `locate_row`.
+    `ranges`: (W,) float32 of the points in the other view, NaN is left out. `first_row`: position of the row's first
+    point among the points of the other view. `nearest`: (H, W) updated: distance of the nearest point. `pixels`: (H, W)
+    updated: its position; −1 without any.
     """
     height, width = nearest.shape
     for i in range(len(ranges)):
@@ -54,12 +52,9 @@ def land_points(
 ) -> None:
     """Write the nearest point of a source that lands in each pixel of the reference.
 
-    Args:
-        ranges: (Hs, Ws) float32 of the source, NaN is left out.
-        grid: (2, Ws) sin θ and cos θ of its columns, (2, Hs) sin φ and cos φ of its rows.
-        view: rotation (3, 3) and translation (3,) reference_from_source.
-        nearest: (H, W) of NaN, written: the distance.
-        pixels: (H, W) of −1, written: the flat position in the source.
+    `ranges`: (Hs, Ws) float32 of the source, NaN is left out. `grid`: (2, Ws) sin θ and cos θ of its columns, (2, Hs)
+    sin φ and cos φ of its rows. `view`: rotation (3, 3) and translation (3,) reference_from_source. `nearest`: (H, W)
+    of NaN, written: the distance. `pixels`: (H, W) of −1, written: the flat position in the source.
     """
     turns, elevations = grid
     height, width = ranges.shape
@@ -80,13 +75,10 @@ def weigh_windows(
 ) -> None:
     """Do what `weigh_window` does for some pixels of a row, (n,) columns; also write sin θ and cos θ of the samples.
 
-    Args:
-        grey: (H + 2 pad, W + 2 pad) float32.
-        place: row, pad, (side,) rows and (side,) columns of the window.
-        columns: (n,) of the pixels.
-        color_scale: 1 / the difference of grey levels at which the weight is halved.
-        window: (side², n) float32 weights, which sum to 1, and centred samples, (n,) means, (n,) variances and (n,)
-            scratch space; written.
+    `grey`: (H + 2 pad, W + 2 pad) float32. `place`: row, pad, (side,) rows and (side,) columns of the window.
+    `columns`: (n,) of the pixels. `color_scale`: 1 / the difference of grey levels at which the weight is halved.
+    `window`: (side², n) float32 weights, which sum to 1, and centred samples, (n,) means, (n,) variances and (n,)
+    scratch space; written.
     """
     row, pad, rows, offsets = place
     weights, centred, means, variances, total = window
@@ -126,13 +118,10 @@ def aim_samples(
 ) -> None:
     """Write where the rays of window samples point, and where they meet the planes of their pixels.
 
-    Args:
-        planes: (3, n) float32.
-        columns: (n,) of the pixels.
-        azimuth: (2, W + 2 pad) float32 sin θ and cos θ of the columns.
-        place: row, H, pad, (side,) rows and (side,) columns of the window.
-        turns: (side, 2, n) float32, written: sin θ and cos θ of the samples in each column of the window.
-        inverse: (side², n) float32, written: q = p · d.
+    `planes`: (3, n) float32. `columns`: (n,) of the pixels. `azimuth`: (2, W + 2 pad) float32 sin θ and cos θ of the
+    columns. `place`: row, H, pad, (side,) rows and (side,) columns of the window. `turns`: (side, 2, n) float32,
+    written: sin θ and cos θ of the samples in each column of the window. `inverse`: (side², n) float32, written: q = p
+    · d.
     """
     row, height, pad, rows, offsets = place
     side = len(rows)
@@ -225,15 +214,10 @@ def correlate_pixels(
 ) -> None:
     """Write the correlation of each source with the reference, on planes of some pixels.
 
-    Args:
-        rows: the first row, and the end.
-        starts: (H + 1,) where the pixels of each row begin.
-        columns: (N,) of the pixels, row after row.
-        planes: (3, N) float32, finite.
-        reference: see `refine_rows`.
-        sources: see `sum_windows`.
-        numbers: 1 / width in grey levels of the window's weights, and noise.
-        correlations: (S, N) float32, written; −2 where a source does not count.
+    `rows`: the first row, and the end. `starts`: (H + 1,) where the pixels of each row begin. `columns`: (N,) of the
+    pixels, row after row. `planes`: (3, N) float32, finite. `reference`: see `refine_rows`. `sources`: see
+    `sum_windows`. `numbers`: 1 / width in grey levels of the window's weights, and noise. `correlations`: (S, N)
+    float32, written; −2 where a source does not count.
     """
     grey, azimuth, pad, stretches, window_rows, window_columns = reference
     packed, packed_starts, shapes, poses, valid, valid_starts = sources

@@ -10,8 +10,41 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.kernels import kernel
-from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip
+from pano_mvs.core.kernels import inlined, kernel
+from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, wrapped_column, wrapped_row
+
+# Parts of red, green and blue in 10,000; levels are in 1/256.
+_RED, _GREEN, _BLUE, _WHOLE, _FINE = 2126, 7152, 722, 10000, 256
+
+
+@kernel
+def pack_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Return all 2×2 patches of the grey levels of a picture, (H, W, 3) to (H + 1, W + 1), over the seam and the poles.
+
+    Patch (j, i) is upper left | lower left << 16 | upper right << 32 | lower right << 48 of rows j − 1, j and columns
+    i − 1, i, in 1/256 grey levels, rounded.
+    """
+    height, width, _ = picture.shape
+    grey = np.empty((height, width), np.uint64)
+    for row in range(height):
+        for column in range(np.uint64(width)):
+            red, green, blue = picture[row, column, 0], picture[row, column, 1], picture[row, column, 2]
+            level = np.int32(_RED) * red + np.int32(_GREEN) * green + np.int32(_BLUE) * blue
+            grey[row, column] = (np.uint32(level) * np.uint32(_FINE) + np.uint32(_WHOLE // 2)) // np.uint32(_WHOLE)
+    packed = np.empty((height + 1, width + 1), np.uint64)
+    for j in range(height + 1):
+        upper, lower = wrapped_row(j - 1, height), wrapped_row(j, height)
+        for i in range(width + 1):
+            upper_left, upper_right = (
+                wrapped_column(j - 1, i - 1, height, width),
+                wrapped_column(j - 1, i, height, width),
+            )
+            lower_left, lower_right = wrapped_column(j, i - 1, height, width), wrapped_column(j, i, height, width)
+            left = grey[upper, upper_left] | grey[lower, lower_left] << np.uint64(16)
+            right = grey[upper, upper_right] | grey[lower, lower_right] << np.uint64(16)
+            packed[j, i] = left | right << np.uint64(32)
+    return packed
+
 
 FloatArray = NDArray[np.float64]
 Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
@@ -45,13 +78,10 @@ def weigh_window(
 ) -> None:
     """Weight the window samples of a stretch of pixels by their similarity to the window's centre.
 
-    Args:
-        grey: (H + 2 pad, W + 2 pad) float32.
-        place: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of the window.
-        color_scale: 1 / the difference of grey levels at which the weight is halved.
-        weights: (side², n) float32, written; they sum to 1.
-        centred: (side², n) float32, written: the samples less their mean.
-        moments: (2, n) float32, written: mean and variance.
+    `grey`: (H + 2 pad, W + 2 pad) float32. `place`: row, first column, H, columns a step, pad, (side,) rows and (side,)
+    columns of the window. `color_scale`: 1 / the difference of grey levels at which the weight is halved. `weights`:
+    (side², n) float32, written; they sum to 1. `centred`: (side², n) float32, written: the samples less their mean.
+    `moments`: (2, n) float32, written: mean and variance.
     """
     row, first, _, _, pad, rows, columns = place
     n, side = weights.shape[1], len(rows)
@@ -108,15 +138,10 @@ def project_samples(
 ) -> None:
     """Project rays of one row, at inverse ranges q, into a packed source, with the derivative by q.
 
-    Args:
-        azimuth: (2, ·) float32 sin θ and cos θ of the columns.
-        first: the first column.
-        inverse: (n,) float32 q.
-        matrix: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q).
-        shape: (2,) int64 rows and columns of the source.
-        index: (n,) int32, written: position in the packed source.
-        placed: (4 · STRETCH,) float32, written: weights of the right and of the lower neighbours, dx/dq and dy/dq in
-            pixels.
+    `azimuth`: (2, ·) float32 sin θ and cos θ of the columns. `first`: the first column. `inverse`: (n,) float32 q.
+    `matrix`: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q). `shape`: (2,) int64 rows and columns of the
+    source. `index`: (n,) int32, written: position in the packed source. `placed`: (4 · STRETCH,) float32, written:
+    weights of the right and of the lower neighbours, dx/dq and dy/dq in pixels.
     """
     m00, m01, o0, t0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, o1, t1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
@@ -168,12 +193,9 @@ def add_samples(
     The sums are one array, whose rows are a constant apart: the loop is only vectorised if few arrays have to be
     proved not to overlap.
 
-    Args:
-        patches: (n,) uint64 of one window sample of each pixel.
-        placed: see `project_samples`.
-        window: (n,) float32 weights and centred samples of the reference, and means, which are subtracted from b.
-        position: columns u and rows v of the sample from the centre.
-        sums: (SUMS · STRETCH,) float32 of one source, added to.
+    `patches`: (n,) uint64 of one window sample of each pixel. `placed`: see `project_samples`. `window`: (n,) float32
+    weights and centred samples of the reference, and means, which are subtracted from b. `position`: columns u and rows
+    v of the sample from the centre. `sums`: (SUMS · STRETCH,) float32 of one source, added to.
     """
     weights, reference, means = window
     u, v = position
@@ -214,7 +236,7 @@ def add_samples(
         sums[i + _U(17) * row] += v * wga
 
 
-@kernel
+@inlined
 def row_matrix(pose: FloatArray, elevation: float, matrix: NDArray[np.float32]) -> None:
     """Write the (3, 4) matrix that takes (sin θ, cos θ, 1, q) of a row to directions in a source of pose (3, 4)."""
     level, dip = np.cos(elevation), -np.sin(elevation)
@@ -237,15 +259,12 @@ def sum_windows(
 ) -> None:
     """Sum up the windows of a stretch of pixels, on their planes, over each source.
 
-    Args:
-        planes: (3, n) float32.
-        place: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of the window.
-        azimuth: (2, W + 2 pad) float32 sin θ and cos θ of the columns.
-        window: weights and centred samples, (side², n) float32, and means (n,), of the reference.
-        sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
-            source_from_reference, (·,) uint8 which patches count, empty if all do, and (S,) where each begins.
-        sums: (S, SUMS, STRETCH) float32, written.
-        votes: (S, n) bool, written: True where the source counts for the pixel.
+    `planes`: (3, n) float32. `place`: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of
+    the window. `azimuth`: (2, W + 2 pad) float32 sin θ and cos θ of the columns. `window`: weights and centred samples,
+    (side², n) float32, and means (n,), of the reference. `sources`: (·,) uint64 packed pictures, (S,) where each
+    begins, (S, 2) their sizes, (S, 3, 4) float64 source_from_reference, (·,) uint8 which patches count, empty if all
+    do, and (S,) where each begins. `sums`: (S, SUMS, STRETCH) float32, written. `votes`: (S, n) bool, written: True
+    where the source counts for the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
     weights, centred, means = window

@@ -24,7 +24,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.view_weights import ViewWeights
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
@@ -34,6 +33,57 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
+
+# Standard deviation of the correlation, from 1, of a source that sees the surface.
+_SIGMA = 0.3
+# Pixels on either side of a pixel whose matches count for it.
+_RADIUS = 2
+# Share of the rounds before in what is known after a round.
+_MEMORY = 0.5
+
+
+class ViewWeights:
+    """The weights of all sources, and what they are made of.
+
+    `views`: (S, H, W) float32. A round replaces it by correlations, −2 where a source does not count; `update` replaces
+    these by weights, at most 1, which is that of the best source. `known`: whether `views` holds weights: from the
+    first `update` on.
+    """
+
+    def __init__(self, sources: int, size_hw: tuple[int, int]) -> None:
+        self.views: FloatImage = np.zeros((sources, *size_hw), np.float32)
+        self.known = False
+        self._match: FloatImage = np.zeros((0, *size_hw), np.float32)
+
+    def update(self) -> None:
+        """Replace correlations by weights.
+
+        The match of a source is exp(−(1 − ρ)² / 2σ²), averaged over 5 × 5 pixels, and over the rounds with half of the
+        weight for all earlier ones. Weights are the squares of the matches over the best one.
+        """
+        if not self.known:
+            self._match = np.empty_like(self.views)
+        for idx, correlation in enumerate(self.views):
+            match = _mean_around(np.exp(-(((1 - correlation) / _SIGMA) ** 2) / 2) * (correlation > -1.5))
+            self._match[idx] = _MEMORY * self._match[idx] + (1 - _MEMORY) * match if self.known else match
+        best = np.maximum(self._match.max(axis=0), np.float32(1e-6))
+        np.square(self._match / best, out=self.views)
+        self.known = True
+
+
+def _mean_around(picture: FloatImage) -> FloatImage:
+    """Return the mean over each pixel and its neighbours, across the seam and the poles; the same sum at each pixel."""
+    height, width = picture.shape
+    padded = pad_panorama(picture.astype(np.float32), _RADIUS)
+    side = 2 * _RADIUS + 1
+    rows = np.zeros((height, width + 2 * _RADIUS), np.float32)
+    for shift in range(side):
+        rows += padded[shift : shift + height]
+    result = np.zeros((height, width), np.float32)
+    for shift in range(side):
+        result += rows[:, shift : shift + width]
+    return result / np.float32(side**2)
+
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 # Maximum of a refined range, relative to the farthest swept one.
@@ -84,14 +134,6 @@ def refine_range(
         reference: (H, W, 3) uint8 RGB.
         sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
         source_from_reference: pose of each source relative to the reference.
-        rounds: number of rounds of fitting and matching planes.
-        window: number of samples along each side of the window, odd; they are two pixels apart.
-        prior_px: standard deviation of the prior of a plane's range, in pixels of parallax at the widest baseline.
-        prior_slope: standard deviation of the prior of its slopes, in pixels of parallax per pixel.
-        noise: standard deviation of image noise in grey levels, at best agreement.
-        sigma_color: difference from the window's centre in grey levels at which a sample has half weight.
-        view_weights: whether sources are weighted from the second round on, see `ViewWeights`. If not, the half of
-            the sources that matches better counts at each pixel.
         source_masks: for each source (Hs, Ws), False where it is ignored, or None.
 
     Returns:
@@ -103,7 +145,7 @@ def refine_range(
     _check(range_map, reference, sources, poses=source_from_reference, masks=source_masks)
     import numba  # slow to import
 
-    from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import
+    from pano_mvs.algorithms.patchmatch import kernels_refine  # compiles on import
 
     height, width = range_map.range.shape
     # The change of inverse range that moves a point by one pixel at the widest baseline.
@@ -129,7 +171,7 @@ def refine_range(
     max_step = _MAX_SLOPE * 2 * np.pi / width
 
     def lay(first: int, rows: int) -> None:
-        kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes)
+        kernels_refine.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes)
 
     def match(first: int, rows: int) -> None:
         kernels_refine.refine_rows(first, rows, planes, *views, numbers, weights.known, inverse, weights.views)
@@ -180,7 +222,7 @@ def source_arrays(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
 ) -> tuple[object, ...]:
     """Return the kernels' arguments for the sources, see `sum_windows`; `reach`: window size in image heights."""
-    from pano_mvs.algorithms.patchmatch.kernels_pack import pack_grey  # compiles on import
+    from pano_mvs.algorithms.patchmatch.kernels_match import pack_grey  # compiles on import
 
     pictures = [pack_grey(source).ravel() for source in sources]
     starts = np.cumsum([0, *(len(picture) for picture in pictures)])[:-1]

@@ -31,11 +31,8 @@ def spread_points(
     is closer than a disc's radius, which is proportional to the spacing (Poisson discs: Cook, "Stochastic sampling in
     computer graphics", 1986). The remaining excess is removed at random.
 
-    Args:
-        points: (M, 3).
-        spacing: (M,) wanted distance to the neighbours at each point, in any unit: only ratios matter.
-        count: number of points to keep; all, if there are fewer.
-        rng: draws the order and the excess.
+    `points`: (M, 3). `spacing`: (M,) wanted distance to the neighbours at each point, in any unit: only ratios matter.
+    `count`: number of points to keep; all, if there are fewer. `rng`: draws the order and the excess.
 
     Returns:
         (min(count, M),) positions in `points`, ascending.

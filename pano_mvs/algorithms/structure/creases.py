@@ -50,13 +50,10 @@ _PAD_PX = 4
 class ScenePlane:
     """The plane n · X = offset.
 
-    Attributes:
-        normal: (3,) unit normal n in the world, towards the side from which it was seen.
-        offset: in scene units.
-        support: solid angle of its points, summed over views.
-        precise_support: that of confirmed points with texture.
-        uncertainty: relative standard deviation of ranges on it.
-        is_level: whether the normal is vertical; else it is horizontal.
+    `normal`: (3,) unit normal n in the world, towards the side from which it was seen. `offset`: in scene units.
+    `support`: solid angle of its points, summed over views. `precise_support`: that of confirmed points with texture.
+    `uncertainty`: relative standard deviation of ranges on it. `is_level`: whether the normal is vertical; else it is
+    horizontal.
     """
 
     normal: NDArray[np.float64]
@@ -83,10 +80,8 @@ def placed_by_creases(
 ) -> list[ScenePlane]:
     """Return the planes, in the same order, moved to where the pictures show their creases.
 
-    Args:
-        views: of one group, in whose world y points down along gravity.
-        planes: found in ranges.
-        max_relative_error: of ranges on a plane.
+    `views`: of one group, in whose world y points down along gravity. `planes`: found in ranges. `max_relative_error`:
+    of ranges on a plane.
     """
     creases = _creases(views, planes, max_relative_error)
     heights = np.array([plane.y if plane.is_level else np.nan for plane in planes])
@@ -115,14 +110,10 @@ def placed_by_creases(
 class _Creases:
     """The samples of all creases of one upright plane.
 
-    Attributes:
-        azimuth: (S,) in the world.
-        dip: (S,) angle below the horizon at which each profile has its middle.
-        center: (S, 3) of the camera.
-        level: (S,) the level plane that it meets.
-        starts: first sample of each crease of one view.
-        fine: (S, 2 reach + 1, 3) differences of colours across the crease, at each step below the middle.
-        coarse: the same, blurred along the profile.
+    `azimuth`: (S,) in the world. `dip`: (S,) angle below the horizon at which each profile has its middle. `center`:
+    (S, 3) of the camera. `level`: (S,) the level plane that it meets. `starts`: first sample of each crease of one
+    view. `fine`: (S, 2 reach + 1, 3) differences of colours across the crease, at each step below the middle. `coarse`:
+    the same, blurred along the profile.
     """
 
     azimuth: FloatArray
@@ -280,12 +271,8 @@ def _profiles(
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return azimuths (S,), dips (S,) and differences of colour (S, 2 reach + 1, 3) of a crease; None if not seen.
 
-    Args:
-        view: the view.
-        upright: the upright plane.
-        level_y: height of the level one.
-        picture: the panorama, padded and blurred.
-        sides: (h, w) pixels that show the upright plane, and the level one.
+    `view`: the view. `upright`: the upright plane. `level_y`: height of the level one. `picture`: the panorama, padded
+    and blurred. `sides`: (h, w) pixels that show the upright plane, and the level one.
     """
     center = view.cam_from_world.center
     across = np.stack([np.sin(_AZIMUTHS_RAD), np.cos(_AZIMUTHS_RAD)], axis=-1)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.guided import guided_values
-from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.filters.supported import has_texture
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.structure.view import FloatArray, Mask, Picture, on_grid, plane_ranges, stride_of
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
@@ -62,8 +62,6 @@ def lay_structure(
         source_poses: cam_from_world of each.
         group: of the poses of the view.
         valid: (H, W) pixels that may have a range; None: all.
-        textured_error: maximum relative error of a confirmed pixel with texture that is moved.
-        plain_error: the same of a confirmed pixel without texture. Other pixels without texture move any distance.
 
     Returns:
         The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
@@ -77,10 +75,7 @@ def lay_structure(
     tolerance = np.where(textured & (range_map.confidence >= CONSISTENT_CONFIDENCE[0]), textured_error, plain_error)
     on_planes = [
         plane_ranges(
-            rays,
-            cam_from_world.center,
-            normal=structure.normals_in_world[idx],
-            offset=float(structure.offsets[idx]),
+            rays, cam_from_world.center, normal=structure.normals_in_world[idx], offset=float(structure.offsets[idx])
         )
         for idx in planes
     ]

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.support.supported import has_texture
+from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
@@ -29,15 +29,9 @@ _GRAZING = 0.02
 class PlaneView:
     """A view on every n-th row and column, so that about 256 rows remain.
 
-    Attributes:
-        load: returns the panorama, (H, W, 3) RGB at full resolution.
-        cam_from_world: its pose.
-        rays: (h, w, 3) unit rays in the world.
-        ranges: (h, w), NaN is invalid.
-        confidence: (h, w).
-        uncertainty: (h, w) relative standard deviation of the ranges.
-        precise: (h, w) confirmed pixels with texture.
-        area: (h, w) solid angle.
+    `load`: returns the panorama, (H, W, 3) RGB at full resolution. `cam_from_world`: its pose. `rays`: (h, w, 3) unit
+    rays in the world. `ranges`: (h, w), NaN is invalid. `confidence`: (h, w). `uncertainty`: (h, w) relative standard
+    deviation of the ranges. `precise`: (h, w) confirmed pixels with texture. `area`: (h, w) solid angle.
     """
 
     load: Callable[[], Picture]
@@ -63,10 +57,7 @@ def on_grid(pixels: NDArray[Value], stride: int) -> NDArray[Value]:
 def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world: Rigid3) -> PlaneView:
     """Return what the search for planes reads of a view.
 
-    Args:
-        range_map: (H, W), the full sphere.
-        load: returns the panorama, (H, W, 3) RGB.
-        cam_from_world: its pose.
+    `range_map`: (H, W), the full sphere. `load`: returns the panorama, (H, W, 3) RGB. `cam_from_world`: its pose.
     """
     size = range_map.range.shape
     stride = stride_of((size[0], size[1]))

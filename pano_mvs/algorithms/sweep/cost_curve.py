@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import combined_cost, path_step, winners_of
-from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged_at
-from pano_mvs.algorithms.sweep.no_match import has_match
+from pano_mvs.algorithms.sweep.edge_support import averaged_at
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput, valid_where_seen
+from pano_mvs.algorithms.sweep.preparation import SweepInput, has_match, valid_where_seen
 from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -27,10 +26,7 @@ from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
 def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Return the mean costs of pixels before the decision, (D, N), combined from the sources, not scaled.
 
-    Args:
-        work: what is swept.
-        rows: (N,) of the pixels.
-        columns: (N,) likewise.
+    `work`: what is swept. `rows`: (N,) of the pixels. `columns`: (N,) likewise.
     """
     if work.settings.matching_cost.kernel is None:
         planes = [combined_cost(work, virtual_range)[rows, columns] for virtual_range in work.ranges]
@@ -41,10 +37,16 @@ def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]
 def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Sweep the tiles in which the pixels lie, range by range: the winner's cost is then that of the range."""
     # On use: numba is slow to import.
-    from pano_mvs.algorithms.sweep.numba.arguments import NO_VOLUME, fresh_state, sweep_arguments
+    from pano_mvs.algorithms.sweep.numba.arguments import (
+        NO_VOLUME,
+        fresh_state,
+        run_arguments,
+        runs_of,
+        sweep_arguments,
+        tile_means,
+    )
     from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
     from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
-    from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, tile_means
 
     height, width = work.reference.shape[:2]
     wanted = np.zeros((height, width), np.bool_)
@@ -94,19 +96,14 @@ _PATHS, _WORST = 8, 255
 class CostCurve:
     """The costs of one pixel at every depth hypothesis, as shares of the worst cost; a chance match has ½.
 
-    Attributes:
-        ranges: (D,) depth hypotheses in scene units, ascending.
-        by_source: (S, D) cost in each source; NaN where the source is not valid.
-        raw: (D,) cost combined from the sources, before the decision.
-        aggregated: (D,) mean cost of the eight paths of semi-global matching, what steps between the planes cost
-            included, so it may exceed 1; None if it is not asked for.
-        winner: index of the range that wins.
-        runner_up: index of the bottom of the deepest other valley; None if there is none.
-        uniqueness: how much cheaper the winner is than the best range that is not next to it, as a share of that one's
-            cost: 0 says that both are as good. The confidence "peak_ratio" is made of it.
-        range: of the pixel, between the hypotheses, as `selection` says; NaN if the sweep leaves it without.
-        confidence: 64–127, or 0 where there is no range.
-        reason: why it has no range; empty if it has.
+    `ranges`: (D,) depth hypotheses in scene units, ascending. `by_source`: (S, D) cost in each source; NaN where the
+    source is not valid. `raw`: (D,) cost combined from the sources, before the decision. `aggregated`: (D,) mean cost
+    of the eight paths of semi-global matching, what steps between the planes cost included, so it may exceed 1; None if
+    it is not asked for. `winner`: index of the range that wins. `runner_up`: index of the bottom of the deepest other
+    valley; None if there is none. `uniqueness`: how much cheaper the winner is than the best range that is not next to
+    it, as a share of that one's cost: 0 says that both are as good. The confidence "peak_ratio" is made of it. `range`:
+    of the pixel, between the hypotheses, as `selection` says; NaN if the sweep leaves it without. `confidence`: 64–127,
+    or 0 where there is no range. `reason`: why it has no range; empty if it has.
     """
 
     ranges: FloatArray
@@ -132,11 +129,8 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     They are those of a sweep from which every range is tried everywhere (`levels` 1), by the compiled backend for
     built-in costs and by the readable one for a plugin's, which takes as long as a sweep by it.
 
-    Args:
-        work: what would be swept, see `sweep_input`.
-        column: of the pixel, from 0.
-        row: likewise.
-        masked: whether the reference is masked there.
+    `work`: what would be swept, see `sweep_input`. `column`: of the pixel, from 0. `row`: likewise. `masked`: whether
+    the reference is masked there.
 
     Raises:
         UsageError: if the image has no such pixel.
@@ -155,10 +149,7 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     winners = winners_of(decisive[None, :, None])
     reason = _why_not(work, winners, row=row, column=column, masked=masked)
     found = range_map_from_winners(
-        winners,
-        range_at=work.range_at,
-        settings=work.settings,
-        seen=np.full((1, 1), not reason),
+        winners, range_at=work.range_at, settings=work.settings, seen=np.full((1, 1), not reason)
     )
     winner = int(winners.plane[0, 0])
     return CostCurve(

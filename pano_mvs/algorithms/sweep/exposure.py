@@ -56,12 +56,8 @@ def match_exposure(
     Geman–McClure weights on a straight line through (source, reference) colours for each channel: occluded and wrong
     pixels drop out. Too few pixels, or a fit beyond reason, leave the channel as it is.
 
-    Args:
-        reference: (H, W, C) uint8.
-        source: (Hs, Ws, C) uint8.
-        source_from_reference: pose.
-        ranges: (h, w) rough ranges of the reference, at any resolution; NaN is left out.
-        source_mask: (Hs, Ws) False is left out.
+    `reference`: (H, W, C) uint8. `source`: (Hs, Ws, C) uint8. `source_from_reference`: pose. `ranges`: (h, w) rough
+    ranges of the reference, at any resolution; NaN is left out. `source_mask`: (Hs, Ws) False is left out.
     """
     return _exposure_of(source, source_from_reference, _Known.of(reference, ranges), source_mask=source_mask)
 
@@ -70,10 +66,8 @@ def match_exposure(
 class _Known:
     """What every source is compared with: pixels of the reference whose range is known roughly.
 
-    Attributes:
-        points: (N, 3) in the reference's frame.
-        colors: (N, C) of the reference, smoothed.
-        cut_off: (N, 1) how much of the colours may have been cut off, 255 is all.
+    `points`: (N, 3) in the reference's frame. `colors`: (N, C) of the reference, smoothed. `cut_off`: (N, 1) how much
+    of the colours may have been cut off, 255 is all.
     """
 
     points: NDArray[np.float64]

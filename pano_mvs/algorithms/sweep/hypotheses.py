@@ -36,13 +36,9 @@ def range_at(
     baseline, where a point moves by the same angle in a source from plane to plane, and even in log range within it,
     where a source sees the point at a right angle or from behind and 1/range would place most planes.
 
-    Args:
-        positions: of any shape.
-        near: the nearest depth hypothesis.
-        far: the farthest one, in the same unit.
-        planes: number of depth hypotheses.
-        spacing: what is even.
-        baseline: usual distance of the sources from the reference, for "parallax"; 0 is the same as "inverse".
+    `positions`: of any shape. `near`: the nearest depth hypothesis. `far`: the farthest one, in the same unit.
+    `planes`: number of depth hypotheses. `spacing`: what is even. `baseline`: usual distance of the sources from the
+    reference, for "parallax"; 0 is the same as "inverse".
 
     Raises:
         UsageError: unless 0 < near < far, both finite.
@@ -66,9 +62,8 @@ def range_at(
 def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, float]:
     """Return the limits of what a sweep can see, from the cameras alone.
 
-    Args:
-        baselines: distances from the reference to its sources, in scene units; at least one positive.
-        width: columns of the reference picture: one pixel at the equator is 2π/width.
+    `baselines`: distances from the reference to its sources, in scene units; at least one positive. `width`: columns of
+    the reference picture: one pixel at the equator is 2π/width.
 
     Returns:
         (near, far): half of the mean baseline, and the range b / (½ px), where b is the longest baseline, at which

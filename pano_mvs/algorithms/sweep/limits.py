@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
-from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_at, range_limits
-from pano_mvs.algorithms.sweep.no_match import is_bare
+from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
@@ -62,12 +62,9 @@ def limits_by_sweeping(
     If a small sweep between these limits ends in the nearest planes on a large area without texture, the surface there
     may be nearer than all that have texture. The near limit is then lowered until no such area is left.
 
-    Args:
-        pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
-        cams_from_world: pose of each.
-        masks: (H, W) of each, False is ignored.
-        backend: of the small sweeps; numba where it does not have their cost.
-        device: where it computes, if it can choose.
+    `pictures`: the reference, then its sources, (H, W, 3) uint8 RGB each. `cams_from_world`: pose of each. `masks`: (H,
+    W) of each, False is ignored. `backend`: of the small sweeps; numba where it does not have their cost. `device`:
+    where it computes, if it can choose.
 
     Returns:
         (near, far); from the baselines and the angular resolution alone where no more than 1 % of what is not masked

@@ -1,4 +1,9 @@
-"""Prepare images for a sweep: filter them, match their exposure, convert them to grey for census and correlation."""
+"""What a backend is given, and the checks of what it finds.
+
+Pictures are filtered, matched in exposure and converted to grey for census and correlation. The costs of sources are
+weighted alike or by parallax. A winner counts where a source sees it and where it has a match, unlike the sky and
+surfaces without texture, where all ranges cost about the same.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, rotate_panorama
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, rotate_panorama
 
 # Rec. 709 luma in 1/256.
 _LUMA = np.array([54, 183, 19])
@@ -166,3 +171,73 @@ def valid_where_seen(valid: NDArray[np.bool_], points_in_source: NDArray[np.floa
     column = np.floor(pixels[..., 0]).astype(np.intp) % width
     row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
     return np.asarray(valid[row, column])
+
+
+# Of all weight this share is dealt out equally where no source sees range, so that something is compared at all.
+_EQUAL_SHARE = 1e-3
+
+
+def source_weights(
+    size_hw: tuple[int, int], source_from_reference: Sequence[Rigid3], settings: SweepSettings
+) -> NDArray[np.float32]:
+    """Return the weight of every source at every pixel, (S, H, W), with a sum of 1; (0, 0, 0) if all are equal."""
+    if settings.combination != "parallax_weighted":
+        return np.zeros((0, 0, 0), np.float32)
+    return parallax_weights(size_hw, source_from_reference)
+
+
+def parallax_weights(size_hw: tuple[int, int], source_from_reference: Sequence[Rigid3]) -> NDArray[np.float32]:
+    """Return weights in proportion to the parallax by which a source would notice a change of range, (S, H, W).
+
+    A point at range r along the ray f is seen from a source at C, in the reference's frame, under a direction that
+    turns by |f × C| for a unit of 1/r, r ≫ |C|: by the baseline times the sine of the angle between ray and baseline.
+    It vanishes at the epipoles, where the source sees the point in the same place at any range.
+
+    `size_hw`: of the reference. `source_from_reference`: pose of each source.
+    """
+    rays = ray_grid(size_hw)
+    parallax = np.stack([np.linalg.norm(np.cross(rays, pose.center), axis=-1) for pose in source_from_reference])
+    parallax += _EQUAL_SHARE * max(float(np.linalg.norm(pose.center)) for pose in source_from_reference) + 1e-12
+    return np.asarray(parallax / parallax.sum(axis=0), dtype=np.float32)
+
+
+# Grey levels between the darkest and the brightest pixel of a window below which it is bare.
+_MIN_CONTRAST = 10
+_CONTRAST_RADIUS = 2
+# The nearest planes are this share of all.
+_NEAREST_SHARE = 0.03
+# The last plane is as good as infinitely far if parallax there is less than this.
+_MIN_PARALLAX_PX = 1.0
+
+
+def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
+    """Return where the winner means something, (H, W).
+
+    Limits lie a little outside the scene, so that few surfaces are at a limit. A pixel that runs to the nearest
+    planes or to the last one has no match if its surroundings are bare: a chance decided. (Near planes are blurred, and
+    so win on bare walls more often than others.) One that runs to the last plane has none either if that plane looks
+    the same as infinity: it is the sky, or something that turns with the camera, and any range beyond the last plane
+    but one would do as well. Everything else is kept: what is bare between the limits was filled in from its
+    surroundings, mostly rightly.
+    """
+    planes = work.settings.planes
+    last = winners.plane == planes - 1
+    first = winners.plane < max(1, round(_NEAREST_SHARE * planes))
+    baseline = max(float(np.linalg.norm(pose.translation)) for pose in work.source_from_reference)
+    parallax_px = baseline / work.ranges[-1] * work.reference.shape[1] / (2 * np.pi)
+    unmatched = (last | first) & is_bare(work.reference)
+    if parallax_px < _MIN_PARALLAX_PX:
+        unmatched |= last
+    return np.asarray(~unmatched)
+
+
+def is_bare(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W), around which no colour of a picture (H, W, C) changes enough to be matched."""
+    radius = _CONTRAST_RADIUS
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    bare = np.ones(picture.shape[:2], np.bool_)
+    for plane in np.moveaxis(picture, -1, 0):
+        padded = np.ascontiguousarray(pad_panorama(plane, radius))
+        contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
+        bare &= contrast[radius:-radius, radius:-radius] < _MIN_CONTRAST
+    return bare

@@ -6,8 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pano_mvs.algorithms.sweep.costs.cost import SweepCost
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, SweepCost
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import check_settings, setting
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends.registry import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
-from pano_mvs.algorithms.sweep.no_match import has_match
 from pano_mvs.algorithms.sweep.preparation import (
     SweepInput,
     derotated,
+    has_match,
     pixels_with_valid_window,
     prepare_colors,
     prepare_picture,
@@ -55,18 +55,13 @@ def sweep_range(
 ) -> RangeMap:
     """Return the range of every pixel of a reference panorama.
 
-    Args:
-        reference: (H, W, 3) uint8 RGB, the full sphere, W even, H and W at least 16.
-        sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
-        source_from_reference: the pose of each source: x_in_source = R x_in_reference + t, t in scene units.
-        near: the nearest depth hypothesis, in scene units.
-        far: the farthest one.
-        settings: how to sample, compare and decide.
-        backend: "numba", compiled; "numpy", the readable reference (the whole volume in memory); "opencv"; or the
-            name of a plugin's.
-        device: where a backend that can choose computes: "auto", "cpu", "cuda", "cuda:1".
-        reference_mask: (H, W) False where the reference is to be ignored: NaN in the result.
-        source_masks: for each source (Hs, Ws), False where it is not valid, or None.
+    `reference`: (H, W, 3) uint8 RGB, the full sphere, W even, H and W at least 16. `sources`: one or more (Hs, Ws, 3)
+    uint8 RGB, each of its own size. `source_from_reference`: the pose of each source: x_in_source = R x_in_reference +
+    t, t in scene units. `near`: the nearest depth hypothesis, in scene units. `far`: the farthest one. `settings`: how
+    to sample, compare and decide. `backend`: "numba", compiled; "numpy", the readable reference (the whole volume in
+    memory); "opencv"; or the name of a plugin's. `device`: where a backend that can choose computes: "auto", "cpu",
+    "cuda", "cuda:1". `reference_mask`: (H, W) False where the reference is to be ignored: NaN in the result.
+    `source_masks`: for each source (Hs, Ws), False where it is not valid, or None.
 
     Returns:
         Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
@@ -115,11 +110,7 @@ def sweep_input(
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(
-        near,
-        far,
-        planes=settings.planes,
-        spacing=settings.spacing,
-        baseline=mean_baseline_of(source_from_reference),
+        near, far, planes=settings.planes, spacing=settings.spacing, baseline=mean_baseline_of(source_from_reference)
     )
     if settings.exposure and settings.matching_cost.minds_exposure:
         rough = _rough_range(

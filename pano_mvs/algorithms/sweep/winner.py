@@ -71,11 +71,9 @@ def range_map_from_winners(
 ) -> RangeMap:
     """Return the range and the confidence of every pixel, NaN and 0 where it was not seen.
 
-    Args:
-        winners: of all pixels.
-        range_at: returns the ranges at positions between the planes, see `SweepInput.range_at`.
-        settings: planes, selection and confidence.
-        seen: (H, W) where the reference is valid and at least one source saw the winner.
+    `winners`: of all pixels. `range_at`: returns the ranges at positions between the planes, see `SweepInput.range_at`.
+    `settings`: planes, selection and confidence. `seen`: (H, W) where the reference is valid and at least one source
+    saw the winner.
     """
     result, sure = np.empty(seen.shape, np.float32), np.empty(seen.shape, np.uint8)
     for first in range(0, len(seen), _ROWS_AT_ONCE):  # in 64 bits, whole pictures would take gigabytes at 8192×4096

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.rendering.cloud import draw_cloud
-from pano_mvs.algorithms.rendering.viewpoints import viewpoints
+from pano_mvs.algorithms.rendering import draw_cloud, viewpoints
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation

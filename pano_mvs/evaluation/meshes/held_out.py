@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.mesh.surface import Mesh
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
-from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.algorithms.mesh.visibility import surface_view
-from pano_mvs.algorithms.rendering.mesh import picture_from_texture, picture_from_vertices, reduced_picture
+from pano_mvs.algorithms.rendering import picture_from_texture, picture_from_vertices, reduced_picture
 from pano_mvs.core.arrays import Picture
 from pano_mvs.evaluation.meshes.picture_scores import PictureScores, picture_scores
 from pano_mvs.geometry import Rigid3

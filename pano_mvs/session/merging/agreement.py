@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pano_mvs.algorithms.blocks.alignment import MIN_COMMON, BlockAlignment, BlockLink
+from pano_mvs.algorithms.blocks import MIN_COMMON, BlockAlignment, BlockLink
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import plural
 from pano_mvs.session.merging.block import Block

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.blocks.merging import MergedBlocks, nearest_owners
+from pano_mvs.algorithms.blocks import MergedBlocks, nearest_owners
 from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.core.files import copy_file, replacing, write_text
 from pano_mvs.core.paths import resolved

@@ -9,8 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
 import pano_mvs
-from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks
-from pano_mvs.algorithms.blocks.merging import MergedBlocks, merge_blocks
+from pano_mvs.algorithms.blocks import BlockAlignment, MergedBlocks, align_blocks, merge_blocks
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.core.files import OUTPUT_MARK

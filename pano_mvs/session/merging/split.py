@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.blocks.division import divide_capture
+from pano_mvs.algorithms.blocks import divide_capture
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.io.images.captures import list_pictures

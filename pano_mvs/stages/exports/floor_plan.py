@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan, strip_px
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid
-from pano_mvs.algorithms.floor_plan.storeys import Storey, find_storeys
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, Storey, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
 from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
 from pano_mvs.core.arrays import FloatArray

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.faces.layout import Face, panorama_faces
-from pano_mvs.algorithms.faces.pictures import face_image, face_mask
-from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
+from pano_mvs.algorithms.faces.render import face_confidence, face_image, face_mask, face_normals, face_z_depth
 from pano_mvs.api import (
     Context,
     FilePart,

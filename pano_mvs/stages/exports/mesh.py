@@ -7,8 +7,15 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.mesh.poisson import MIN_POINTS, poisson_depth, solve_poisson
-from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
+from pano_mvs.algorithms.mesh.surface import (
+    MIN_POINTS,
+    Mesh,
+    point_spacings,
+    poisson_depth,
+    solve_poisson,
+    trimmed_mesh,
+    without_crumbs,
+)
 from pano_mvs.api import Context, Files, InputError, One, PointCloud, Poses, stage
 from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh

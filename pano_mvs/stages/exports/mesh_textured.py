@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.mesh.atlas import unwrapped
-from pano_mvs.algorithms.mesh.decimate import decimated
-from pano_mvs.algorithms.mesh.free_space import FreeSpace
+from pano_mvs.algorithms.mesh.surface import FreeSpace, Mesh, decimated, used_part, without_crumbs
 from pano_mvs.algorithms.mesh.texture import TexturedMesh, balanced_views, textured
-from pano_mvs.algorithms.mesh.triangles import Mesh, used_part, without_crumbs
 from pano_mvs.algorithms.mesh.view_quality import PaintView
 from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.io.meshes.glb_writer import write_glb

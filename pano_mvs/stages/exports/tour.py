@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.faces.levelled import Facing, level_from_world, turned_panorama
+from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, Pose, Poses, RangeMap, stage
 from pano_mvs.io.colmap.image_copies import write_picture
 from pano_mvs.io.images.gpano_writer import add_level_gpano

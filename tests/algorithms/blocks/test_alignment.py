@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.blocks.alignment import BlockAlignment, align_blocks, similarity_from_cameras
+from pano_mvs.algorithms.blocks import BlockAlignment, align_blocks, similarity_from_cameras
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.blocks.walked_blocks import bent, block_of, some_world, walk
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pano_mvs.algorithms.blocks.division import divide_capture
+from pano_mvs.algorithms.blocks import divide_capture
 from pano_mvs.core.errors import UsageError
 
 NAMES = [f"{idx:03d}.png" for idx in range(200)]

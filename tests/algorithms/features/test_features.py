@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.faces.icosahedron import face_centers, tangent_tiles
+from pano_mvs.algorithms.faces.layout import face_centers, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.sphorb import extract_sphorb

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.faces.icosahedron import face_centers
+from pano_mvs.algorithms.faces.layout import face_centers
 from pano_mvs.algorithms.features import sphorb
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid
 from pano_mvs.algorithms.features.smoothing import smooth_panorama

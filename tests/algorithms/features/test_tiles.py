@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.icosahedron import beyond_face_rad, face_centers, tangent_tiles
+from pano_mvs.algorithms.faces.layout import beyond_face_rad, face_centers, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features import tangent, tile_sampling
 from pano_mvs.algorithms.features.tile_sampling import owned_pixels, sample_tile

@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, solve_bilateral
-from pano_mvs.algorithms.filters.confidence import confidence_weight
+from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, solve_bilateral, sphere_cells
 from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS
-from pano_mvs.algorithms.filters.sphere.cells import sphere_cells
-from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
@@ -126,13 +123,6 @@ def test_it_keeps_an_edge_that_the_picture_shows_and_smooths_one_that_it_does_no
     assert np.abs(blurred / ranges - 1)[40:90, 60:68].mean() > 0.15
 
 
-@pytest.mark.parametrize("domain", ["inverse", "range"])
-def test_a_sphere_stays_a_sphere(domain: Literal["range", "inverse"]) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
-    solved = smooth_all(as_map(np.full((64, 128), 2.5)), image, domain=domain, smoothness=100)
-    np.testing.assert_allclose(solved.range, 2.5, rtol=1e-5)
-
-
 def test_a_plane_keeps_its_slant() -> None:
     """A ceiling all over the upper half, in one colour: linear weights and 1/range leave no staircase."""
     size = (256, 512)
@@ -157,17 +147,6 @@ def test_rolling_the_input_rolls_the_output(view: View, columns: int) -> None:
     # No worse at the old and the new seam than elsewhere.
     seam = change[:, [0, 1, -1, columns - 1, columns % SIZE[1]]]
     assert np.quantile(seam, 0.9) < 2 * np.quantile(change, 0.9) + 1e-3
-
-
-def test_no_crack_at_the_seam_and_the_poles() -> None:
-    """Noise around a ball is smoothed over the seam and the poles as it is elsewhere."""
-    noisy = harmed(np.full(SIZE, 2.0))
-    solved = smooth_all(noisy, np.full((*SIZE, 3), 90, np.uint8)).range
-    seam = np.abs(solved[:, 0] - solved[:, -1])[20:-20]
-    assert seam.mean() < 2 * np.abs(np.diff(solved, axis=1))[20:-20].mean()
-    for pole in (0, -1):
-        over = np.abs(solved[pole] - np.roll(solved[pole], SIZE[1] // 2))
-        assert over.mean() < 2 * np.abs(np.diff(solved, axis=0)).mean()
 
 
 def test_holes_are_filled_and_marked_and_nothing_else_is(view: View) -> None:
@@ -197,58 +176,10 @@ def test_no_range_anywhere_is_returned_as_it_is() -> None:
     assert smooth_all(empty, np.zeros((16, 32, 3), np.uint8)) is empty
 
 
-def test_units_do_not_matter(view: View) -> None:
-    image, truth = view
-    broken = harmed(truth)
-    thousand = RangeMap(broken.range * np.float32(1000), broken.confidence)
-    for domain in ("inverse", "range"):
-        np.testing.assert_allclose(
-            smooth_all(thousand, image, domain=domain).range,
-            1000 * smooth_all(broken, image, domain=domain).range,
-            rtol=1e-3,
-        )
-
-
-def test_more_smoothness_is_smoother(view: View) -> None:
-    image, truth = view
-    broken = harmed(truth)
-    rough = [
-        np.abs(np.diff(smooth_all(broken, image, smoothness=smoothness).range, axis=1)).mean()
-        for smoothness in (0.5, 8, 128)
-    ]
-    assert rough == sorted(rough, reverse=True)
-
-
-def test_weights_follow_the_bands() -> None:
-    weight = confidence_weight(np.array([0, 1, 63, 64, 127, 128, 255], np.uint8))
-    assert weight[0] == 0
-    assert weight[-1] == 1
-    assert (np.diff(weight) > 0).all()
-    assert weight[5] > 20 * weight[4] > 20 * 5 * weight[2]
-
-
 def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view: View) -> None:
     image, truth = view
     weak, sure = as_map(harmed(truth).range, 100), as_map(harmed(truth).range, 200)
     np.testing.assert_allclose(smooth_all(weak, image).range, smooth_all(sure, image).range, rtol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"sigma_luma": 1}, "at least 2.1"),
-        ({"sigma_spatial": 0.5}, "sigma_spatial"),
-        ({"smoothness": -1}, "smoothness"),
-    ],
-)
-def test_impossible_settings_are_named(view: View, settings: dict[str, Any], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        smooth_all(as_map(view[1]), view[0], **settings)
-
-
-def test_a_guide_of_another_size_is_refused(view: View) -> None:
-    with pytest.raises(UsageError, match="guide must be"):
-        smooth_all(as_map(view[1]), view[0][::2, ::2])
 
 
 @pytest.mark.parametrize("height", [25, 50, 75, 100, 150])

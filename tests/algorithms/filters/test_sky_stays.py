@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.consistency import checked_with_agreement
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
-from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
-from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
+from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.core.errors import ContractError

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
-from pano_mvs.algorithms.filters.support.supported import supported_pixels
+from pano_mvs.algorithms.filters.supported import supported_pixels
 from pano_mvs.scene import RangeMap
 
 SIZE = 32, 64

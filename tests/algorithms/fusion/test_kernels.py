@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
-from pano_mvs.algorithms.fusion.kernels_fuse import add_source
-from pano_mvs.algorithms.fusion.kernels_support import find_supported
+from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
+from pano_mvs.algorithms.sphere_windows import columns_per_step
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec, sines_of_grid
 from tests.oracles import fusion as oracle
 
@@ -67,7 +66,7 @@ def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> Non
     assert 0 < (colored & ~merged).sum() < merged.sum()
 
 
-@pytest.mark.kernel("fusion.kernels_support")
+@pytest.mark.kernel("fusion.kernels_fuse")
 @pytest.mark.parametrize("least", [0.2, 0.4])
 def test_support_of_a_surface_equals_the_plain_count(least: float) -> None:
     rng = np.random.default_rng(21)

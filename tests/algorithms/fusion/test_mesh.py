@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import pyvista
 
-from pano_mvs.algorithms.mesh import poisson
-from pano_mvs.algorithms.mesh.poisson import poisson_depth, solve_poisson
-from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
+from pano_mvs.algorithms.mesh import surface
+from pano_mvs.algorithms.mesh.surface import (
+    Mesh,
+    point_spacings,
+    poisson_depth,
+    solve_poisson,
+    trimmed_mesh,
+    without_crumbs,
+)
 from pano_mvs.api import Context, InputError, PointCloud
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.ply_writer import write_ply
@@ -130,7 +136,7 @@ def test_points_without_a_surface_are_refused(tmp_path: Path) -> None:
 
 def test_a_solver_that_crashes_is_an_error_of_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Natively, as COLMAP's own trimming does on an empty surface: the process goes on."""
-    monkeypatch.setattr(poisson, "_SOLVE", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    monkeypatch.setattr(surface, "_SOLVE", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     write_ply(tmp_path / "cloud.ply", room_cloud(200))
     with pytest.raises(InputError, match=r"the Poisson solver ended with code -9 at depth 6: try another `depth`"):
         solve_poisson(tmp_path / "cloud.ply", tmp_path, depth=6, point_weight=1.0)

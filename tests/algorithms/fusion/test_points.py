@@ -9,10 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.points.kernels_seen import see_points
-from pano_mvs.algorithms.points.samples import sample_surface
 from pano_mvs.algorithms.points.selection import spread_points
-from pano_mvs.algorithms.points.tracking import track_points
+from pano_mvs.algorithms.points.tracking import sample_surface, track_points
+from pano_mvs.algorithms.ranges.kernels_agreement import see_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Poses, RangeMap
@@ -162,12 +161,6 @@ def test_few_neighbours_make_short_tracks_that_have_the_own_view(room: Room) -> 
     assert np.bincount(alone.track_point_idx).min() >= 1
 
 
-def test_the_same_draw_is_the_same_points(room: Room) -> None:
-    one, other = tracked(room, count=700), tracked(room, count=700)
-    np.testing.assert_array_equal(one.points_in_world, other.points_in_world)
-    np.testing.assert_array_equal(one.track_bearings, other.track_bearings)
-
-
 def test_views_without_samples_or_pose_are_left_out(room: Room) -> None:
     poses, maps, samples = room
     found = tracked((poses, maps, {NAMES[0]: samples[NAMES[0]], "c.png": samples[NAMES[1]]}), count=50, min_views=1)
@@ -190,13 +183,7 @@ def test_points_join_poses_behind_or_in_place_of_theirs(room: Room) -> None:
     assert len(joined.track_point_idx) == int((found.track_image_idx == 1).sum())
 
 
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"min_views": 0}, {"neighbours": 0}, {"max_relative_error": 0.0}])
-def test_settings_out_of_bounds_are_refused(room: Room, wrong: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match=r"must be (positive|at least 1)"):
-        tracked(room, **wrong)
-
-
-@pytest.mark.kernel("points.kernels_seen")
+@pytest.mark.kernel("ranges.kernels_agreement")
 def test_the_compiled_test_is_the_plain_one(room: Room) -> None:
     """On points of the room, some moved, and a range map with holes and doubtful pixels."""
     poses, maps, samples = room

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.keyframes.parallax import REDUCED_HW, Motion, ParallaxTracker, reduced_grey
+from pano_mvs.algorithms.keyframes import REDUCED_HW, Motion, ParallaxTracker, reduced_grey
 from tests.algorithms.keyframes.walked_room import grey_from
 
 

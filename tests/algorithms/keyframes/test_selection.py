@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.keyframes.selection import KeyframeSettings, SmallFrame, select_keyframes
+from pano_mvs.algorithms.keyframes import KeyframeSettings, SmallFrame, select_keyframes
 from tests.algorithms.keyframes.walked_room import PER_S, frames_along, grey_from
 
 NORMAL = KeyframeSettings(parallax_deg=8.0, min_s=0.2, max_s=None)
@@ -95,8 +95,3 @@ def test_without_texture_frames_come_by_time() -> None:
 def test_short_and_empty_videos() -> None:
     assert list(select_keyframes([], NORMAL)) == []
     assert len(list(select_keyframes([SmallFrame(0.0, grey_from(0.0), 1.0)], NORMAL))) == 1
-
-
-def test_the_choice_depends_on_no_earlier_video() -> None:
-    places = np.linspace(-0.9, 0.9, 20)
-    assert numbers(chosen(places)).tolist() == numbers(chosen(places)).tolist()

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
-from pano_mvs.algorithms.keyframes.parallax import REDUCED_HW, GreyImage
-from pano_mvs.algorithms.keyframes.selection import SmallFrame
+from pano_mvs.algorithms.keyframes import REDUCED_HW, GreyImage, SmallFrame
 from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_rotvec
 
 PER_S = 10.0

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.mesh.decimate import decimated
-from pano_mvs.algorithms.mesh.free_space import FreeSpace
+from pano_mvs.algorithms.mesh.surface import FreeSpace, decimated
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 from tests.algorithms.mesh.box import BOARD, Capture, box, capture, poses

@@ -15,7 +15,7 @@ from tests.oracles.mesh import nearest_triangles, texel_looks
 SIZE = (16, 32)
 
 
-@pytest.mark.kernel("mesh.kernels_raster")
+@pytest.mark.kernel("mesh.kernels_mesh")
 @pytest.mark.parametrize("threads", [1, 2])
 def test_nearest_triangles_are_those_of_ray_casting(threads: int) -> None:
     """Also across the seam and at the poles, which are inside triangles for the first camera."""
@@ -33,7 +33,7 @@ def test_nearest_triangles_are_those_of_ray_casting(threads: int) -> None:
         assert (view.triangle == triangle).mean() > 0.9  # the others are at common edges
 
 
-@pytest.mark.kernel("mesh.kernels_raster")
+@pytest.mark.kernel("mesh.kernels_mesh")
 def test_without_a_surface_the_range_is_infinite() -> None:
     vertices, faces, wall = box(1)
     view = surface_view(vertices, faces[wall == 5], Rigid3.identity(), size_hw=SIZE)
@@ -42,9 +42,9 @@ def test_without_a_surface_the_range_is_infinite() -> None:
     np.testing.assert_array_equal(np.isinf(view.ranges), view.triangle < 0)
 
 
-@pytest.mark.kernel("mesh.kernels_texture")
+@pytest.mark.kernel("mesh.kernels_mesh")
 def test_looks_are_those_of_numpy() -> None:
-    from pano_mvs.algorithms.mesh.kernels_texture import look_at_texels
+    from pano_mvs.algorithms.mesh.kernels_mesh import look_at_texels
 
     shown = capture(poses(1), board=True, size_hw=SIZE, steps=2)
     vertices, faces, _ = shown.surface

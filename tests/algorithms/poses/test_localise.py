@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.pictures import face_image
+from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.sweep.backends.registry import (
     helper_backend,
     register_sweep_backend,
 )
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
+from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range

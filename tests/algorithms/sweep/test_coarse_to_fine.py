@@ -13,13 +13,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
-from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_guided_rows, follow_guided_strip
-from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates, split_layers
+from pano_mvs.algorithms.sweep.coarse_to_fine import STEPS, GuidedSweep
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, virtual_ranges
-from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.arguments import (
+    fresh_state,
+    run_arguments,
+    runs_of,
+    spread_tiles,
+    sweep_arguments,
+    tile_means,
+)
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, spread_tiles, tile_means
+from pano_mvs.algorithms.sweep.numba.kernels_guided import (
+    adopt_candidates,
+    follow_guided_rows,
+    follow_guided_strip,
+    split_layers,
+)
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
@@ -65,7 +75,7 @@ def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes: dict[st
     _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
 
 
-@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided", "sweep.numba.kernels_band")
+@pytest.mark.kernel("sweep.numba.kernels_guided", "sweep.numba.kernels_band")
 def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep() -> None:
     """Small enough to run as plain Python too."""
     _compare_with_the_plain_sweep(16, SweepSettings(planes=14, window=3, exposure=False))
@@ -119,7 +129,7 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others() -> None:
     assert run_arguments(shared, run).reference.flags.c_contiguous
 
 
-@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
+@pytest.mark.kernel("sweep.numba.kernels_guided")
 @pytest.mark.parametrize("upward", [False, True])
 @pytest.mark.parametrize("drift", [0, 1, -1])
 def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) -> None:
@@ -142,7 +152,7 @@ def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) 
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
+@pytest.mark.kernel("sweep.numba.kernels_guided")
 def test_paths_along_rows_go_around_the_sphere() -> None:
     rng = np.random.default_rng(8)
     height, width, count = 3, 20, 3
@@ -161,7 +171,7 @@ def test_paths_along_rows_go_around_the_sphere() -> None:
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
+@pytest.mark.kernel("sweep.numba.kernels_guided")
 def test_two_surfaces_are_told_apart_and_one_is_not_split() -> None:
     positions = np.full((12, 16), 10.0, np.float32)
     positions[:, 8:] = 30.0
@@ -175,7 +185,7 @@ def test_two_surfaces_are_told_apart_and_one_is_not_split() -> None:
     assert np.array_equal(layers[0], layers[1])
 
 
-@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
+@pytest.mark.kernel("sweep.numba.kernels_guided")
 def test_candidates_are_adopted_with_those_that_agree() -> None:
     found, costs = np.full((9, 9), 50.0, np.float32), np.full((9, 9), np.inf, np.float32)
     found[4, 4:6], costs[4, 4:6] = (10, 12), (1, 2)

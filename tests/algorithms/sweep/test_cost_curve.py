@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
-from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged
+from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, register_sweep_cost
+from pano_mvs.algorithms.sweep.edge_support import averaged
 from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput

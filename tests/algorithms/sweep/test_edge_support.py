@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.edge_support.edge_support import EdgeSupport, average_volume, averaged, averaged_at
+from pano_mvs.algorithms.sweep.edge_support import EdgeSupport, average_volume, averaged, averaged_at
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 
@@ -27,7 +27,7 @@ def _noise(seed: int = 0) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     return picture, rng.integers(0, 256, (SIZE[0], DEPTH, SIZE[1]), dtype=np.uint8)
 
 
-@pytest.mark.kernel("sweep.edge_support.kernels_edge_support")
+@pytest.mark.kernel("sweep.numba.kernels_edge_support")
 @pytest.mark.parametrize("side", [3, 5, 9])
 def test_the_compiled_average_is_the_plain_one(side: int) -> None:
     picture, volume = _noise()
@@ -75,14 +75,6 @@ def test_rows_in_parts_are_those_of_the_whole_away_from_the_cut() -> None:
     average_volume(volume, work)
     np.testing.assert_array_equal(lower[2:], volume[12:])
     assert (lower[:2] != volume[10:12]).any()
-
-
-def test_the_average_rolls_with_the_panorama() -> None:
-    picture, volume = _noise(3)
-    rolled = np.roll(volume, 7, axis=2).copy()
-    average_volume(volume, _work(picture))
-    average_volume(rolled, _work(np.roll(picture, 7, axis=1)))
-    np.testing.assert_array_equal(rolled, np.roll(volume, 7, axis=2))
 
 
 @pytest.mark.parametrize("side", [1, 5])

@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pano_mvs.algorithms.sweep.backends import compiled_aggregation
-from pano_mvs.algorithms.sweep.backends.compiled_aggregation import winners_by_paths
+from pano_mvs.algorithms.sweep.backends import numba_backend
+from pano_mvs.algorithms.sweep.backends.numba_backend import winners_by_paths
 from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, path_step, winners_of
 from pano_mvs.algorithms.sweep.numba import kernels_sgm, kernels_sgm_rows
-from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, census_row, difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_band import combine_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import (
+    average_differences,
+    box_rows,
+    census_row,
+    difference_row,
+    one_box_serves,
+    store_row,
+)
 from pano_mvs.algorithms.sweep.numba.kernels_records import Combination
-from pano_mvs.algorithms.sweep.numba.kernels_sad import average_differences, one_box_serves
 from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
     DRIFTS,
     Front,
@@ -26,7 +32,6 @@ from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
     state_columns,
 )
 from pano_mvs.algorithms.sweep.numba.kernels_sgm_rows import follow_rows
-from pano_mvs.algorithms.sweep.numba.kernels_source_cost import store_row
 from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     AFTER,
     BEFORE,
@@ -92,7 +97,7 @@ def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
     np.testing.assert_allclose(means, expected, rtol=1e-5)
 
 
-@pytest.mark.kernel("sweep.numba.kernels_sad")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize(
     ("sources", "share", "most", "pad", "serves"),
     [
@@ -115,7 +120,7 @@ def test_one_box_serves_where_all_sources_count_and_nothing_overflows(
     assert not one_box_serves(sources, weighted, 3, pad)
 
 
-@pytest.mark.kernel("sweep.numba.kernels_sad")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("radius", [0, 2])
 def test_differences_are_averaged_over_seams(radius: int) -> None:
     costs = np.random.default_rng(7).integers(0, 65536, (4 + 2 * radius, 20)).astype(np.uint16)
@@ -130,7 +135,7 @@ def test_differences_are_averaged_over_seams(radius: int) -> None:
         np.testing.assert_allclose(means[row], expected, rtol=1e-6)
 
 
-@pytest.mark.kernel("sweep.numba.kernels_combine")
+@pytest.mark.kernel("sweep.numba.kernels_band")
 @pytest.mark.parametrize("sources", [1, 2, 3, 5, 8, 9])
 @pytest.mark.parametrize(("share", "most"), [(0.5, 9), (1.0, 9), (1.0, 2)])
 @pytest.mark.parametrize("all_vote", [True, False])
@@ -188,7 +193,7 @@ def test_winners_of_rows_are_those_of_the_volume() -> None:
     np.testing.assert_array_equal(state[RIVAL], expected.rival[3:])
 
 
-@pytest.mark.kernel("sweep.numba.kernels_source_cost")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 def test_costs_are_stored_rounded_and_saturated() -> None:
     voxels = np.zeros(5, np.uint8)
     store_row(np.array([0.0, 1.24, 1.26, 100.0, 1e6], np.float32), np.float32(2.0), voxels)
@@ -309,7 +314,7 @@ def test_paths_by_vector_instructions_equal_those_by_loops(monkeypatch: pytest.M
             assert _follow(costs, strips, blocks, 3).tobytes() == expected.tobytes()
 
 
-@pytest.mark.kernel("sweep.numba.kernels_sgm_rows", "sweep.numba.x86.kernels_vector_planes")
+@pytest.mark.kernel("sweep.numba.kernels_sgm_rows", "sweep.numba.x86.kernels_vector_path")
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
 def test_paths_along_rows_by_vector_instructions_equal_those_by_loops(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -335,8 +340,8 @@ def test_all_paths_equal_the_readable_ones(
     work = SweepInput(picture, (), (), None, np.linspace(1, 2, 33), settings)
     volume = rng.integers(0, 256, (count, 33, size[1]), dtype=np.uint8)
     found = winners_by_paths(work, volume, top=top)
-    monkeypatch.setattr(compiled_aggregation, "_BLOCK_ROWS", 5)
-    monkeypatch.setattr(compiled_aggregation, "_STRIP_COLUMNS", 31)
+    monkeypatch.setattr(numba_backend, "_BLOCK_ROWS", 5)
+    monkeypatch.setattr(numba_backend, "_STRIP_COLUMNS", 31)
     again = winners_by_paths(work, volume, top=top)
     for name in ("plane", "cost", "before", "after", "rival"):
         np.testing.assert_array_equal(getattr(found, name), getattr(again, name))

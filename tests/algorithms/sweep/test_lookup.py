@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
-from pano_mvs.algorithms.sweep.numba.kernels_lookup import vote_row, warp_band
-from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.numba.arguments import pack_colors, pack_plane, pack_sources, pack_votes
+from pano_mvs.algorithms.sweep.numba.kernels_cost import add_differences, census_row, count_census_row, interleave_rows
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import knot_rows, vote_row, warp_band
 from pano_mvs.algorithms.sweep.numba.kernels_records import Lookup, Sources
-from pano_mvs.algorithms.sweep.numba.kernels_sad import add_differences, interleave_rows
-from pano_mvs.algorithms.sweep.numba.packing import pack_colors, pack_plane, pack_sources, pack_votes
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -64,7 +61,7 @@ def _warped(
     return pixel_costs if len(against) else warped
 
 
-@pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.kernels_warp", "sweep.numba.kernels_project")
+@pytest.mark.kernel("sweep.numba.kernels_lookup")
 @pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("translation", TRANSLATIONS)
@@ -168,7 +165,7 @@ def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles() -> None:
         assert both[:, 1].ravel().tolist() == corners
 
 
-@pytest.mark.kernel("sweep.numba.kernels_census")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("side", [3, 7, 15])
 @pytest.mark.parametrize("width", [20, 64, 100])
 def test_census_by_vector_instructions_counts_what_loops_count(side: int, width: int) -> None:

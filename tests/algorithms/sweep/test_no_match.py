@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
-from pano_mvs.algorithms.sweep.no_match import is_bare
+from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.backends.compiled_aggregation import VOLUME_BYTES, volume_parts
+from pano_mvs.algorithms.sweep.backends.numba_backend import VOLUME_BYTES, volume_parts
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.testing.room import capture_poses, default_room, render
 

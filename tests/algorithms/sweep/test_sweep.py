@@ -95,11 +95,7 @@ def test_the_compiled_sweep_equals_the_readable_one(settings: SweepSettings, mas
 
 
 @pytest.mark.kernel(
-    "sweep.numba.kernels_band",
-    "sweep.numba.kernels_sgm",
-    "sweep.numba.kernels_lookup",
-    "sweep.numba.kernels_warp",
-    "sweep.numba.kernels_winner",
+    "sweep.numba.kernels_band", "sweep.numba.kernels_sgm", "sweep.numba.kernels_lookup", "sweep.numba.kernels_winner"
 )
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "aggregation": "box"}])
 def test_a_tiny_sweep_equals_the_readable_one(changes: dict[str, str]) -> None:
@@ -263,15 +259,10 @@ def test_calls_that_cannot_work_say_why() -> None:
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"planes": 2}, "planes"),
         ({"window": 6}, "window must be odd"),
-        ({"support": 17}, "support must be at most 15"),
         ({"window": 1}, "census needs"),
         ({"window": 1, "cost": "zncc"}, "zncc needs"),
-        ({"best": 0}, "best must"),
         ({"p1": 9, "p2": 8}, "p1 ≤ p2"),
-        ({"p2_contrast": -1.0}, "p2_contrast"),
-        ({"prefilter_diameter": -1}, "prefilter_diameter"),
     ],
 )
 def test_settings_that_no_sweep_can_use_are_refused(change: dict[str, Any], what: str) -> None:

@@ -23,11 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.pictures import face_image
+from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.fusion.fuse import fuse_views
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.algorithms.photograph_colors import PhotographColors, PhotographColorSettings
+from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec

@@ -71,7 +71,7 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
         ),
         ("algorithms.features.kernels_sphorb", "ARC = 10", "ARC = 9", {"features.sphorb"}),
         (
-            "algorithms.patchmatch.kernels_planes",
+            "algorithms.patchmatch.kernels_refine",
             "_MIN_WEIGHT, _MIN_SPREAD = 5.0",
             "_MIN_WEIGHT, _MIN_SPREAD = 6.0",
             {"depth.patchmatch", "depth.plain_surfaces"},

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.cube import CUBE
+from pano_mvs.algorithms.faces.sampling import CUBE
 
 SIDE = 64
 LAYOUTS: dict[str, Callable[[str, str, int, int], str]] = {

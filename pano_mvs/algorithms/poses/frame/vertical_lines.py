@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
-from pano_mvs.algorithms.faces.pictures import face_image, face_mask
+from pano_mvs.algorithms.faces.render import face_image, face_mask
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors
 

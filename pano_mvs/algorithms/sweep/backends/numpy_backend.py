@@ -8,12 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs.cost import checked_cost
-from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
-from pano_mvs.algorithms.sweep.edge_support.edge_support import averaged
+from pano_mvs.algorithms.sweep.costs import BUILTIN, checked_cost
+from pano_mvs.algorithms.sweep.edge_support import averaged
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.preparation import SweepInput, source_weights
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import CostWindow, box_mean
 from pano_mvs.algorithms.sweep.winner import Winners

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixel_cost
-from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
-from pano_mvs.algorithms.sweep.edge_support.edge_support import average_volume
-from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.edge_support import average_volume
+from pano_mvs.algorithms.sweep.kernels_constants import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.preparation import SweepInput, source_weights
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
@@ -89,7 +88,7 @@ def find_winners(work: SweepInput) -> Winners:
             winner.add(combined)
     if not with_volume:
         return winner.result()
-    from pano_mvs.algorithms.sweep.backends.compiled_aggregation import (
+    from pano_mvs.algorithms.sweep.backends.numba_backend import (
         winners_by_paths,  # on use: numba is slow to import
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from pano_mvs.algorithms.sweep.backends import numpy_backend, opencv_backend
-from pano_mvs.algorithms.sweep.costs.registry import BUILTIN, SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs import BUILTIN, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -41,12 +41,9 @@ Function = TypeVar("Function", bound=FindWinners)
 class SweepBackend:
     """A backend and what it can do.
 
-    Attributes:
-        find_winners: see `FindWinners`.
-        costs: the costs that it has; None: any, plugins' too.
-        coarse_to_fine: whether it takes `levels` above 1.
-        bytes_per_voxel: bytes that semi-global matching takes for each pixel and plane.
-        keeps_volume_limit: whether it keeps the volume of semi-global matching within `volume_limit_gb`.
+    `find_winners`: see `FindWinners`. `costs`: the costs that it has; None: any, plugins' too. `coarse_to_fine`:
+    whether it takes `levels` above 1. `bytes_per_voxel`: bytes that semi-global matching takes for each pixel and
+    plane. `keeps_volume_limit`: whether it keeps the volume of semi-global matching within `volume_limit_gb`.
     """
 
     find_winners: FindWinners

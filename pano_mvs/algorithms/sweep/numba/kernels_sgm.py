@@ -32,12 +32,8 @@ DRIFTS = (0, 1, -1)
 def look_up_penalties(channels: U8, table: U16, steps: I64, first: int, penalties: U16) -> None:
     """Do what `penalties.step_penalties` does for several directions.
 
-    Args:
-        channels: (C, H + 2, W + 2) uint8, see `padded_channels`.
-        table: see `penalty_table`.
-        steps: (K, 2) int64 rows and columns of each direction.
-        first: the first row.
-        penalties: (K, rows, W) uint16, written.
+    `channels`: (C, H + 2, W + 2) uint8, see `padded_channels`. `table`: see `penalty_table`. `steps`: (K, 2) int64 rows
+    and columns of each direction. `first`: the first row. `penalties`: (K, rows, W) uint16, written.
     """
     contrast = np.empty(penalties.shape[2], np.uint8)
     for k in range(_U(penalties.shape[0])):
@@ -58,11 +54,8 @@ def look_up_penalties(channels: U8, table: U16, steps: I64, first: int, penaltie
 class PathCosts(NamedTuple):
     """What paths from one pole to the other read.
 
-    Attributes:
-        volume: (H, D, W) uint8.
-        penalties: (3, H, W) uint16 P2 of the step into each pixel, for each of `DRIFTS`.
-        p1: uint16.
-        upward: whether the paths run from the last row to the first.
+    `volume`: (H, D, W) uint8. `penalties`: (3, H, W) uint16 P2 of the step into each pixel, for each of `DRIFTS`. `p1`:
+    uint16. `upward`: whether the paths run from the last row to the first.
     """
 
     volume: U8
@@ -74,9 +67,8 @@ class PathCosts(NamedTuple):
 class Front(NamedTuple):
     """Where paths have come to.
 
-    Attributes:
-        paths: (3, D, W) uint16 costs of the paths in the last pixels that they came to, by the columns of these.
-        least: (3, W) uint16 the least of each.
+    `paths`: (3, D, W) uint16 costs of the paths in the last pixels that they came to, by the columns of these. `least`:
+    (3, W) uint16 the least of each.
     """
 
     paths: U16
@@ -86,11 +78,9 @@ class Front(NamedTuple):
 class Sums(NamedTuple):
     """Where sums of path costs are read and written.
 
-    Attributes:
-        before: (·, D, ·) uint16 sums of other paths; rows may be longer than the volume's.
-        first_before: the row of the picture with which `before` begins.
-        after: (·, D, ·) uint16, written: with those of these paths; the same length of rows.
-        first_after: the row with which `after` begins.
+    `before`: (·, D, ·) uint16 sums of other paths; rows may be longer than the volume's. `first_before`: the row of the
+    picture with which `before` begins. `after`: (·, D, ·) uint16, written: with those of these paths; the same length
+    of rows. `first_after`: the row with which `after` begins.
     """
 
     before: U16
@@ -115,18 +105,11 @@ def step_plain(
 ) -> None:
     """Advance neighbouring lines of one direction by one row.
 
-    Args:
-        costs: what paths read.
-        place: row and column of the first line's pixel; the others follow in the row.
-        lines: number of lines.
-        direction: among `DRIFTS`.
-        line: the first line's place in the state.
-        state: (3, D + 1, ·) uint16 costs of the paths, updated.
-        least: (3, ·) uint16 the least of each, updated.
-        scratch: (2, ·) uint16.
-        sums: where to write sums.
-        others: whether these lines are added to `sums.before`, or to those that were added to them already.
-        keep: whether to write sums.
+    `costs`: what paths read. `place`: row and column of the first line's pixel; the others follow in the row. `lines`:
+    number of lines. `direction`: among `DRIFTS`. `line`: the first line's place in the state. `state`: (3, D + 1, ·)
+    uint16 costs of the paths, updated. `least`: (3, ·) uint16 the least of each, updated. `scratch`: (2, ·) uint16.
+    `sums`: where to write sums. `others`: whether these lines are added to `sums.before`, or to those that were added
+    to them already. `keep`: whether to write sums.
     """
     volume, p1 = costs.volume, costs.p1
     row, column, first, way = _U(place[0]), _U(place[1]), _U(line), _U(direction)
@@ -276,14 +259,10 @@ def follow_block(
     Step i comes to the row i, counted from where the paths begin. Steps i < 0 lie beyond the pole: in row −1 − i, half
     a turn further on; their costs only prepare the paths, and a block has none or only such steps.
 
-    Args:
-        costs: what paths read.
-        front: where all paths have come to before the block.
-        new_front: written in the columns of the strip: where its paths have come to.
-        steps: the first step, and how many.
-        strip: the first column, and how many.
-        sums: what is added to; strips of one block write disjoint entries.
-        state: (3, D + 1, ·) uint16, scratch space of `state_columns` columns.
+    `costs`: what paths read. `front`: where all paths have come to before the block. `new_front`: written in the
+    columns of the strip: where its paths have come to. `steps`: the first step, and how many. `strip`: the first
+    column, and how many. `sums`: what is added to; strips of one block write disjoint entries. `state`: (3, D + 1, ·)
+    uint16, scratch space of `state_columns` columns.
     """
     height, depth, width = costs.volume.shape
     (first_step, count), (first, lines) = steps, strip

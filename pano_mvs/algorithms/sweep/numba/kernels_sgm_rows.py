@@ -10,8 +10,7 @@ import numpy as np
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES
-from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_planes import SIDE, step_planes, turn_bytes, turn_sums
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, SIDE, step_planes, turn_bytes, turn_sums
 from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
@@ -81,19 +80,12 @@ def step_pixel(
 ) -> np.uint16:
     """Advance a path by one pixel and return the least of its costs.
 
-    Args:
-        costs: (W, P) uint8, P the number of planes D and some more to fill registers.
-        paths: (2, W + 2, P) uint16 costs of the paths of both directions, written; pixel W is where they start, and
-            the one after it is there because registers are read ahead.
-        way: 0 or 1, the direction.
-        before: the pixel before, or W.
-        now: the pixel.
-        penalty: P2 of the step.
-        floor: the least cost of the pixel before.
-        p1: uint16.
-        barred: (P,) uint16, 0 for planes and `_OUTSIDE` for what only fills registers.
-        scratch: (2, D + 2) uint16, for each direction the costs in the pixel before, between two planes that do not
-            exist; written; not used by vector instructions.
+    `costs`: (W, P) uint8, P the number of planes D and some more to fill registers. `paths`: (2, W + 2, P) uint16 costs
+    of the paths of both directions, written; pixel W is where they start, and the one after it is there because
+    registers are read ahead. `way`: 0 or 1, the direction. `before`: the pixel before, or W. `now`: the pixel.
+    `penalty`: P2 of the step. `floor`: the least cost of the pixel before. `p1`: uint16. `barred`: (P,) uint16, 0 for
+    planes and `_OUTSIDE` for what only fills registers. `scratch`: (2, D + 2) uint16, for each direction the costs in
+    the pixel before, between two planes that do not exist; written; not used by vector instructions.
     """
     jump = _H(floor + penalty)
     if HAS_VECTOR:
@@ -155,13 +147,9 @@ def _close_circle(
 def follow_rows(volume: U8, penalties: U16, p1: np.uint16, rows: tuple[int, int], sums: U16, first_sums: int) -> None:
     """Follow both paths of some rows around the sphere and write the sum of their costs.
 
-    Args:
-        volume: (H, D, W) uint8.
-        penalties: (2, H, W) uint16 P2 of the step into each pixel from its left and from its right.
-        p1: uint16.
-        rows: the first row, and how many.
-        sums: (·, D, ·) uint16, written; rows may be longer than the volume's.
-        first_sums: the row with which `sums` begins.
+    `volume`: (H, D, W) uint8. `penalties`: (2, H, W) uint16 P2 of the step into each pixel from its left and from its
+    right. `p1`: uint16. `rows`: the first row, and how many. `sums`: (·, D, ·) uint16, written; rows may be longer than
+    the volume's. `first_sums`: the row with which `sums` begins.
     """
     depth, width = volume.shape[1:]
     padded = -(-depth // LINES) * LINES

@@ -55,15 +55,10 @@ def update_plain(
 
     `EARLIER` is the least cost of all planes but the last two: when a plane wins, it is the rival so far.
 
-    Args:
-        costs: (P, W) float32 or uint16.
-        start: the first plane's place in `costs`.
-        count: of planes.
-        plane: index of the first plane; they come in order.
-        state: (STATES, rows, W) of the costs' type, infinite or its largest number before the first plane.
-        y: the row.
-        planes: (rows, W) int32, or uint16 for costs in uint16: index of the winner so far.
-        begin: the first column; all from there on are treated.
+    `costs`: (P, W) float32 or uint16. `start`: the first plane's place in `costs`. `count`: of planes. `plane`: index
+    of the first plane; they come in order. `state`: (STATES, rows, W) of the costs' type, infinite or its largest
+    number before the first plane. `y`: the row. `planes`: (rows, W) int32, or uint16 for costs in uint16: index of the
+    winner so far. `begin`: the first column; all from there on are treated.
     """
     row = _U(y)
     for k in range(count):
@@ -121,11 +116,8 @@ def update_winners(
 def winners_of_rows(total: U16, first: int, state: U16, planes: U16) -> None:
     """Find the winners of some rows of a volume.
 
-    Args:
-        total: (H, D, W) uint16.
-        first: the first row.
-        state: (STATES, rows, W) uint16, the largest number.
-        planes: (rows, W) uint16, written.
+    `total`: (H, D, W) uint16. `first`: the first row. `state`: (STATES, rows, W) uint16, the largest number. `planes`:
+    (rows, W) uint16, written.
     """
     depth = total.shape[1]
     for y in range(planes.shape[0]):

@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.numba.kernels_warp import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
+from pano_mvs.algorithms.sweep.kernels_constants import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
 
 
 def _lanes_of_this_machine() -> int:
@@ -50,16 +50,8 @@ _COLOR_PAIRS = [0, 1, 8, 9, 2, 3, 10, 11, 4, 5, 12, 13, 6, 7, 14, 15]
 _I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 _NAMES = {
     "pairs": {1: "llvm.x86.sse2.pmadd.wd", 2: "llvm.x86.avx2.pmadd.wd", 4: "llvm.x86.avx512.pmaddw.d.512"},
-    "to_words": {
-        1: "llvm.x86.sse2.packssdw.128",
-        2: "llvm.x86.avx2.packssdw",
-        4: "llvm.x86.avx512.packssdw.512",
-    },
-    "to_bytes": {
-        1: "llvm.x86.sse2.packsswb.128",
-        2: "llvm.x86.avx2.packsswb",
-        4: "llvm.x86.avx512.packsswb.512",
-    },
+    "to_words": {1: "llvm.x86.sse2.packssdw.128", 2: "llvm.x86.avx2.packssdw", 4: "llvm.x86.avx512.packssdw.512"},
+    "to_bytes": {1: "llvm.x86.sse2.packsswb.128", 2: "llvm.x86.avx2.packsswb", 4: "llvm.x86.avx512.packsswb.512"},
 }
 
 
@@ -106,12 +98,9 @@ def _in_lanes(within: list[int]) -> list[int]:
 def _blend(builder: Any, patches: Any, order: list[int], weights_y: tuple[Any, Any], weight_x: Any) -> Any:
     """Return patches blended, as int32 around 0.
 
-    Args:
-        builder: of the function.
-        patches: a register of signed bytes.
-        order: for each lane, its bytes in pairs {upper, lower}, left and right in turn.
-        weights_y: the weights of the first and of the second half of the pairs of each lane.
-        weight_x: the weights of the pairs {left, right} that the rows' blending leaves.
+    `builder`: of the function. `patches`: a register of signed bytes. `order`: for each lane, its bytes in pairs
+    {upper, lower}, left and right in turn. `weights_y`: the weights of the first and of the second half of the pairs of
+    each lane. `weight_x`: the weights of the pairs {left, right} that the rows' blending leaves.
     """
     zero = _constant(_I8, 0)
     sides = []
@@ -288,17 +277,9 @@ def census_block(
 ) -> Any:
     """Do what `kernels_cost.census_row` does for some pixels, the counts staying in a register.
 
-    Args:
-        typingctx: numba's.
-        reference: (·,) uint8.
-        reference_at: where the first pixel is.
-        warped: (·,) uint8.
-        warped_at: likewise.
-        stride: from a row to the next, of both.
-        offsets: (side,) int64 columns of the window.
-        side: of the window.
-        out: (·,) uint8, written.
-        out_at: where.
+    `reference`: (·,) uint8. `reference_at`: where the first pixel is. `warped`: (·,) uint8. `warped_at`: likewise.
+    `stride`: from a row to the next, of both. `offsets`: (side,) int64 columns of the window. `side`: of the window.
+    `out`: (·,) uint8, written. `out_at`: where.
     """
     place = types.uint64
     signature = types.void(reference, place, warped, place, place, offsets, place, out, place)

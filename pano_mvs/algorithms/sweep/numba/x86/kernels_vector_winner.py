@@ -71,18 +71,10 @@ def take_planes(
 ) -> Any:
     """Do what `kernels_winner.update_plain` does for as many pixels as a register holds.
 
-    Args:
-        typingctx: numba's.
-        costs: float32 or uint16, of any rank; positions are counted in elements.
-        cost_at: where the first plane's are.
-        cost_step: from a plane's to the next one's.
-        plane: index of the first plane.
-        count: of planes.
-        state: of the costs' type.
-        state_at: where its first row is.
-        state_step: from a row to the next.
-        planes: integers as wide as the costs.
-        planes_at: where.
+    `costs`: float32 or uint16, of any rank; positions are counted in elements. `cost_at`: where the first plane's are.
+    `cost_step`: from a plane's to the next one's. `plane`: index of the first plane. `count`: of planes. `state`: of
+    the costs' type. `state_at`: where its first row is. `state_step`: from a row to the next. `planes`: integers as
+    wide as the costs. `planes_at`: where.
     """
     place = types.uint64
     signature = types.void(costs, place, place, place, place, state, place, place, planes, place)

@@ -1,1 +1,0 @@
-"""Windows, grid cells and steps that have the same extent everywhere on the sphere."""

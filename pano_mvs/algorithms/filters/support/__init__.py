@@ -1,1 +1,0 @@
-"""Pixels that confirmed neighbours support."""

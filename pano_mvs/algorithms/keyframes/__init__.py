@@ -1,1 +1,0 @@
-"""Choose frames of a video by the motion of the camera."""

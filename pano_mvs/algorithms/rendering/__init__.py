@@ -1,1 +1,0 @@
-"""Images of clouds, rendered with numpy."""

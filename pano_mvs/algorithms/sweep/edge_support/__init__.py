@@ -1,1 +1,0 @@
-"""Averages of the costs that follow the edges of the picture."""
