@@ -18,7 +18,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama
+from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.masks.areas import reduced_to_width
 from pano_mvs.algorithms.masks.static_content import (
     MIN_VIEWS,
     color_difference,
     evenly_spread_pairs,
     frame_agreement,
-    reduced_to_width,
     static_content,
 )
 from pano_mvs.core.errors import UsageError

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import nearest_pixels, sample_view
 from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.ranges.agreement import MAX_SURFACE_STEP
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, pad_panorama, ray_from_pixel
@@ -62,10 +63,6 @@ def _samples(width: int, view: PinholeView) -> int:
     return max(1, int(np.ceil(width / (2 * np.pi) / view.focal_px - 1e-6)))
 
 
-# Four neighbouring pixels with a larger relative difference are two surfaces: do not interpolate between them.
-_MAX_SURFACE_STEP = 0.05
-
-
 def face_z_depth(ranges: NDArray[np.float32], view: PinholeView, *, threads: int = 1) -> NDArray[np.float32]:
     """Return the z-depth of a face, (h, w) float32 in the ranges' unit, NaN if unknown.
 
@@ -90,7 +87,7 @@ def face_z_depth(ranges: NDArray[np.float32], view: PinholeView, *, threads: int
     given = np.ascontiguousarray(ranges)
     result = np.empty(view.size_hw, np.float32)
     for_bands(
-        lambda first, rows: z_depth_rows(first, rows, given, camera, _MAX_SURFACE_STEP, result),
+        lambda first, rows: z_depth_rows(first, rows, given, camera, MAX_SURFACE_STEP, result),
         view.size_hw[0],
         threads=threads,
     )

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid
@@ -51,9 +52,7 @@ def nearest_pixels(
     """
     row, column = np.empty(view.size_hw, np.intp), np.empty(view.size_hw, np.intp)
     for rows in _bands(view.size_hw[0]):
-        whole = np.floor(pixel_from_ray(view.rays(rows, offset_xy=offset_xy), size_hw)).astype(np.intp)
-        row[rows] = np.minimum(whole[..., 1], size_hw[0] - 1)
-        column[rows] = whole[..., 0] % size_hw[1]
+        row[rows], column[rows] = pixels_containing(view.rays(rows, offset_xy=offset_xy), size_hw)
     return row, column
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty
-from pano_mvs.core.arrays import FloatArray
-from pano_mvs.core.bands import for_bands
+from pano_mvs.algorithms.ranges.agreement import Comparison, compare_with_sources
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, sines_of_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
@@ -98,8 +97,6 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
         yield within[np.argsort(np.linalg.norm(places[within] - place, axis=1), kind="stable")[:count]]
 
 
-# Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
-_MAX_SURFACE_STEP = 0.05
 # Accuracy of range maps, as a fraction of a pixel.
 _PRECISION_PX = 0.2
 # Near a step like this, in ln range, it is uncertain to which side a pixel belongs.
@@ -223,99 +220,6 @@ def checked_with_agreement(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
-    """Agreement of all sources with each pixel, (H, W) each.
-
-    Attributes:
-        agreeing: number of sources that agree.
-        contradicting: number of sources that see through it.
-        hiding: number of sources that see something nearer.
-        support: sum of the supports of the agreeing sources.
-        motion: sum of their supports times their squared motions, in rad².
-        squared_error: sum of their supports times their squared reprojection errors, in rad².
-    """
-
-    agreeing: NDArray[np.int64]
-    contradicting: NDArray[np.int64]
-    hiding: NDArray[np.uint16]
-    support: NDArray[np.float64]
-    motion: NDArray[np.float64]
-    squared_error: NDArray[np.float64]
-
-
-def compare_with_sources(
-    ranges: NDArray[np.float32],
-    sources: Sequence[RangeMap],
-    source_from_reference: Sequence[Rigid3],
-    *,
-    max_relative_error: float,
-    max_angle: float,
-) -> Comparison:
-    """Return the agreement of the sources with ranges of the reference, as in `checked_with_agreement`.
-
-    `ranges`: (H, W) float32, NaN is left out. `sources`: range maps; filled pixels are left out.
-    `source_from_reference`: pose of each. `max_relative_error`: largest relative difference of ranges that agree.
-    `max_angle`: largest angle between pixel and reprojection, in radians.
-    """
-    import numba  # slow to import
-
-    from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows  # compiles on import
-
-    shape = ranges.shape
-    comparison = Comparison(
-        np.zeros(shape, np.int64),
-        np.zeros(shape, np.int64),
-        np.zeros(shape, np.uint16),
-        *(np.zeros(shape) for _ in range(3)),
-    )
-    counts = comparison.agreeing, comparison.contradicting, comparison.hiding
-    sums = comparison.support, comparison.motion, comparison.squared_error
-    # Copied, since the kernel is compiled once more for arrays that are read-only.
-    ranges, grid = np.array(ranges, np.float32), sines_of_grid((shape[0], shape[1]))
-    limits = max_relative_error, max_angle, _MAX_SURFACE_STEP
-    views = [
-        (_arrays_of(moved), seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0]))
-        for source, moved in zip(sources, source_from_reference, strict=True)
-    ]
-
-    def compare(first: int, rows: int) -> None:
-        for view, known in views:
-            compare_rows((first, first + rows), ranges, grid, view, known, limits, counts, sums)
-
-    for_bands(compare, shape[0], threads=numba.get_num_threads())
-    return comparison
-
-
-def agreeing_sources(
-    points: FloatArray,
-    sources: Sequence[NDArray[np.float32]],
-    source_from_reference: Sequence[Rigid3],
-    *,
-    max_relative_error: float,
-    max_angle: float,
-    most: int = 255,
-) -> NDArray[np.uint8]:
-    """Return the number of sources that agree with each point, (N,), as in `compare_with_sources`.
-
-    `points`: (N, 3) in the reference frame. `sources`: ranges (H, W) that were seen, NaN is left out; see
-    `seen_ranges`. `source_from_reference`: pose of each. `max_relative_error`: largest relative difference of ranges
-    that agree. `max_angle`: largest angle between pixel and reprojection, in radians. `most`: as many sources are
-    enough; more are not counted.
-    """
-    from pano_mvs.algorithms.ranges.kernels_agreement import count_agreeing  # compiles on import
-
-    agreeing = np.zeros(len(points), np.uint8)
-    limits = max_relative_error, max_angle, _MAX_SURFACE_STEP
-    for ranges, moved in zip(sources, source_from_reference, strict=True):
-        count_agreeing(points, _arrays_of(moved), ranges, limits, most, agreeing)
-    return agreeing
-
-
-def _arrays_of(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
-    return np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-
-
 def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
     """Return the agreement of the sources with all pixels that were seen, (H, W)."""
     judges = comparison.agreeing + comparison.contradicting + comparison.hiding
@@ -344,9 +248,3 @@ def _step_around(ranges: NDArray[np.float32]) -> NDArray[np.float32]:
     farthest = cv2.dilate(np.where(np.isnan(logs), np.float32(-np.inf), logs), window)
     step = np.where(farthest >= nearest, farthest, 0) - np.where(farthest >= nearest, nearest, 0)
     return np.asarray(step[radius:-radius, radius:-radius], np.float32)
-
-
-def seen_ranges(range_map: RangeMap, *, min_confidence: int) -> NDArray[np.float32]:
-    """Return the ranges, (H, W) float32, NaN where the confidence is lower than `min_confidence`."""
-    ranges: NDArray[np.float32] = np.where(range_map.confidence >= min_confidence, range_map.range, np.float32(np.nan))
-    return np.ascontiguousarray(ranges)

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from pano_mvs.algorithms.filters.data_term import MaxHoleDeg
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.data_term import Domain, data_term, require_guide
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.sphere_windows import box_spread, box_sum
+from pano_mvs.algorithms.panoramas import box_spread, box_sum
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings

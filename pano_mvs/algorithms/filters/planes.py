@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.data_term import MaxHoleDeg, require_guide
 from pano_mvs.algorithms.filters.fill import large_holes
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.sphere_windows import largest_channel
+from pano_mvs.algorithms.panoramas import largest_channel, squarely_dilated
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
@@ -169,7 +169,7 @@ def _plane_fits(
     margin = max(1, round(3 * height / 256))
     rays, inverse = ray_grid((height, width)), 1 / range_map.range.astype(np.float64)
     for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
-        support = _dilated(surface, margin) & trusted
+        support = squarely_dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
         if len(points) < _MIN_POINTS:
             continue
@@ -247,12 +247,6 @@ def _large_surfaces(labels: NDArray[np.int64], area: FloatArray, least: float) -
     sizes = np.bincount(labels[inside], area[inside], labels.size)
     large = np.flatnonzero(sizes >= least)
     return [labels == number for number in large[np.argsort(-sizes[large], kind="stable")]]
-
-
-def _dilated(mask: Mask, margin: int) -> Mask:
-    window = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-    grown = cv2.dilate(pad_panorama(mask.astype(np.uint8), margin), window)[margin:-margin, margin:-margin]
-    return np.asarray(grown > 0)
 
 
 def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:

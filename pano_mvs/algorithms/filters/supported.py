@@ -6,11 +6,10 @@ pixels alike pulls the background beside a thin object onto the object, and the 
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sphere_windows import largest_channel
+from pano_mvs.algorithms.panoramas import contrast_around, largest_channel
 from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
@@ -53,7 +52,4 @@ def supported_pixels(range_map: RangeMap, guide: NDArray[np.uint8], *, min_confi
 
 def has_texture(guide: NDArray[np.uint8]) -> Mask:
     """Return the pixels, (H, W), around which a colour has contrast."""
-    window = np.ones((2 * _RADIUS + 1, 2 * _RADIUS + 1), np.uint8)
-    padded = pad_panorama(guide, _RADIUS)
-    contrast = largest_channel(cv2.subtract(cv2.dilate(padded, window), cv2.erode(padded, window)))
-    return np.asarray(contrast[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS] >= _MIN_CONTRAST)
+    return contrast_around(guide, _RADIUS) >= _MIN_CONTRAST

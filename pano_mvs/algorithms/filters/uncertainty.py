@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sphere_windows import box_sum
+from pano_mvs.algorithms.panoramas import box_sum
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE

@@ -21,7 +21,8 @@ from pano_mvs.algorithms.fusion.view import (
     nearest_views,
 )
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
+from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP
 from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import PointCloud
@@ -30,8 +31,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 Grid = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-_MAX_SURFACE_STEP = 0.05
-_MAX_REPROJECTION_PX = 1.0
 # If two views see a surface about equally well, the earlier one contributes it: it may be 5 % worse, and the later one
 # must be 3 % better. Points between these limits are written twice, so that small errors of the footprints leave no
 # gap.
@@ -227,12 +226,12 @@ def _compare_with(
 
     reference, *arrays_of_pixels = pixels
     height, width = reference.ranges.shape
-    max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / width
+    max_angle = MAX_REPROJECTION_PX * 2 * np.pi / width
     limits = np.array(
         [
             settings.max_relative_error,
             max_angle,
-            _MAX_SURFACE_STEP,
+            MAX_SURFACE_STEP,
             settings.max_footprint_ratio * tie,
             settings.merge_within,
             CONSISTENT_CONFIDENCE[0],

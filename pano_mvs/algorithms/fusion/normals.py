@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.view import held_rays
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sphere_windows import box_sum
-from pano_mvs.core.arrays import Mask
-from pano_mvs.geometry import pad_panorama, pixel_solid_angle
+from pano_mvs.algorithms.panoramas import box_sum, reduced_mask, reduced_panorama
+from pano_mvs.core.arrays import Mask, Picture
+from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
+
+WIDTH = 512
+"""Columns at which views are compared; larger ones are reduced."""
+
+SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
+DARK_LEVEL = 4.0
+"""Added to grey levels before they are divided, because dark ones are mostly noise."""
+
+
+def reduced_to_width(picture: Picture, valid: Mask) -> tuple[Picture, Mask]:
+    """Return a panorama and its mask at `WIDTH` columns; smaller ones as they are."""
+    return reduced_panorama(picture, WIDTH), reduced_mask(valid, WIDTH)
 
 
 def area_labels(pixels: Mask) -> NDArray[np.int64]:
@@ -16,6 +30,35 @@ def area_labels(pixels: Mask) -> NDArray[np.int64]:
 
     labels = label_surfaces(np.where(pixels, np.float32(1), np.float32(np.nan)), 1.0)
     return np.asarray(labels).reshape(pixels.shape)
+
+
+def area_sizes(labels: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum of weights (H, W) over the area of each label, (H W,)."""
+    inside = labels >= 0
+    return np.bincount(labels[inside], weights[inside], labels.size)
+
+
+def large_areas(pixels: Mask, min_area_deg2: float) -> Mask:
+    """Return the connected areas of at least a size, (H, W)."""
+    labels, weights = area_labels(pixels), pixel_weights(pixels.shape)
+    sizes = area_sizes(labels, weights) / weights.sum() * SQUARE_DEG_OF_SPHERE
+    return (labels >= 0) & (sizes >= min_area_deg2)[labels]
+
+
+def opened_areas(pixels: Mask, radius_px: int) -> Mask:
+    """Return areas without bridges and specks narrower than twice a radius."""
+    return dilated(~dilated(~pixels, radius_px), radius_px) & pixels
+
+
+def closed_areas(pixels: Mask, radius_px: int) -> Mask:
+    """Return areas with gaps closed that are narrower than twice a radius."""
+    return ~dilated(~dilated(pixels, radius_px), radius_px) | pixels
+
+
+@cache
+def off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the angle of each pixel from straight down, (H, W)."""
+    return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
 
 
 def dilated(pixels: Mask, radius_px: int) -> Mask:

@@ -9,8 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.masks.areas import DARK_LEVEL
+from pano_mvs.algorithms.panoramas import mean_around, nearest_resized
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
@@ -23,7 +26,6 @@ _GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
 _GROUND_TRIALS = 60
 # Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
 _AROUND_DEG = 1.4
-_DARK_LEVEL = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,11 +85,11 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
             np.float32
         )
     ground = ~(ranges < (1 - 2 * _SAME) * on_ground) & np.isfinite(on_ground)
-    ranges = _enlarged(np.where(ground, on_ground, ranges), size_hw)
-    ground = _enlarged(ground.astype(np.float32), size_hw) > 0.5
-    colors, own = [_colors_around(other.picture) for other in others], _smooth(picture)
+    ranges = nearest_resized(np.where(ground, on_ground, ranges), size_hw)
+    ground = nearest_resized(ground.astype(np.float32), size_hw) > 0.5
+    colors, own = [_colors_around(other.picture) for other in others], mean_around(picture)
     difference, expected = _differences(own, ranges, others, around=colors, colors_at=ground)
-    ratio = (own + _DARK_LEVEL) / (expected + _DARK_LEVEL)
+    ratio = (own + DARK_LEVEL) / (expected + DARK_LEVEL)
     # Such as a chair beside the camera that others hardly see.
     nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
     if nearer.any():
@@ -143,10 +145,9 @@ def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:
     points = ray_grid((ranges.shape[0], ranges.shape[1]))[known].T * ranges[known]
     points = other.pose.rotation.T @ (points - other.pose.translation[:, None])
     distances = np.sqrt(points[0] ** 2 + points[1] ** 2 + points[2] ** 2)
-    nearest = np.full(grid_hw[0] * grid_hw[1], np.inf, np.float32)
-    x, y = np.floor(pixel_from_ray(points.T, grid_hw)).astype(np.intp).T
-    np.minimum.at(nearest, np.minimum(y, grid_hw[0] - 1) * grid_hw[1] + x % grid_hw[1], distances.astype(np.float32))
-    found = np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(grid_hw)
+    nearest = np.full(grid_hw, np.inf, np.float32)
+    np.minimum.at(nearest, pixels_containing(points.T, grid_hw), distances.astype(np.float32))
+    found = np.where(np.isfinite(nearest), nearest, np.float32(0))
     return _with_holes_filled(found)
 
 
@@ -171,18 +172,13 @@ def _agreed(seen: Plane) -> Plane:
     return np.asarray(np.where(np.isfinite(best), best, np.nan), np.float32)
 
 
-def _enlarged(values: Plane, size_hw: tuple[int, int]) -> Plane:
-    rows, columns = (np.arange(size) * small // size for size, small in zip(size_hw, values.shape, strict=True))
-    return np.asarray(values[rows[:, None], columns])
-
-
 def _differences(
     own: Plane, ranges: Plane, others: Sequence[OtherView], *, around: Sequence[Plane], colors_at: Mask
 ) -> tuple[Plane, Plane]:
     """Return the differences of colour and the expected colours of pixels; NaN where fewer than two, or no, views see.
 
-    `own`: (H, W, 3) colours of the reference, see `_smooth`. `ranges`: (H, W), NaN if not known. `others`: the other
-    views. `around`: `_colors_around` of each. `colors_at`: (H, W), where expected colours are wanted.
+    `own`: (H, W, 3) `mean_around` of the reference. `ranges`: (H, W), NaN if not known. `others`: the other views.
+    `around`: `_colors_around` of each. `colors_at`: (H, W), where expected colours are wanted.
 
     Returns:
         (H, W) grey levels, and (H, W, 3).
@@ -198,7 +194,7 @@ def _differences(
         lowest, middle, highest = of_other[:, :, at[visible]]
         gain = np.ones((3, 1), np.float32)
         if visible.sum() > 100:
-            gain = np.median((here + _DARK_LEVEL) / (middle + _DARK_LEVEL), axis=1, keepdims=True)
+            gain = np.median((here + DARK_LEVEL) / (middle + DARK_LEVEL), axis=1, keepdims=True)
         apart = np.maximum(lowest * gain - here, here - highest * gain)
         # Three planes: the largest over a short last axis takes many times as long.
         differences[idx, visible] = np.maximum(np.maximum(np.maximum(*apart[:2]), apart[2]), 0)
@@ -228,9 +224,9 @@ def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp]
     in_view = other.pose.rotation @ points + other.pose.translation[:, None]
     distances = np.sqrt(in_view[0] ** 2 + in_view[1] ** 2 + in_view[2] ** 2)
     height, width = other.picture.shape[:2]
-    x, y = np.floor(pixel_from_ray(in_view.T, (height, width))).astype(np.intp).T
-    at = np.minimum(y, height - 1) * width + x % width
-    seen = _enlarged(other.range_map.range, (height, width)).ravel()[at]
+    row, column = pixels_containing(in_view.T, (height, width))
+    at = row * width + column
+    seen = nearest_resized(other.range_map.range, (height, width)).ravel()[at]
     with np.errstate(invalid="ignore"):
         visible = other.valid.ravel()[at] & ~(np.abs(seen - distances) > 2 * _SAME * distances)
     return at, visible
@@ -238,14 +234,10 @@ def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp]
 
 def _colors_around(picture: Picture) -> Plane:
     """Return the darkest, the mean and the lightest colours around each pixel, (3, 3, H W): which, colour and pixel."""
-    smooth = _smooth(picture)
+    smooth = mean_around(picture)
     around = max(1, round(_AROUND_DEG * len(picture) / 180))
     padded = pad_panorama(smooth, around)
     window = np.ones((2 * around + 1,) * 2, np.uint8)
     inner = (slice(around, -around),) * 2
     colors = np.stack([cv2.erode(padded, window)[inner], smooth, cv2.dilate(padded, window)[inner]])
     return np.ascontiguousarray(colors.reshape(3, -1, 3).transpose(0, 2, 1))
-
-
-def _smooth(picture: Picture) -> Plane:
-    return np.ascontiguousarray(cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1])

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights
+from pano_mvs.algorithms.masks.areas import (
+    SQUARE_DEG_OF_SPHERE,
+    area_labels,
+    area_sizes,
+    border_shares,
+    closed_areas,
+    dilated,
+    off_nadir_deg,
+    opened_areas,
+    pixel_weights,
+)
 from pano_mvs.algorithms.masks.expected_view import Expected, OtherView, expected_view
 from pano_mvs.algorithms.masks.people import person_at
 from pano_mvs.algorithms.masks.person_views import SeenPanorama
@@ -20,13 +28,9 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
 
-WIDTH = 512
-"""Columns at which views are compared; larger ones have to be reduced."""
-
 MAX_OTHERS = 6
 """More views around a panorama add nothing."""
 
-_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 # Differences of colour, in grey levels, from which an area is changed, and at least somewhere in it.
 _CHANGED, _CERTAIN = 10.0, 24.0
 _MIN_CERTAIN_SHARE = 0.15
@@ -110,7 +114,7 @@ def moving_pixels(
         else:
             found |= _person_in(seen, area, passers_by=passers_by)
     if found.any():
-        found = _closed(found, size_hw)
+        found = _without_gaps(found)
     cast = _beside(shadow, found | ~valid) if shadows else nothing
     margin = round(margin_deg * size_hw[0] / 180)
     everything = found | cast
@@ -119,18 +123,13 @@ def moving_pixels(
 
 def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask]:
     """Return the connected areas that are large enough and certain."""
-    opened = dilated(~dilated(~changed, 1), 1) & changed
+    opened = opened_areas(changed, 1)
     labels, weights = area_labels(opened), pixel_weights(changed.shape)
-    sizes = np.bincount(labels[opened], weights[opened], labels.size)
+    sizes = area_sizes(labels, weights)
     certain = opened & (np.nan_to_num(expected.difference) > _CERTAIN)
     share = np.bincount(labels[certain], weights[certain], labels.size) / np.maximum(sizes, 1e-9)
-    least = min_area_deg2 / _SQUARE_DEG_OF_SPHERE * weights.sum()
+    least = min_area_deg2 / SQUARE_DEG_OF_SPHERE * weights.sum()
     return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= _MIN_CERTAIN_SHARE))]
-
-
-@cache
-def _off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
-    return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(size_hw)[..., 1], -1, 1))), np.float64)
 
 
 def _extends_mask(area: Mask, masked: Mask) -> bool:
@@ -138,7 +137,7 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
     if not masked.any():
         return False
     weights = pixel_weights(area.shape)
-    within = area & (_off_nadir_deg((area.shape[0], area.shape[1])) < _REACH_DEG)
+    within = area & (off_nadir_deg((area.shape[0], area.shape[1])) < _REACH_DEG)
     if weights[within].sum() < 0.9 * weights[area].sum():
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
@@ -147,7 +146,7 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
 
 def _person_in(seen: SeenPanorama, area: Mask, *, passers_by: bool) -> Mask:
     """Return an area if it is the operator, or with the pixels of the person in it; nothing if neither."""
-    below = bool(_off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG)
+    below = bool(off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG)
     nobody = np.zeros_like(area)
     if not below and not passers_by:
         return nobody
@@ -185,7 +184,7 @@ def _is_vehicle(area: Mask, expected: Expected) -> bool:
 def _has_ceiling(expected: Expected) -> bool:
     """Return whether other views see a surface not far above the camera."""
     size_hw = (expected.ranges.shape[0], expected.ranges.shape[1])
-    above = expected.ranges[_off_nadir_deg(size_hw) > 180 - _CEILING_DEG]
+    above = expected.ranges[off_nadir_deg(size_hw) > 180 - _CEILING_DEG]
     known = above[np.isfinite(above)]
     return bool(len(known) > _MIN_CEILING_SHARE * len(above) and np.median(known) < _MAX_CEILING * expected.height)
 
@@ -205,12 +204,9 @@ def _beside(shadow: Mask, pixels: Mask) -> Mask:
     return np.isin(labels, touched) & (labels >= 0)
 
 
-def _closed(found: Mask, size_hw: tuple[int, int]) -> Mask:
+def _without_gaps(found: Mask) -> Mask:
     """Return areas with gaps of up to two degrees closed, and holes filled."""
-    radius = max(1, round(size_hw[0] / 180))
-    closed = ~dilated(~dilated(found, radius), radius) | found
-    labels, weights = area_labels(~closed), pixel_weights(size_hw)
-    sizes = np.bincount(labels[~closed], weights[~closed], labels.size)
-    hole = np.zeros_like(closed)
-    hole[~closed] = sizes[labels[~closed]] < 0.3 * weights[found].sum()
-    return np.asarray(closed | hole)
+    closed = closed_areas(found, max(1, round(len(found) / 180)))
+    labels, weights = area_labels(~closed), pixel_weights(found.shape)
+    small = area_sizes(labels, weights) < 0.3 * weights[found].sum()
+    return closed | ((labels >= 0) & small[labels])

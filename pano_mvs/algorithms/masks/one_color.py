@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.masks.areas import large_areas
+from pano_mvs.algorithms.panoramas import squarely_dilated
 from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import pad_panorama, pixel_solid_angle
 
 
 @checks_settings
@@ -34,23 +34,7 @@ def areas_of_color(
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise UsageError(f"an image must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
-    from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
-
     alike = np.asarray((np.abs(picture.astype(np.int16) - np.array(color_rgb, np.int16)) <= tolerance).all(axis=-1))
     if not alike.any():
         return alike
-    labels = label_surfaces(np.where(alike, np.float32(1), np.float32(np.nan)), 1.0).reshape(alike.shape)
-    area_deg2 = np.broadcast_to(pixel_solid_angle(alike.shape)[:, None], alike.shape) * np.degrees(1) ** 2
-    sizes = np.bincount(labels[alike], area_deg2[alike], labels.size)
-    large = np.zeros_like(alike)
-    large[alike] = sizes[labels[alike]] >= min_area_deg2
-    return _widened(large, min(margin_px, len(alike)))
-
-
-def _widened(mask: Mask, margin: int) -> Mask:
-    if margin == 0:
-        return mask
-    window = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-    return np.asarray(
-        cv2.dilate(pad_panorama(mask.astype(np.uint8), margin), window)[margin:-margin, margin:-margin] > 0
-    )
+    return squarely_dilated(large_areas(alike, min_area_deg2), min(margin_px, len(alike)))

@@ -7,10 +7,16 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
-from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights
+from pano_mvs.algorithms.masks.areas import (
+    SQUARE_DEG_OF_SPHERE,
+    area_labels,
+    dilated,
+    large_areas,
+    off_nadir_deg,
+    pixel_weights,
+)
 from pano_mvs.algorithms.masks.person_upright import upright_people
 from pano_mvs.algorithms.masks.person_views import MAP_HW, Look, Map, SeenPanorama, look, rolled
 from pano_mvs.core.arrays import Mask, Picture
@@ -65,14 +71,14 @@ def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline
     found = _means(probable[: len(_NARROW_ROLLS_DEG)], area)
     if np.mean(_means(outlined, area)) < min_outline:
         return False
-    if _off_nadir_deg()[area].min() < _AT_NADIR_DEG and np.mean(found) >= _MIN_PROBABILITY_AT_NADIR:
+    if off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG and np.mean(found) >= _MIN_PROBABILITY_AT_NADIR:
         return True
     return bool(np.mean(found) >= _MIN_PROBABILITY and min(found) >= _MIN_ONE_PROBABILITY)
 
 
 def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, area: Mask) -> bool:
     """Return whether an area that is likely is a person, or what is fixed below the camera."""
-    at_nadir = _off_nadir_deg()[area].min() < _AT_NADIR_DEG
+    at_nadir = off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG
     if at_nadir and np.mean(_means(outlined, area)) >= _CERTAIN_OUTLINE:
         return True
     wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= _MIN_WIDE_PROBABILITY
@@ -84,8 +90,8 @@ def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, a
 def _areas_below(mean: Map, min_area_deg2: float) -> list[Mask]:
     """Return the connected areas near the nadir that are probable and large enough."""
     labels, weights = area_labels(mean > _BELONGS_BELOW), pixel_weights(MAP_HW)
-    near = np.unique(labels[(_off_nadir_deg() < _REACH_DEG) & (labels >= 0)])
-    least = min_area_deg2 / (4 * np.pi * np.degrees(1) ** 2) * weights.sum()
+    near = np.unique(labels[(off_nadir_deg(MAP_HW) < _REACH_DEG) & (labels >= 0)])
+    least = min_area_deg2 / SQUARE_DEG_OF_SPHERE * weights.sum()
     areas = (labels == label for label in near)
     return [area for area in areas if weights[area].sum() >= least]
 
@@ -112,11 +118,6 @@ def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
     return narrow, wide
 
 
-@cache
-def _off_nadir_deg() -> NDArray[np.float64]:
-    return np.asarray(np.degrees(np.arccos(np.clip(ray_grid(MAP_HW)[..., 1], -1, 1))))
-
-
 # An area is seen again in the middle of views of its own, this many times as wide.
 _VIEW_OF_EXTENT = 2.4
 _MIN_FOV_DEG, _MAX_FOV_DEG = 40.0, 110.0
@@ -126,7 +127,6 @@ _NADIR_DEG = 15.0
 _MIN_PRESENCE = 0.6
 # The mean probability of the pixels of a person.
 _BELONGS = 0.6
-_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 
 
 @checks_settings
@@ -158,7 +158,9 @@ def people(
     seen = SeenPanorama(picture)
     found = people_below(seen, min_area_deg2)
     found = upright_people(seen, found, min_area_deg2=min_area_deg2, passers_by=passers_by)
-    return _large_and_dilated(_at_size(found.astype(np.float32), seen.size_hw) > 0.5, min_area_deg2, margin_deg)
+    large = large_areas(_at_size(found.astype(np.float32), seen.size_hw) > 0.5, min_area_deg2)
+    margin = round(margin_deg * len(large) / 180)
+    return dilated(large, margin) if margin and large.any() else large
 
 
 def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, Mask]:
@@ -185,17 +187,6 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
 
 def _mean_in(probability: Map, area: Mask) -> float:
     return float(np.average(probability[area], weights=pixel_weights(area.shape)[area]))
-
-
-def _large_and_dilated(found: Mask, min_area_deg2: float, margin_deg: float) -> Mask:
-    if not found.any():
-        return found
-    labels, weights = area_labels(found), pixel_weights(found.shape)
-    sizes = np.bincount(labels[found], weights[found], labels.size) / weights.sum() * _SQUARE_DEG_OF_SPHERE
-    large = np.zeros_like(found)
-    large[found] = sizes[labels[found]] >= min_area_deg2
-    margin = round(margin_deg * len(found) / 180)
-    return dilated(large, margin) if margin and large.any() else large
 
 
 def _views_of(area: Mask) -> list[Look]:

@@ -11,10 +11,9 @@ import numpy as np
 from pano_mvs.algorithms.faces.layout import upright_rotation
 from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
 from pano_mvs.algorithms.masks.person_views import MAP_HW, SIDE_PX, Look, Map, SeenPanorama, rolled, stereographic_look
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray, Mask
-from pano_mvs.geometry import pixel_from_ray
 
-_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 # The views in which people are looked for.
 _RING, _RING_FOV_DEG, _RING_ELEVATION_DEG = 8, 85.0, -12.0
 # What is in the middle of a view is looked for with this standard deviation.
@@ -198,15 +197,13 @@ def _same(first: _Candidate, second: _Candidate) -> bool:
 
 def _share_in(candidate: _Candidate, pixels: Mask) -> float:
     """Return the share of a candidate that lies in some pixels of the map."""
-    x, y = np.floor(pixel_from_ray(candidate.rays, MAP_HW)).astype(np.intp).T
-    return float(pixels[np.minimum(y, MAP_HW[0] - 1), x % MAP_HW[1]].mean())
+    return float(pixels[pixels_containing(candidate.rays, MAP_HW)].mean())
 
 
 def _on_map(candidate: _Candidate) -> Mask:
     """Return the pixels of the map in which the directions of a candidate lie."""
-    x, y = np.floor(pixel_from_ray(candidate.rays, MAP_HW)).astype(np.intp).T
     pixels = np.zeros(MAP_HW, np.bool_)
-    pixels[np.minimum(y, MAP_HW[0] - 1), x % MAP_HW[1]] = True
+    pixels[pixels_containing(candidate.rays, MAP_HW)] = True
     return pixels
 
 

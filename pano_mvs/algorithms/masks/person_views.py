@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import StoreError
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec
@@ -158,9 +159,9 @@ class SeenPanorama:
 
     def __init__(self, picture: Picture) -> None:
         """Take a panorama, (H, W, 3) uint8 RGB, and reduce it to `WIDTH` columns."""
-        reduced = _reduced(picture, WIDTH)
+        reduced = reduced_panorama(picture, WIDTH)
         self._full = pad_panorama(reduced, _PAD_PX)
-        self._half = pad_panorama(_reduced(reduced, WIDTH // 2), _PAD_PX)
+        self._half = pad_panorama(reduced_panorama(reduced, WIDTH // 2), _PAD_PX)
         self.size_hw = (reduced.shape[0], reduced.shape[1])
 
     def image(self, look: Look, *, mirrored: bool = False) -> Picture:
@@ -205,9 +206,3 @@ def _rays() -> FloatArray:
 def rolled(view_from_cam: FloatArray, roll: float) -> FloatArray:
     """Return the rotation of a view that is rolled about its axis."""
     return np.asarray(rotation_from_rotvec(np.array([0.0, 0.0, roll])) @ view_from_cam)
-
-
-def _reduced(picture: Picture, width: int) -> Picture:
-    if picture.shape[1] <= width:
-        return picture
-    return np.asarray(cv2.resize(picture, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)

@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights, share_of_sphere
+from pano_mvs.algorithms.masks.areas import (
+    area_labels,
+    border_shares,
+    dilated,
+    pixel_weights,
+    reduced_to_width,
+    share_of_sphere,
+)
 from pano_mvs.algorithms.masks.sky_comparison import (
     Comparison,
     compare_with_source,
@@ -18,12 +25,16 @@ from pano_mvs.algorithms.masks.sky_comparison import (
     pixel_errors,
     source_errors,
 )
-from pano_mvs.algorithms.sphere_windows import box_sum, largest_channel
+from pano_mvs.algorithms.panoramas import (
+    box_sum,
+    contrast_around,
+    largest_channel,
+    nearest_resized,
+)
 from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
-from pano_mvs.scene.masks.masking import placed_mask
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
 Mask = NDArray[np.bool_]
@@ -124,9 +135,6 @@ def _box(values: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
     return np.asarray(cv2.blur(padded, (side, side)))[radius:-radius, radius:-radius]
 
 
-WIDTH = 512
-"""Columns at which views are compared."""
-
 MAX_SOURCES = 4
 """More sources than this add little."""
 
@@ -226,8 +234,8 @@ def sky_pixels(
     found = np.asarray(sharpened_sky(sky, colors, picture) & valid, np.bool_)
     if not walls.any():
         return found
-    surface = confirmed_parts(_nearest(found, sky.shape), _seen_to_move(view))
-    return np.asarray(found & ~_nearest(surface, valid.shape), np.bool_)
+    surface = confirmed_parts(nearest_resized(found, sky.shape), _seen_to_move(view))
+    return np.asarray(found & ~nearest_resized(surface, valid.shape), np.bool_)
 
 
 def _seen_to_move(view: _View) -> Mask:
@@ -236,40 +244,17 @@ def _seen_to_move(view: _View) -> Mask:
     return np.asarray(view.consistent & (parallax_px > 1), np.bool_)
 
 
-def _nearest(values: NDArray[Any], size_hw: tuple[int, ...]) -> NDArray[Any]:
-    """Return an image (H, W) at another size."""
-    rows, columns = (np.arange(new) * old // new for old, new in zip(values.shape, size_hw, strict=True))
-    return np.asarray(values[rows[:, None], columns])
-
-
 def _view(range_map: RangeMap, picture: Picture, valid: Mask, *, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:
     """Return the reference and its comparisons with the sources, at `WIDTH` columns or fewer."""
-    small, small_valid = _reduced(picture, valid)
-    ranges = _nearest(range_map.range, small_valid.shape)
-    consistent = _nearest(range_map.confidence, small_valid.shape) >= CONSISTENT_CONFIDENCE[0]
-    small_sources = [(*_reduced(source, mask), pose) for source, mask, pose in sources]
+    small, small_valid = reduced_to_width(picture, valid)
+    ranges = nearest_resized(range_map.range, small_valid.shape)
+    consistent = nearest_resized(range_map.confidence, small_valid.shape) >= CONSISTENT_CONFIDENCE[0]
+    small_sources = [(*reduced_to_width(source, mask), pose) for source, mask, pose in sources]
     comparisons = tuple(
         compare_with_source(small, ranges, source, source_valid=mask, source_from_reference=pose)
         for source, mask, pose in small_sources
     )
     return _View(small, small_valid, ranges, consistent, comparisons)
-
-
-def _reduced(picture: Picture, valid: Mask) -> tuple[Picture, Mask]:
-    height, width = valid.shape
-    if width <= WIDTH:
-        return picture, valid
-    size_hw = (WIDTH // 2, WIDTH)
-    small = cv2.resize(picture, size_hw[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(small), placed_mask(valid, size_hw, of=(0, 0, width, height), whole_hw=(height, width))
-
-
-def _contrast(picture: Picture) -> NDArray[np.int16]:
-    """Return the largest difference of a channel within 3×3 pixels, (H, W), in grey levels."""
-    window = np.ones((3, 3), np.uint8)
-    padded = np.ascontiguousarray(pad_panorama(picture, 1))
-    contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-    return np.asarray(largest_channel(contrast[1:-1, 1:-1]), np.int16)
 
 
 def confirmed_parts(sky: Mask, confirmed: Mask) -> Mask:
@@ -295,7 +280,7 @@ def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[
 
     If the sky is only seen through windows, other large smooth areas are walls and ceilings.
     """
-    possible = view.valid & ((_contrast(view.picture) < _SMOOTH) | _clouds(view))
+    possible = view.valid & ((contrast_around(view.picture, 1) < _SMOOTH) | _clouds(view))
     labels, weights = area_labels(possible), pixel_weights(possible.shape)
     sizes = np.bincount(labels[possible], weights[possible], labels.size)
     found, large = np.zeros_like(possible), np.flatnonzero(sizes >= min_share * weights.sum())

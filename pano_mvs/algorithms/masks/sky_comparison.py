@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sphere_windows import largest_channel
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, sample_panorama
+from pano_mvs.algorithms.masks.areas import DARK_LEVEL
+from pano_mvs.algorithms.panoramas import largest_channel, mean_around
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, sample_panorama
 
 Colors = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -18,7 +18,6 @@ Mask = NDArray[np.bool_]
 # Below this parallax, infinity and the range look the same.
 _MIN_PARALLAX_PX = 1.0
 _MIN_PIXELS = 20
-_DARK_LEVEL = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ def compare_with_source(
     `source_valid`: (Hs, Ws), False is ignored. `source_from_reference`: the pose of the source.
     """
     size_hw = (reference.shape[0], reference.shape[1])
-    colors = smoothed(source)
+    colors = mean_around(source)
     colors[~source_valid] = np.nan
     far = ray_grid(size_hw) @ source_from_reference.rotation.T
     known = np.isfinite(ranges)
@@ -73,11 +72,6 @@ def _sum(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors[..., 0] + vectors[..., 1] + vectors[..., 2])
 
 
-def smoothed(picture: NDArray[np.uint8]) -> Colors:
-    """Return the mean colour of 3×3 pixels, (H, W, 3) float32, to suppress noise."""
-    return np.ascontiguousarray(cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1])
-
-
 def errors_of_area(picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison]) -> tuple[float, float]:
     """Return the median colour differences, in grey levels, of an area at infinity and at its ranges.
 
@@ -85,7 +79,7 @@ def errors_of_area(picture: NDArray[np.uint8], area: Mask, comparisons: Sequence
     ranges have parallax, if there are some; otherwise the second one is infinite. Both are infinite if no source sees
     the area.
     """
-    own = smoothed(picture)
+    own = mean_around(picture)
     found: tuple[list[float], list[float]] = ([], [])
     for source in comparisons:
         seen = area & np.isfinite(source.at_infinity[..., 0])
@@ -109,7 +103,7 @@ def pixel_errors(
     `comparisons`: with the sources. `area_at_infinity`: whether these pixels are infinitely far away, or at their
     ranges.
     """
-    own = smoothed(picture)
+    own = mean_around(picture)
     errors = []
     for source in comparisons:
         known = source.at_infinity if area_at_infinity else source.at_range
@@ -128,7 +122,7 @@ def source_errors(
     NaN where a source is masked or a range is missing. Pixels of `area`, at their ranges, give the factor of each
     channel.
     """
-    own = smoothed(picture)
+    own = mean_around(picture)
     errors = []
     for source in comparisons:
         seen = area & np.isfinite(source.at_range[..., 0])
@@ -143,7 +137,7 @@ def _median_error(own: Colors, other: Colors) -> float:
 
 
 def _gain(own: Colors, other: Colors) -> NDArray[np.float32]:
-    return np.asarray(np.median((other + _DARK_LEVEL) / (own + _DARK_LEVEL), axis=0), np.float32)
+    return np.asarray(np.median((other + DARK_LEVEL) / (own + DARK_LEVEL), axis=0), np.float32)
 
 
 def _better_half(errors: list[float]) -> float:

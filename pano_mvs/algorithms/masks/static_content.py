@@ -10,13 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights, share_of_sphere
-from pano_mvs.algorithms.sphere_windows import largest_channel
+from pano_mvs.algorithms.masks.areas import (
+    DARK_LEVEL,
+    area_labels,
+    closed_areas,
+    dilated,
+    large_areas,
+    opened_areas,
+    pixel_weights,
+    share_of_sphere,
+)
+from pano_mvs.algorithms.panoramas import contrast_around, largest_channel, mean_around
 from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, ray_grid, rotate_panorama
-from pano_mvs.scene.masks.masking import placed_mask
 
 Plane = NDArray[np.float32]
 _Compared: TypeAlias = "tuple[Plane, Plane, Plane]"
@@ -80,10 +88,7 @@ def color_difference(pictures: Sequence[Picture], gains: NDArray[np.float64]) ->
 
     `pictures`: (H, W, 3) uint8 RGB each. `gains`: (V, 3) factor by which the channels of each picture are multiplied.
     """
-    smooth = [
-        cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1] * gain.astype(np.float32)
-        for picture, gain in zip(pictures, gains, strict=True)
-    ]
+    smooth = [mean_around(picture) * gain.astype(np.float32) for picture, gain in zip(pictures, gains, strict=True)]
     apart = [largest_channel(np.abs(smooth[i] - smooth[j])) for i, j in evenly_spread_pairs(len(pictures))]
     return np.asarray(np.quantile(apart, 1 - _DISAGREEING, axis=0), np.float32)
 
@@ -138,9 +143,6 @@ MIN_VIEWS = 3
 MAX_VIEWS = 12
 """More views than this add nothing; give an evenly spread choice."""
 
-WIDTH = 512
-"""Columns at which panoramas are compared."""
-
 _MIN_WIDTH = 128
 # A window has structure from this standard deviation on, in grey levels.
 _MIN_CONTRAST = 4.0
@@ -152,14 +154,12 @@ _MIN_MOVED_SHARE = 0.03
 _MIN_SEED_PX = 12
 # How much colours may differ: in grey levels, and as a share of the brightness.
 _MAX_DIFFERENCE, _MAX_CHANGE = 8.0, 0.05
-_DARK_LEVEL = 4.0
 # Around content that moves with the camera, at least this share of the structure moves.
 _RING_PX, _MIN_RING_MOVED, _MIN_RING_STRUCTURE = 6, 0.35, 0.1
 # A part belongs to the content beside it if this share of its border lies on it, or on an outline.
 _MIN_ENCLOSED = 0.5
 _MIN_EDGE = 12
 _CLOSING_PX, _OVERHANG_PX = 2, 3
-_SQUARE_DEG_OF_SPHERE = 4 * np.pi * np.degrees(1) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,19 +215,9 @@ def static_content(
     core = _grown(agreement, structure, moved)
     if not core.any():
         return StaticContent(nothing)
-    found = _large(_with_enclosed_parts(core, pictures, plain=usable & ~structure), min_area_deg2)
+    found = large_areas(_with_enclosed_parts(core, pictures, plain=usable & ~structure), min_area_deg2)
     margin = round(margin_deg * size_hw[0] / 180)
     return StaticContent(dilated(found, margin) if margin and found.any() else found)
-
-
-def reduced_to_width(picture: Picture, valid: Mask) -> tuple[Picture, Mask]:
-    """Return a panorama and its mask at `WIDTH` columns; smaller ones as they are."""
-    height, width = valid.shape
-    if width <= WIDTH:
-        return picture, valid
-    size_hw = (WIDTH // 2, WIDTH)
-    small = cv2.resize(picture, size_hw[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(small), placed_mask(valid, size_hw, of=(0, 0, width, height), whole_hw=(height, width))
 
 
 def _usable(valid: Sequence[Mask] | None, size_hw: tuple[int, int]) -> Mask:
@@ -265,9 +255,11 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     """
     brightness = np.median([largest_channel(picture) for picture in pictures], axis=0)
     alike = color_difference(pictures, _gains(pictures, core)) <= _MAX_DIFFERENCE + _MAX_CHANGE * brightness
-    closed = ~dilated(~dilated(core, _CLOSING_PX), _CLOSING_PX) | core
-    outline = closed | _lasting_edges(pictures)
-    parts = _opened((alike | plain) & ~closed)
+    closed = closed_areas(core, _CLOSING_PX)
+    # Beside which three fifths of the views have an edge.
+    edges = np.quantile([contrast_around(picture, 1) for picture in pictures], 0.4, axis=0) >= _MIN_EDGE
+    outline = closed | edges
+    parts = opened_areas((alike | plain) & ~closed, 1)
     labels, weights = area_labels(parts), pixel_weights(core.shape)
     result = closed.copy()
     for label in np.unique(labels[parts & dilated(closed, 1)]):
@@ -283,24 +275,8 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
 def _gains(pictures: Sequence[Picture], pixels: Mask) -> NDArray[np.float64]:
     """Return factors (V, 3) that give most of some pixels the same colour in all views."""
     inner = pixels & ~dilated(~pixels, _CLOSING_PX)
-    levels = np.array([picture[inner if inner.any() else pixels] for picture in pictures]) + _DARK_LEVEL
+    levels = np.array([picture[inner if inner.any() else pixels] for picture in pictures]) + DARK_LEVEL
     return np.asarray(np.median(np.median(levels, axis=0) / levels, axis=1))
-
-
-def _lasting_edges(pictures: Sequence[Picture]) -> Mask:
-    """Return the pixels, (H, W), beside which three fifths of the views have an edge."""
-    window = np.ones((3, 3), np.uint8)
-    contrasts = []
-    for picture in pictures:
-        padded = np.ascontiguousarray(pad_panorama(picture, 1))
-        contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-        contrasts.append(largest_channel(contrast[1:-1, 1:-1]))
-    return np.asarray(np.quantile(contrasts, 0.4, axis=0) >= _MIN_EDGE)
-
-
-def _opened(pixels: Mask) -> Mask:
-    """Return areas without bridges and specks one or two pixels wide."""
-    return np.asarray(dilated(~dilated(~pixels, 1), 1) & pixels)
 
 
 def _without_pinholes(found: Mask) -> Mask:
@@ -311,12 +287,3 @@ def _without_pinholes(found: Mask) -> Mask:
     filled = found.copy()
     filled[~found] = sizes[labels[~found]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
     return filled
-
-
-def _large(found: Mask, min_area_deg2: float) -> Mask:
-    labels = area_labels(found)
-    area_deg2 = pixel_weights(found.shape) * (_SQUARE_DEG_OF_SPHERE / pixel_weights(found.shape).sum())
-    sizes = np.bincount(labels[found], area_deg2[found], labels.size)
-    large = np.zeros_like(found)
-    large[found] = sizes[labels[found]] >= min_area_deg2
-    return large

@@ -14,9 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file
-from pano_mvs.geometry import Rigid3, pixel_from_ray
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -183,9 +184,7 @@ class FreeSpace:
         if valid.shape != range_map.range.shape:
             raise UsageError(f"a mask of {valid.shape} for ranges of {range_map.range.shape}")
         points = cam_from_world.apply(self._vertices)
-        height, width = range_map.range.shape
-        at = np.floor(pixel_from_ray(points, (height, width))).astype(np.int64)
-        row, column = np.minimum(at[:, 1], height - 1), at[:, 0] % width
+        row, column = pixels_containing(points, range_map.range.shape)
         ratio = range_map.range[row, column] / np.linalg.norm(points, axis=1)
         shown = valid[row, column]
         sure = shown & (range_map.confidence[row, column] >= CONSISTENT_CONFIDENCE[0])

@@ -17,11 +17,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.consistency import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.filters.data_term import MaxHoleDeg, require_confidence
 from pano_mvs.algorithms.filters.fill import large_holes
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.patchmatch.refine import SOURCE_REACH, reference_arrays, source_arrays
+from pano_mvs.algorithms.ranges.agreement import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.core.bands import for_bands

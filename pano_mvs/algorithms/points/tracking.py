@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.points.selection import spread_points
+from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP, pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, spiral_rays
+from pano_mvs.geometry import Rigid3, ray_from_pixel, spiral_rays
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surface_samples import SurfaceSamples
@@ -47,8 +48,7 @@ def sample_surface(
     size_hw = (range_map.range.shape[0], range_map.range.shape[1])
     if image.shape[:2] != size_hw or valid.shape != size_hw:
         raise UsageError(f"image {image.shape[:2]}, mask {valid.shape} and range map {size_hw} differ in size")
-    whole = np.floor(pixel_from_ray(spiral_rays(count), size_hw)).astype(np.intp)
-    row, column = np.minimum(whole[:, 1], size_hw[0] - 1), whole[:, 0] % size_hw[1]
+    row, column = pixels_containing(spiral_rays(count), size_hw)
     pixels = np.unique(row * size_hw[1] + column)
     row, column = np.divmod(pixels, size_hw[1])
     good = valid[row, column] & (range_map.confidence[row, column] >= min_confidence) & range_map.valid[row, column]
@@ -64,8 +64,6 @@ def sample_surface(
 # Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So the
 # distance of neighbouring points is proportional to the square root of the distance to the nearest camera.
 _SPACING_POWER = 0.5
-_MAX_SURFACE_STEP = 0.05
-_MAX_REPROJECTION_PX = 1.0
 # Factor on the number of points that are tested for visibility, since some fail.
 _SURPLUS = 1.3
 _MAX_CANDIDATES = 12_000_000
@@ -189,7 +187,7 @@ def _track_group(
     few = spread_points(candidates.points, spacing, int(np.ceil(_SURPLUS * count)), rng=rng)
     chosen, spacing = candidates[few], spacing[few]
     asked = _asked(tree, chosen, min(neighbours, len(names)))
-    limits = np.array([max_relative_error, _MAX_SURFACE_STEP, float(min_confidence)])
+    limits = np.array([max_relative_error, MAX_SURFACE_STEP, float(min_confidence)])
     found = [
         _sightings(
             chosen,
@@ -259,7 +257,7 @@ def _sightings(
 
     points, homes = chosen.points[asked], centers[chosen.home_idx[asked]]
     seen, errors, bearings = np.zeros(len(asked), np.bool_), np.zeros(len(asked)), np.zeros((len(asked), 3))
-    max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / range_map.range.shape[1]
+    max_angle = MAX_REPROJECTION_PX * 2 * np.pi / range_map.range.shape[1]
     view = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
     ranges, confidence = np.ascontiguousarray(range_map.range), np.ascontiguousarray(range_map.confidence)
     see_points(points, homes, max_angle, view, ranges, confidence, limits, seen, errors, bearings)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.view import FloatArray, PlaneView, plane_ranges
 from pano_mvs.geometry import pad_panorama, pixel_from_ray
 
@@ -307,7 +308,4 @@ def _rays(azimuth: FloatArray, dip: FloatArray) -> FloatArray:
 
 
 def _value_at(values: NDArray[np.bool_], view: PlaneView, *, rays: FloatArray) -> NDArray[np.bool_]:
-    size = values.shape[0], values.shape[1]
-    pixels = pixel_from_ray(rays @ view.cam_from_world.rotation.T, size)
-    column, row = np.floor(pixels).astype(np.int64).T
-    return np.asarray(values[np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)])
+    return np.asarray(values[pixels_containing(rays @ view.cam_from_world.rotation.T, values.shape)])

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.guided import guided_values
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.view import FloatArray, Mask, Picture, on_grid, plane_ranges, stride_of
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 from pano_mvs.scene.structure import Structure
@@ -164,11 +165,9 @@ def _seen_by_others(
     agree, through = np.zeros(places.shape[:2], np.int64), np.zeros(places.shape[:2], np.int64)
     known = np.isfinite(places).all(axis=-1)
     for source, pose in zip(sources, poses, strict=True):
-        size = source.range.shape[0], source.range.shape[1]
         in_source = pose.apply(places[known])
         distance = np.linalg.norm(in_source, axis=-1)
-        column, row = np.floor(pixel_from_ray(in_source / distance[:, None], size)).astype(np.int64).T
-        row, column = np.clip(row, 0, size[0] - 1), np.clip(column, 0, size[1] - 1)
+        row, column = pixels_containing(in_source / distance[:, None], source.range.shape)
         confirmed = source.confidence[row, column] >= CONSISTENT_CONFIDENCE[0]
         seen = source.range[row, column] / distance
         agree[known] += confirmed & (np.abs(seen - 1) < error)

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.panoramas import contrast_around, reduced_mask, reduced_panorama
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline, range_at, range_limits
 from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
+from pano_mvs.geometry import Rigid3, pixel_solid_angle
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.masks.masking import placed_mask
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Rounding the limits outward to steps of a quarter octave keeps the planes, and with them the ranges, the same when
@@ -158,29 +158,9 @@ def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:
     return [float(np.linalg.norm(pose.center - poses[idx].center)) for pose in poses]
 
 
-def reduced_panorama(picture: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
-    """Return a panorama (H, W, 3) at `width_px` columns; a smaller one is returned unchanged."""
-    if picture.shape[1] <= width_px:
-        return picture
-    small: NDArray[np.uint8] = cv2.resize(picture, (width_px, width_px // 2), interpolation=cv2.INTER_AREA)
-    return small
-
-
-def reduced_mask(mask: NDArray[np.bool_], width_px: int) -> NDArray[np.bool_]:
-    """Return a mask (H, W) at `width_px` columns: True where a small pixel has no ignored pixel in it."""
-    if mask.shape[1] <= width_px:
-        return mask
-    height, width = mask.shape
-    return placed_mask(mask, (width_px // 2, width_px), of=(0, 0, width, height), whole_hw=(height, width))
-
-
 def textured_pixels(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), in whose surroundings there is something to match."""
-    grey = pad_panorama(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2)
-    window = np.ones((5, 5), np.uint8)
-    contrast = cv2.dilate(grey, window).astype(np.int16) - cv2.erode(grey, window)
-    textured: NDArray[np.bool_] = contrast[2:-2, 2:-2] >= _MIN_CONTRAST
-    return textured
+    return contrast_around(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2) >= _MIN_CONTRAST
 
 
 def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tuple[float, float]:

@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.algorithms.panoramas import contrast_around
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, rotate_panorama
+from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, rotate_panorama
 
 # Rec. 709 luma in 1/256.
 _LUMA = np.array([54, 183, 19])
@@ -166,11 +168,7 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
 
 def valid_where_seen(valid: NDArray[np.bool_], points_in_source: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether the pixel of a source, `valid` (H, W), in which each point (..., 3) is seen is valid, (...,)."""
-    height, width = valid.shape
-    pixels = pixel_from_ray(points_in_source, (height, width))
-    column = np.floor(pixels[..., 0]).astype(np.intp) % width
-    row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
-    return np.asarray(valid[row, column])
+    return np.asarray(valid[pixels_containing(points_in_source, valid.shape)])
 
 
 # Of all weight this share is dealt out equally where no source sees range, so that something is compared at all.
@@ -233,11 +231,4 @@ def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
 
 def is_bare(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), around which no colour of a picture (H, W, C) changes enough to be matched."""
-    radius = _CONTRAST_RADIUS
-    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    bare = np.ones(picture.shape[:2], np.bool_)
-    for plane in np.moveaxis(picture, -1, 0):
-        padded = np.ascontiguousarray(pad_panorama(plane, radius))
-        contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-        bare &= contrast[radius:-radius, radius:-radius] < _MIN_CONTRAST
-    return bare
+    return contrast_around(picture, _CONTRAST_RADIUS) < _MIN_CONTRAST

@@ -8,13 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.filters.consistency import (
-    _step_around,
-    agreeing_sources,
-    check_consistency,
-    compare_with_sources,
-    seen_ranges,
-)
+from pano_mvs.algorithms.filters.consistency import _step_around, check_consistency
+from pano_mvs.algorithms.ranges.agreement import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows, count_agreeing
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama, sines_of_grid

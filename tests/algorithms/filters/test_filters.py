@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from tests.algorithms.range_scenes import TRUSTED, as_map, random_map, rolled

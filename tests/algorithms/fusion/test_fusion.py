@@ -15,7 +15,7 @@ from pano_mvs.algorithms.fusion.fuse import fuse_reference, fuse_stream, fuse_vi
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView, nearest_views
 from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid
 from pano_mvs.scene import PointCloud, RangeMap

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
-from pano_mvs.algorithms.sphere_windows import columns_per_step
+from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec, sines_of_grid
 from tests.oracles import fusion as oracle
 

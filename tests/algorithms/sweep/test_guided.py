@@ -16,7 +16,7 @@ from pano_mvs.algorithms.filters.fill import fill_from_neighbours, large_holes
 from pano_mvs.algorithms.filters.guided import guided_range, guided_values
 from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.sphere_windows import box_spread, box_sum, columns_per_step, largest_channel
+from pano_mvs.algorithms.panoramas import box_spread, box_sum, columns_per_step, largest_channel
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
-from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama, textured_pixels
+from pano_mvs.algorithms.sweep.limits import textured_pixels
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, pixel_solid_angle, ray_grid

@@ -1,14 +1,17 @@
-"""Sums, extremes and step widths over windows that are isotropic on the sphere."""
+"""Panoramas as arrays: windows across the seam and the poles, sums over isotropic ones, and smaller copies."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.arrays import FloatArray, FloatImage, Mask, Picture
 from pano_mvs.geometry import pad_panorama
+from pano_mvs.scene.masks.masking import placed_mask
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -22,6 +25,60 @@ def largest_channel(values: NDArray[Scalar]) -> NDArray[Scalar]:
     for channel in range(1, values.shape[-1]):
         largest = np.maximum(largest, values[..., channel])
     return largest
+
+
+def filtered(picture: NDArray[Any], margin: int, apply: Callable[[NDArray[Any]], NDArray[Any]]) -> NDArray[Any]:
+    """Return a panorama after a filter of pictures that reads `margin` pixels around, as if there were no border."""
+    result = apply(np.ascontiguousarray(pad_panorama(picture, margin)))
+    return np.asarray(result)[margin:-margin, margin:-margin]
+
+
+def square_window(radius: int) -> NDArray[np.uint8]:
+    """Return the window of OpenCV's morphology with `radius` pixels on either side of the centre."""
+    return np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+
+
+def contrast_around(picture: Picture, radius: int) -> NDArray[np.int16]:
+    """Return the largest difference of a channel within a square window, (H, W), in grey levels."""
+    window = square_window(radius)
+    contrast = filtered(
+        picture, radius, lambda padded: cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
+    )
+    return largest_channel(contrast) if contrast.ndim == 3 else contrast
+
+
+def mean_around(picture: Picture) -> FloatImage:
+    """Return the mean of 3×3 pixels, (H, W, 3) float32, which suppresses noise."""
+    mean = filtered(picture, 1, lambda padded: cv2.blur(padded.astype(np.float32), (3, 3)))
+    return np.ascontiguousarray(mean)
+
+
+def squarely_dilated(pixels: Mask, radius: int) -> Mask:
+    """Return pixels, (H, W), and those within a square window around them."""
+    if radius == 0:
+        return pixels
+    return filtered(pixels.astype(np.uint8), radius, lambda padded: cv2.dilate(padded, square_window(radius))) > 0
+
+
+def reduced_panorama(picture: Picture, width_px: int) -> Picture:
+    """Return a panorama (H, W, 3) at `width_px` columns; a smaller one is returned unchanged."""
+    if picture.shape[1] <= width_px:
+        return picture
+    return np.asarray(cv2.resize(picture, (width_px, width_px // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def reduced_mask(mask: Mask, width_px: int) -> Mask:
+    """Return a mask (H, W) at `width_px` columns: True where a small pixel has no ignored pixel in it."""
+    height, width = mask.shape
+    if width <= width_px:
+        return mask
+    return placed_mask(mask, (width_px // 2, width_px), of=(0, 0, width, height), whole_hw=(height, width))
+
+
+def nearest_resized(values: NDArray[Any], size_hw: tuple[int, ...]) -> NDArray[Any]:
+    """Return values (H, W) at another size, those of the nearest pixels."""
+    rows, columns = (np.arange(new) * old // new for old, new in zip(values.shape, size_hw, strict=True))
+    return np.asarray(values[rows[:, None], columns])
 
 
 def columns_per_step(size_hw: tuple[int, int], *, steps: int) -> NDArray[np.int64]:
