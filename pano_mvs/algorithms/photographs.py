@@ -67,7 +67,7 @@ class PhotographColors:
         coarse = _sampled(photograph, pixels, size_hw, blur_px=2 * spacing_px)
         own = self._cloud.colors_rgb[seen].astype(np.float64)
         gains, contrasts = _exposure(coarse, own)
-        corrected, compared = (_corrected(colors, gains, contrasts) for colors in (sharp, coarse))
+        corrected, compared = ((255 * gains * (colors / 255) ** contrasts).clip(0, 255) for colors in (sharp, coarse))
         alike = np.abs(compared - own).max(axis=1) < self._settings.max_difference
         seen, weights, corrected, pixels = seen[alike], weights[alike], corrected[alike], pixels[alike]
         self._sums[seen] += weights[:, None] * corrected
@@ -167,10 +167,6 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
         slope = float(np.clip(1 + trust * (np.sqrt(spread_y / spread_x) - 1), *_CONTRAST_BOUNDS))
         offset = float(middle_y - slope * middle_x)
     return offset, slope
-
-
-def _corrected(colors: FloatArray, gains: FloatArray, contrasts: FloatArray) -> FloatArray:
-    return np.asarray((255 * gains * (colors / 255) ** contrasts).clip(0, 255))
 
 
 _ROUNDS = 50

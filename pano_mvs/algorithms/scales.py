@@ -18,7 +18,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
+from pano_mvs.algorithms.panoramas import filtered, reduced_mask, reduced_panorama
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
@@ -177,8 +177,7 @@ def without_detail(picture: Picture) -> Mask:
         return np.zeros(picture.shape[:2], np.bool_)
     detail = finest_detail(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32))
     side = 2 * _RADIUS_PX + 1
-    energy = cv2.blur(pad_panorama(detail * detail, _RADIUS_PX), (side, side))
-    energy = energy[_RADIUS_PX:-_RADIUS_PX, _RADIUS_PX:-_RADIUS_PX]
+    energy = filtered(detail * detail, _RADIUS_PX, lambda padded: cv2.blur(padded, (side, side)))
     around_equator = energy[height // 4 : height - height // 4]
     noisy = around_equator[around_equator >= _LEAST_NOISE**2]
     noise = float(np.quantile(noisy, _PLAIN_PIXELS_SHARE)) if noisy.size else _LEAST_NOISE**2

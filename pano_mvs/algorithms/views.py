@@ -62,7 +62,7 @@ def select_views(
 
 def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg: float) -> dict[str, tuple[str, ...]]:
     """Return the sources of the images of one group."""
-    distances = _center_distances(poses.centers)
+    distances = np.asarray(cdist(poses.centers, poses.centers), np.float64)
     scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
     preference = _distance_ranks(distances)
     extent = float(distances.max(initial=0.0))
@@ -74,11 +74,6 @@ def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg
         if len(order):
             neighbours[name] = tuple(poses.names[source] for source in order[:count])
     return neighbours
-
-
-def _center_distances(centers: FloatArray) -> FloatArray:
-    """Return the distances between all centres, (N, N)."""
-    return np.asarray(cdist(centers, centers), dtype=np.float64)
 
 
 def _distance_ranks(distances: FloatArray) -> FloatArray:

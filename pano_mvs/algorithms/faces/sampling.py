@@ -33,10 +33,11 @@ def sample_view(
     # OpenCV puts (0, 0) at the first pixel's centre.
     shift = min(_PAD_PX, *panorama.shape[:2]) - 0.5
     result = np.empty((*view.size_hw, *panorama.shape[2:]), np.uint8)
+    size_hw, places = (panorama.shape[0], panorama.shape[1]), [(step + 0.5) / samples for step in range(samples)]
     for rows in _bands(view.size_hw[0]):
         total = np.zeros(result[rows].shape, np.float32)
-        for offset_xy in _offsets(samples):
-            pixels = (pixel_from_ray(view.rays(rows, offset_xy=offset_xy), _size(panorama)) + shift).astype(np.float32)
+        for offset_xy in ((x, y) for y in places for x in places):
+            pixels = (pixel_from_ray(view.rays(rows, offset_xy=offset_xy), size_hw) + shift).astype(np.float32)
             total += cv2.remap(padded, pixels[..., 0], pixels[..., 1], interpolation)
         result[rows] = np.rint(total / samples**2)
     return result
@@ -56,21 +57,10 @@ def nearest_pixels(
     return row, column
 
 
-def _offsets(samples: int) -> Iterator[tuple[float, float]]:
-    """Yield evenly spread positions in a pixel."""
-    for y in range(samples):
-        for x in range(samples):
-            yield (x + 0.5) / samples, (y + 0.5) / samples
-
-
 def _bands(height: int) -> Iterator[slice]:
     """Yield bands of rows, so that the rays of a large view are never all in memory."""
     for first in range(0, height, _BAND_ROWS):
         yield slice(first, min(first + _BAND_ROWS, height))
-
-
-def _size(panorama: NDArray[np.generic]) -> tuple[int, int]:
-    return panorama.shape[0], panorama.shape[1]
 
 
 # For each face, its axes to the right, down and forward in the camera frame. As in tours and sky boxes, the lower

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.data_term import Window
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
+from pano_mvs.algorithms.panoramas import square_window
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
@@ -68,8 +69,10 @@ def median_range(range_map: RangeMap, *, window: Window = 5) -> RangeMap:
     """
     padded = pad_panorama(range_map.range, window // 2)
     if window in _OPENCV_WINDOWS:
-        filtered = _median_of_dense(padded, window)
-        holed = _window_has_hole(padded, window) & range_map.valid
+        inner = slice(window // 2, -(window // 2))
+        filtered = cv2.medianBlur(np.nan_to_num(padded), window)[inner, inner].copy()
+        holes = cv2.dilate(np.isnan(padded).astype(np.uint8), square_window(window // 2))[inner, inner]
+        holed = (holes > 0) & range_map.valid
         filtered[holed] = _median_of_windows(sliding_window_view(padded, (window, window))[holed])
     else:
         filtered = np.empty_like(range_map.range)
@@ -77,20 +80,6 @@ def median_range(range_map: RangeMap, *, window: Window = 5) -> RangeMap:
             filtered[row] = _median_of_windows(windows)
     filtered[~range_map.valid] = np.nan
     return with_ranges(range_map, filtered)
-
-
-def _median_of_dense(padded: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """Return the median for windows without invalid pixels; the result elsewhere is undefined."""
-    pad = window // 2
-    filtered: NDArray[np.float32] = cv2.medianBlur(np.nan_to_num(padded), window)[pad:-pad, pad:-pad].copy()
-    return filtered
-
-
-def _window_has_hole(padded: NDArray[np.float32], window: int) -> NDArray[np.bool_]:
-    pad = window // 2
-    holes = cv2.dilate(np.isnan(padded).astype(np.uint8), np.ones((window, window), np.uint8))
-    inner: NDArray[np.bool_] = holes[pad:-pad, pad:-pad] > 0
-    return inner
 
 
 def _median_of_windows(windows: NDArray[np.float32]) -> NDArray[np.float32]:

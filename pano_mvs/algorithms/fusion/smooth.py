@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from itertools import product
 
 import numpy as np
@@ -82,13 +80,12 @@ def surface_heights(
         marked[some] = True
         targets = np.flatnonzero(marked[cells[-1]])
         marked[some] = False
-        find = partial(_find, kernel=find_heights, arguments=(cloud, radii, targets, cells, per_column, heights))
+
+        def find(first: int, count: int, targets: IntArray = targets, cells: tuple[IntArray, ...] = cells) -> None:
+            find_heights(cloud, radii, targets, cells, per_column, heights, (first, first + count))
+
         for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
     return heights
-
-
-def _find(first: int, count: int, *, kernel: Callable[..., object], arguments: tuple[object, ...]) -> None:
-    kernel(*arguments, (first, first + count))
 
 
 def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) -> list[tuple[IntArray, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import DARK_LEVEL
-from pano_mvs.algorithms.panoramas import mean_around, nearest_resized
+from pano_mvs.algorithms.panoramas import filtered, mean_around, nearest_resized, square_window
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
@@ -236,8 +236,10 @@ def _colors_around(picture: Picture) -> Plane:
     """Return the darkest, the mean and the lightest colours around each pixel, (3, 3, H W): which, colour and pixel."""
     smooth = mean_around(picture)
     around = max(1, round(_AROUND_DEG * len(picture) / 180))
-    padded = pad_panorama(smooth, around)
-    window = np.ones((2 * around + 1,) * 2, np.uint8)
-    inner = (slice(around, -around),) * 2
-    colors = np.stack([cv2.erode(padded, window)[inner], smooth, cv2.dilate(padded, window)[inner]])
+    window = square_window(around)
+    darkest, lightest = (
+        filtered(smooth, around, lambda padded, extreme=extreme: extreme(padded, window))  # type: ignore[misc]
+        for extreme in (cv2.erode, cv2.dilate)
+    )
+    colors = np.stack([darkest, smooth, lightest])
     return np.ascontiguousarray(colors.reshape(3, -1, 3).transpose(0, 2, 1))

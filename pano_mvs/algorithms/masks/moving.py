@@ -115,7 +115,11 @@ def moving_pixels(
             found |= _person_in(seen, area, passers_by=passers_by)
     if found.any():
         found = _without_gaps(found)
-    cast = _beside(shadow, found | ~valid) if shadows else nothing
+    cast = nothing
+    if shadows:  # those that touch what is found
+        labels = area_labels(np.asarray(shadow & ~(found | ~valid)))
+        touched = np.unique(labels[dilated(found | ~valid, 2) & (labels >= 0)])
+        cast = np.isin(labels, touched) & (labels >= 0)
     margin = round(margin_deg * size_hw[0] / 180)
     everything = found | cast
     return Moving(dilated(everything, margin) & valid if margin else everything, cast)
@@ -195,13 +199,6 @@ def _shadows(expected: Expected) -> Mask:
     mean = ratio.mean(axis=-1)
     tint = (ratio.max(axis=-1) - ratio.min(axis=-1)) / np.maximum(mean, 1e-6)
     return np.asarray(expected.ground & (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (tint < _MAX_TINT))
-
-
-def _beside(shadow: Mask, pixels: Mask) -> Mask:
-    """Return the connected shadows that touch some pixels."""
-    labels = area_labels(np.asarray(shadow & ~pixels))
-    touched = np.unique(labels[dilated(pixels, 2) & (labels >= 0)])
-    return np.isin(labels, touched) & (labels >= 0)
 
 
 def _without_gaps(found: Mask) -> Mask:

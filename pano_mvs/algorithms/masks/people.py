@@ -172,7 +172,8 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
     Returns:
         The probability, 0 if it is too low, or unless a person is detected in one of the views; and (H, W) bool.
     """
-    reduced, size_hw = _reduced_mask(area), (area.shape[0], area.shape[1])
+    size_hw = area.shape[0], area.shape[1]
+    reduced = np.asarray(cv2.resize(area.astype(np.float32), MAP_HW[::-1], interpolation=cv2.INTER_AREA) >= 0.5)
     if not reduced.any():
         return 0.0, np.zeros_like(area)
     looks = _views_of(reduced)
@@ -199,11 +200,6 @@ def _views_of(area: Mask) -> list[Look]:
     if center[1] > np.cos(np.radians(_NADIR_DEG)):
         return [look(rolled(_DOWN, roll), fov_deg) for roll in np.radians([0, 90, 180, 270])]
     return [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in _ROLLS_DEG]
-
-
-def _reduced_mask(pixels: Mask) -> Mask:
-    """Return a mask at `MAP_HW`, True where most of a pixel is."""
-    return np.asarray(cv2.resize(pixels.astype(np.float32), MAP_HW[::-1], interpolation=cv2.INTER_AREA) >= 0.5)
 
 
 def _at_size(probability: Map, size_hw: tuple[int, int]) -> Map:

@@ -83,7 +83,11 @@ def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, pas
     possible = [each for each in candidates if each is not None and _may_be_person(each, _MIN_FIRST_ASPECT)]
     tried: list[_Candidate] = []
     for each in sorted(possible, key=lambda candidate: -candidate.score)[:_MAX_CANDIDATES]:
-        if each.area_deg2 < min_area_deg2 / 2 or _share_in(each, found) > 0.5 or any(_same(each, o) for o in tried):
+        if (
+            each.area_deg2 < min_area_deg2 / 2
+            or found[pixels_containing(each.rays, MAP_HW)].mean() > 0.5
+            or any(_same(each, o) for o in tried)
+        ):
             continue
         tried.append(each)
         found |= _confirmed(seen, each, passers_by=passers_by, tried=tried)
@@ -130,7 +134,7 @@ def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, t
     if mean is None:
         return nobody
     labels = area_labels(np.asarray(mean > _BELONGS))
-    inside = labels[_on_map(candidate)]
+    inside = labels[pixels_containing(candidate.rays, MAP_HW)]
     return np.isin(labels, np.unique(inside[inside >= 0]))
 
 
@@ -193,18 +197,6 @@ def _same(first: _Candidate, second: _Candidate) -> bool:
     apart_deg = np.degrees(np.arccos(np.clip(first.center @ second.center, -1, 1)))
     smaller, larger = sorted((first.extent_deg, second.extent_deg))
     return bool(apart_deg < 0.15 * smaller and larger < 1.2 * smaller)
-
-
-def _share_in(candidate: _Candidate, pixels: Mask) -> float:
-    """Return the share of a candidate that lies in some pixels of the map."""
-    return float(pixels[pixels_containing(candidate.rays, MAP_HW)].mean())
-
-
-def _on_map(candidate: _Candidate) -> Mask:
-    """Return the pixels of the map in which the directions of a candidate lie."""
-    pixels = np.zeros(MAP_HW, np.bool_)
-    pixels[pixels_containing(candidate.rays, MAP_HW)] = True
-    return pixels
 
 
 def _overlap(first: Mask, second: Mask) -> float:

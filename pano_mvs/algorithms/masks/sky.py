@@ -28,6 +28,7 @@ from pano_mvs.algorithms.masks.sky_comparison import (
 from pano_mvs.algorithms.panoramas import (
     box_sum,
     contrast_around,
+    filtered,
     largest_channel,
     nearest_resized,
 )
@@ -131,8 +132,7 @@ def _resized(values: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[n
 
 def _box(values: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
     side = 2 * radius + 1
-    padded = np.ascontiguousarray(pad_panorama(values.astype(np.float32), radius))
-    return np.asarray(cv2.blur(padded, (side, side)))[radius:-radius, radius:-radius]
+    return filtered(values.astype(np.float32), radius, lambda padded: cv2.blur(padded, (side, side)))
 
 
 MAX_SOURCES = 4
@@ -234,14 +234,9 @@ def sky_pixels(
     found = np.asarray(sharpened_sky(sky, colors, picture) & valid, np.bool_)
     if not walls.any():
         return found
-    surface = confirmed_parts(nearest_resized(found, sky.shape), _seen_to_move(view))
-    return np.asarray(found & ~nearest_resized(surface, valid.shape), np.bool_)
-
-
-def _seen_to_move(view: _View) -> Mask:
-    """Return the pixels whose ranges other views confirm under a parallax of more than one pixel."""
     parallax_px = np.max([source.parallax_px for source in view.comparisons], axis=0)
-    return np.asarray(view.consistent & (parallax_px > 1), np.bool_)
+    surface = confirmed_parts(nearest_resized(found, sky.shape), view.consistent & (parallax_px > 1))
+    return np.asarray(found & ~nearest_resized(surface, valid.shape), np.bool_)
 
 
 def _view(range_map: RangeMap, picture: Picture, valid: Mask, *, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:

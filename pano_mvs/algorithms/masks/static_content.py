@@ -207,7 +207,9 @@ def static_content(
     if size_hw[1] < _MIN_WIDTH:
         return StaticContent(nothing, f"panoramas of at least {_MIN_WIDTH} columns are needed")
     agreement = frame_agreement(pictures)
-    usable = _usable(valid, size_hw)
+    usable = np.ones(size_hw, np.bool_)
+    if valid is not None and not all(mask.all() for mask in valid):  # windows that are not masked anywhere
+        usable = ~dilated(~np.logical_and.reduce(list(valid)), 4)
     structure = (agreement.contrast >= _MIN_CONTRAST) & usable
     moved = structure & (agreement.still < _MOVED)
     if share_of_sphere(moved) < _MIN_MOVED_SHARE:
@@ -218,13 +220,6 @@ def static_content(
     found = large_areas(_with_enclosed_parts(core, pictures, plain=usable & ~structure), min_area_deg2)
     margin = round(margin_deg * size_hw[0] / 180)
     return StaticContent(dilated(found, margin) if margin and found.any() else found)
-
-
-def _usable(valid: Sequence[Mask] | None, size_hw: tuple[int, int]) -> Mask:
-    """Return the pixels, (H, W), whose windows are not masked in any panorama."""
-    if valid is None or all(mask.all() for mask in valid):
-        return np.ones(size_hw, np.bool_)
-    return ~dilated(~np.logical_and.reduce(list(valid)), 4)
 
 
 def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:

@@ -20,10 +20,10 @@ from scipy.sparse.linalg import spsolve
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
 from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality
 from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
+from pano_mvs.algorithms.panoramas import filtered
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
-from pano_mvs.geometry import pad_panorama
 
 _GREY = 128.0
 _TEXELS_OF_PART = 1 << 20  # bounds the memory
@@ -219,7 +219,13 @@ class Surface:
         ranges = surface_view(self.vertices_in_world, self.faces, pose, size_hw=size_hw, threads=threads).ranges
         sigma = size_hw[1] * _DETAIL_SCALE
         quality = pixel_quality(view, ranges, feather_px=_FEATHER_SIGMAS * sigma)
-        smooth = _blurred(view.picture, sigma)
+        margin = min(int(np.ceil(3 * sigma)), size_hw[0])
+        side = 2 * margin + 1
+        smooth = np.ascontiguousarray(
+            filtered(
+                view.picture, margin, lambda padded: cv2.GaussianBlur(padded.astype(np.float32), (side, side), sigma)
+            )
+        )
         mesh = pose.apply(self.vertices_in_world), self.normals @ pose.rotation.T, self.faces
         # A pixel of a larger panorama covers less of the surface.
         scaled = (quality * np.float32(worth * size_hw[1] ** 2)).astype(np.float32)
@@ -333,13 +339,6 @@ class _Painting:
         np.divide(self._sums, total[:, None], out=self._sums)
         self._sums += self._detail
         return self._sums, seen
-
-
-def _blurred(picture: NDArray[np.uint8], sigma: float) -> FloatImage:
-    margin = min(int(np.ceil(3 * sigma)), len(picture))
-    padded = pad_panorama(picture, margin).astype(np.float32)
-    side = 2 * margin + 1
-    return np.ascontiguousarray(cv2.GaussianBlur(padded, (side, side), sigma)[margin:-margin, margin:-margin])
 
 
 def _triangle_centers(count: int) -> Texels:

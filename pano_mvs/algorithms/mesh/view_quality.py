@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import filtered
 from pano_mvs.core.arrays import FloatImage, Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama
@@ -85,8 +86,8 @@ def _range_worth(range_map: RangeMap, surface_ranges: FloatImage) -> FloatImage:
         worth[ratio < 1 - _MAX_DIFFERENCE] *= np.float32(_OCCLUDED)
         worth[ratio > 1 + _MAX_DIFFERENCE] *= np.float32(_CARVED)
     margin = min(_SMOOTH_PX, len(worth))
-    blurred = cv2.blur(pad_panorama(worth, margin), (2 * margin + 1, 2 * margin + 1))
-    return np.asarray(np.minimum(blurred[margin:-margin, margin:-margin], np.maximum(worth, 2 * _OCCLUDED)))
+    blurred = filtered(worth, margin, lambda padded: cv2.blur(padded, (2 * margin + 1, 2 * margin + 1)))
+    return np.asarray(np.minimum(blurred, np.maximum(worth, 2 * _OCCLUDED)))
 
 
 def _distance_px(marked: Mask, *, limit: int) -> FloatImage:

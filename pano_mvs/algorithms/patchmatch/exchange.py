@@ -116,7 +116,7 @@ def exchange_ranges(
     offers, scores = Offers.joined(offered), np.concatenate(scored)
     wanted = np.unique(offers.pixels)
     own_scores = np.zeros(seen.size)
-    own_scores[wanted] = match.correlation(_own_offers(range_map, wanted))
+    own_scores[wanted] = match.correlation(Offers.of(range_map, wanted))
     own_scores[wanted] += agreement * np.minimum(own.agreeing.ravel()[wanted], _MOST_AGREEING)
     better = np.flatnonzero(scores > own_scores[offers.pixels])
     # The last of a pixel counts: the best one, and of equals that of the first source.
@@ -132,6 +132,13 @@ class Offers:
     pixels: NDArray[np.int64]
     ranges: NDArray[np.float32]
     normals: NDArray[np.float16] | None
+
+    @staticmethod
+    def of(range_map: RangeMap, pixels: NDArray[np.int64]) -> Offers:
+        """Return the ranges of some pixels of a map as offers to them."""
+        normals = range_map.normals_in_cam
+        normals = None if normals is None else normals.reshape(-1, 3)[pixels]
+        return Offers(pixels, range_map.range.ravel()[pixels], normals)
 
     @staticmethod
     def joined(offers: Sequence[Offers]) -> Offers:
@@ -163,11 +170,6 @@ def offers_of(source: SourceView, farthest: FloatImage) -> Offers:
         turn = source.from_reference.rotation
         normals = (normals.reshape(-1, 3)[positions.ravel()[pixels]].astype(np.float64) @ turn).astype(np.float16)
     return Offers(pixels, ranges.ravel()[pixels], normals)
-
-
-def _own_offers(range_map: RangeMap, pixels: NDArray[np.int64]) -> Offers:
-    normals = range_map.normals_in_cam
-    return Offers(pixels, range_map.range.ravel()[pixels], None if normals is None else normals.reshape(-1, 3)[pixels])
 
 
 def _replaced(range_map: RangeMap, offers: Offers) -> RangeMap:

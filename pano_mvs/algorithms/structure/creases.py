@@ -218,7 +218,8 @@ def _creases(views: Sequence[PlaneView], planes: Sequence[ScenePlane], tolerance
     parts: dict[int, list[tuple[FloatArray, ...]]] = {}
     for view in views:
         labels = _nearest_planes(view, planes, tolerance)
-        picture = _padded(view)
+        padded = pad_panorama(view.load(), _PAD_PX).astype(np.float32)
+        picture = np.asarray(cv2.GaussianBlur(padded, (0, 0), _BLUR_PX))
         for idx, upright in enumerate(planes):
             for level, other in enumerate(planes):
                 if upright.is_level or not other.is_level:
@@ -256,10 +257,6 @@ def _nearest_planes(view: PlaneView, planes: Sequence[ScenePlane], tolerance: fl
             closer = error < best
         best[closer], labels[closer] = error[closer], idx
     return labels
-
-
-def _padded(view: PlaneView) -> NDArray[np.float32]:
-    return np.asarray(cv2.GaussianBlur(pad_panorama(view.load(), _PAD_PX).astype(np.float32), (0, 0), _BLUR_PX))
 
 
 def _profiles(

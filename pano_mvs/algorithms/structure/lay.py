@@ -87,7 +87,7 @@ def lay_structure(
         on_grid(range_map.confidence, stride),
         textured=on_grid(textured, stride),
         tolerance=on_grid(tolerance, stride),
-        guide=cv2.resize(guide, _grid_wh(size, stride), interpolation=cv2.INTER_AREA),
+        guide=cv2.resize(guide, coarse_rays.shape[1::-1], interpolation=cv2.INTER_AREA),
     )
     places = cam_from_world.center + coarse_rays * _chosen(coarse_planes, label)[..., None]
     agree, seen_through = _seen_by_others(places, sources[:_SOURCES], source_poses[:_SOURCES], error=plain_error)
@@ -113,12 +113,6 @@ def lay_structure(
     return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
-
-
-def _grid_wh(size_hw: tuple[int, int], stride: int) -> tuple[int, int]:
-    """Return columns and rows of the grid of `on_grid`."""
-    rows, columns = (len(range(stride // 2, length, stride)) for length in size_hw)
-    return columns, rows
 
 
 def _labels(

@@ -74,7 +74,8 @@ class GuidedSweep:
         self._by_paths = work.settings.aggregation == "sgm"
         self.volume = np.empty((height, 2 * _COUNT, width), np.uint8 if self._by_paths else np.float32)
         self._shared = sweep_arguments(work)
-        self._table = _inverse_ranges(work)
+        positions = np.arange((work.settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
+        self._table = (1 / work.range_at(positions)).astype(np.float32)
 
     def find_winners(self) -> Winners:
         """Return the winning candidates and the costs around them."""
@@ -190,11 +191,6 @@ class GuidedSweep:
         run_jobs(self._pool, decide, range(0, height, BAND_ROWS))
         plane = np.rint(position).astype(np.int32)
         return Winners(plane, costs[0], costs[1], costs[2], costs[3], position - plane)
-
-
-def _inverse_ranges(work: SweepInput) -> NDArray[np.float32]:
-    positions = np.arange((work.settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
-    return (1 / work.range_at(positions)).astype(np.float32)
 
 
 _MIN_ROWS = 64

@@ -43,10 +43,6 @@ class CostFunction(Protocol):
         ...
 
 
-def _one(_: int) -> float:
-    return 1.0
-
-
 @dataclass(frozen=True)
 class SweepCost:
     """A matching cost.
@@ -68,7 +64,7 @@ class SweepCost:
     radius: int | None = None
     averages_itself: bool = False
     min_window: int = 1
-    worst: Callable[[int], float] = _one
+    worst: Callable[[int], float] = lambda _: 1.0
     kernel: int | None = None
 
     def radii(self, *, window: int, support: int) -> tuple[int, int]:

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
+from pano_mvs.algorithms.panoramas import filtered
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
 
 _ROUNDS = 10
 _MIN_PIXELS = 50
@@ -132,9 +133,9 @@ def _at_an_end(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _smooth(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return a picture, (H, W, C), in which neither noise nor interpolation makes a difference to speak of."""
     radius = int(np.ceil(3 * _SMOOTHING_PX))
-    padded = pad_panorama(picture, radius).astype(np.float32)
-    smooth = cv2.GaussianBlur(padded, (2 * radius + 1, 2 * radius + 1), _SMOOTHING_PX)
-    return np.asarray(smooth[radius:-radius, radius:-radius], np.float32).reshape(picture.shape)
+    size = 2 * radius + 1, 2 * radius + 1
+    smooth = filtered(picture, radius, lambda padded: cv2.GaussianBlur(padded.astype(np.float32), size, _SMOOTHING_PX))
+    return smooth.reshape(picture.shape)
 
 
 def shrink(picture: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:

@@ -98,7 +98,11 @@ def limits_by_sweeping(
     if solid_angle[agreed].sum() <= _MIN_SHARE * seen_angle:
         return nearest, farthest
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
-    near, far = _outward(min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far)
+    steps = np.log2([min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far]) * _STEPS_PER_OCTAVE
+    near, far = (
+        float(2 ** (np.floor(steps[0]) / _STEPS_PER_OCTAVE)),
+        float(2 ** (np.ceil(steps[1]) / _STEPS_PER_OCTAVE)),
+    )
     open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
     far = max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
     return _lowered(near, far, sweeps), far
@@ -168,8 +172,3 @@ def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tup
     below = np.cumsum(weights[order]) / weights.sum()
     near, far = np.searchsorted(below, [_NEAR_QUANTILE, _FAR_QUANTILE])
     return float(ranges[order[near]]), float(ranges[order[min(far, len(order) - 1)]])
-
-
-def _outward(near: float, far: float) -> tuple[float, float]:
-    steps = _STEPS_PER_OCTAVE
-    return float(2 ** (np.floor(np.log2(near) * steps) / steps)), float(2 ** (np.ceil(np.log2(far) * steps) / steps))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.panoramas import contrast_around
+from pano_mvs.algorithms.panoramas import contrast_around, filtered
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.sweep.hypotheses import mean_baseline_of, range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -88,16 +88,11 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
 
 def prepare_colors(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
     """Return the colours of a picture, (H, W, 3) RGB, prefiltered if asked for."""
-    return np.ascontiguousarray(_bilateral(picture, settings) if settings.prefilter_diameter else picture)
-
-
-def _bilateral(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
-    pad = min(settings.prefilter_diameter, picture.shape[0])
-    padded = pad_panorama(picture, pad)
-    filtered = cv2.bilateralFilter(
-        padded, settings.prefilter_diameter, settings.prefilter_sigma_color, settings.prefilter_sigma_space_px
-    )
-    return np.asarray(filtered[pad:-pad, pad:-pad], dtype=np.uint8)
+    diameter, sigmas = settings.prefilter_diameter, (settings.prefilter_sigma_color, settings.prefilter_sigma_space_px)
+    if diameter:
+        margin = min(diameter, picture.shape[0])
+        picture = filtered(picture, margin, lambda padded: cv2.bilateralFilter(padded, diameter, *sigmas))
+    return np.ascontiguousarray(picture)
 
 
 def derotated(

@@ -158,7 +158,10 @@ def _summed_paths(
     for first in range(0, height, _BLOCK_ROWS):
         count = min(_BLOCK_ROWS, height - first)
         rows = range(first, first + count)
-        along = partial(_follow_some_rows, rows=rows, volume=volume, penalties=sideways, p1=p1, block=block)
+
+        def along(row: int, rows: range = rows) -> None:
+            follow_rows(volume, sideways, p1, (row, min(_JOB_ROWS, rows.stop - row)), block, rows.start)
+
         run_jobs(pool, along, rows[::_JOB_ROWS])
         paths.follow(pool, rows, Sums(block, first, total, 0))
     paths = _PolePaths(PathCosts(volume, penalties(*((-1, drift) for drift in DRIFTS)), p1, True))
@@ -168,18 +171,6 @@ def _summed_paths(
         first = height - step - count
         paths.follow(pool, range(step, step + count), Sums(total, 0, block, first))
         yield slice(first, first + count), block
-
-
-def _follow_some_rows(
-    first: int,
-    *,
-    rows: range,
-    volume: NDArray[np.uint8],
-    penalties: NDArray[np.uint16],
-    p1: np.uint16,
-    block: NDArray[np.uint16],
-) -> None:
-    follow_rows(volume, penalties, p1, (first, min(_JOB_ROWS, rows.stop - first)), block, rows.start)
 
 
 class _PolePaths:
@@ -192,7 +183,8 @@ class _PolePaths:
             Front(np.zeros((len(DRIFTS), depth, width), np.uint16), np.zeros((len(DRIFTS), width), np.uint16))
             for _ in range(2)
         ]
-        self._strip = _strip_columns(width)
+        # Few enough columns that the paths of a strip fit the caches, and a strip for each thread.
+        self._strip = min(_STRIP_COLUMNS, ceil(width / numba.get_num_threads()))
         columns = state_columns(self._strip, _BLOCK_ROWS)
         self._states = np.empty((-(-width // self._strip), len(DRIFTS), depth + 1, columns), np.uint16)
 
@@ -222,12 +214,6 @@ def _sum_shape(volume: NDArray[np.uint8]) -> tuple[int, int]:
     """
     _, depth, width = volume.shape
     return depth, (-(-width // _LINE_WORDS) | 1) * _LINE_WORDS
-
-
-def _strip_columns(width: int) -> int:
-    """Return how many columns a strip has: few enough that its paths fit the caches, one strip for each thread."""
-    threads: int = numba.get_num_threads()
-    return min(_STRIP_COLUMNS, ceil(width / threads))
 
 
 def find_winners(work: SweepInput) -> Winners:
