@@ -1,4 +1,4 @@
-"""Normals and the voted cloud."""
+"""Normals, the voted cloud and its smoothing, and their compiled parts."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.fusion import voxels
 from pano_mvs.algorithms.fusion.fuse import fuse_reference, fuse_stream, fuse_views, join_clouds
+from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
 from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.fusion.smooth import smooth_surfaces, surface_heights
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView, nearest_views
 from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, angle_between, ray_grid
+from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec, sines_of_grid
 from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.algorithms.range_scenes import as_map, box_range, room_range
 from tests.known import known
+from tests.oracles import fusion as fusion_oracle
 from tests.oracles import normals as oracle
+from tests.oracles import smoothing as smoothing_oracle
 
 SIZE = (128, 256)
 POSES = capture_poses(3, seed=2, spread=0.4)
@@ -412,3 +416,155 @@ class TestUncertainty:
         )
         assert plain.uncertainty is None
         np.testing.assert_array_equal(plain.points_in_world, limited.points_in_world)
+
+
+TINY, SOURCE_SIZE = (12, 24), (10, 20)
+SOURCE_LIMITS = np.array([0.05, 0.2, 0.05, 1.05, 0.03, 100.0])
+FIELDS = ("yields", "counts", "violations", "confidence", "sums", "colors", "precisions")
+
+
+def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> np.ndarray:
+    """Return the ranges of a sphere of radius 2 with noise, steps to both sides and holes."""
+    ranges = 2 + rng.normal(0, 0.03, size_hw)
+    ranges[rng.random(size_hw) < 0.1] *= 0.6
+    ranges[rng.random(size_hw) < 0.1] *= 1.6
+    ranges[rng.random(size_hw) < 0.1] = np.nan
+    return ranges.astype(np.float32)
+
+
+@pytest.mark.kernel("fusion.kernels_fuse")
+@pytest.mark.parametrize("with_uncertainty", [False, True])
+def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> None:
+    rng = np.random.default_rng(20)
+    ranges, source_ranges = rough_sphere(rng, TINY), rough_sphere(rng, SOURCE_SIZE)
+    rays = ray_grid(TINY)
+    normals = -rays + rng.normal(0, 0.5, rays.shape)
+    normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
+    written = rng.random(TINY) < 0.8
+    confidence = rng.integers(30, 200, SOURCE_SIZE).astype(np.uint8)
+    image = rng.integers(0, 256, (*SOURCE_SIZE, 3)).astype(np.uint8)
+    pose = Rigid3(rotation_from_rotvec((0.4, -1.9, 0.7)), np.array([0.05, -0.03, 0.06]))
+    uncertainty = rng.uniform(0.01, 0.2, SOURCE_SIZE if with_uncertainty else (0, 0)).astype(np.float32)
+    found: dict[str, NDArray[Any]] = {
+        "yields": np.zeros(TINY, np.bool_),
+        "counts": np.zeros(TINY, np.uint8),
+        "violations": np.zeros(TINY, np.uint8),
+        "confidence": np.zeros(TINY, np.uint8),
+        "sums": np.zeros((*TINY, 4)),
+        "colors": np.zeros((*TINY, 4)),
+        "precisions": np.zeros(TINY if with_uncertainty else (0, 0)),
+    }
+    source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image, uncertainty)
+    for rows in ((0, 5), (5, 12)):
+        add_source(
+            (ranges, sines_of_grid(TINY), normals, written),
+            source,
+            SOURCE_LIMITS,
+            rows,
+            tuple(found[name] for name in FIELDS),
+        )
+    expected = fusion_oracle.add_source(
+        (ranges, rays, normals, written), pose, (source_ranges, confidence, image, uncertainty), SOURCE_LIMITS
+    )
+    for name in FIELDS:  # as plain Python, quotients of ranges are float32
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-3, atol=1e-5, err_msg=name)
+    assert 0.2 < found["counts"].mean() < 0.8
+    assert found["violations"].sum() > 5
+    assert 0.1 < found["yields"][found["counts"] > 0].mean() < 0.9
+    merged, colored = (found[name][..., 3] > 0 for name in ("sums", "colors"))
+    assert 0 < (colored & ~merged).sum() < merged.sum()
+
+
+@pytest.mark.kernel("fusion.kernels_fuse")
+@pytest.mark.parametrize("least", [0.2, 0.4])
+def test_support_of_a_surface_equals_the_plain_count(least: float) -> None:
+    rng = np.random.default_rng(21)
+    ranges = rough_sphere(rng, TINY)
+    confirmed = np.isfinite(ranges) & (rng.random(TINY) < 0.6)
+    stretches = columns_per_step(TINY, steps=5)
+    assert stretches.max() > 1
+    found = find_supported(ranges, confirmed, stretches, 2, 0.03, least)
+    expected = fusion_oracle.supported(ranges, confirmed, stretches, radius=2, max_step=0.03, least=least)
+    np.testing.assert_array_equal(found, expected)
+    assert 0 < found.sum() < (np.isfinite(ranges) & ~confirmed).sum()
+
+
+CENTERS = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+
+
+def cloud_of(points: NDArray[np.float64], normals: NDArray[np.float64], sigma: float) -> PointCloud:
+    count = len(points)
+    return PointCloud(
+        points.astype(np.float32),
+        np.broadcast_to(normals, points.shape).astype(np.float32),
+        np.zeros((count, 3), np.uint8),
+        np.full(count, 2, np.uint8),
+        uncertainty=np.full(count, sigma, np.float32),
+    )
+
+
+def noisy_wall(rng: np.random.Generator, *, noise: float, sigma: float, count: int = 4000) -> PointCloud:
+    """Return a noisy noisy_wall at z = 3, 2 × 2 in size."""
+    place = rng.uniform(-1, 1, (count, 2))
+    points = np.column_stack([place, 3 + rng.normal(0, noise, count)])
+    return cloud_of(points, np.array([0.0, 0.0, -1.0]), sigma)
+
+
+@pytest.mark.kernel("fusion.kernels_smooth")
+def test_heights_equal_the_plain_fit() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (150, 3)) * (1, 1, 0.1)
+    normals = rng.normal((0, 0, 1), 0.2, (150, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    sigmas = rng.uniform(0.1, 0.4, 150).astype(np.float32)
+    arrays = points.astype(np.float32), normals.astype(np.float32), sigmas
+    found, expected = surface_heights(*arrays, per_column=1000, threads=2), smoothing_oracle.surface_heights(*arrays)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert 0.1 < (expected != 0).mean() < 0.95
+
+
+def test_a_noisy_wall_becomes_thin() -> None:
+    before = noisy_wall(np.random.default_rng(0), noise=0.03, sigma=0.06)
+    after = smooth_surfaces(before, CENTERS)
+    inner = np.abs(before.points_in_world[:, :2]).max(axis=1) < 0.8
+    thickness = [float(cloud.points_in_world[inner, 2].std()) for cloud in (before, after)]
+    assert thickness[1] < 0.4 * thickness[0]
+    assert abs(after.points_in_world[inner, 2].mean() - 3) < 0.006
+
+
+def test_no_point_moves_by_more_than_its_uncertainty() -> None:
+    before = noisy_wall(np.random.default_rng(1), noise=0.03, sigma=0.02)
+    moves = np.linalg.norm(smooth_surfaces(before, CENTERS).points_in_world - before.points_in_world, axis=1)
+    assert 0.01 < moves.max() < 0.0201
+
+
+def test_two_surfaces_farther_apart_than_their_uncertainty_stay_apart() -> None:
+    rng = np.random.default_rng(2)
+    first, second = (noisy_wall(rng, noise=0.003, sigma=0.01, count=3000) for _ in range(2))
+    points = np.concatenate([first.points_in_world, second.points_in_world + np.array([0, 0, 0.1])])
+    both = cloud_of(points, np.array([0.0, 0.0, -1.0]), 0.01)
+    after = smooth_surfaces(both, CENTERS).points_in_world[:, 2]
+    np.testing.assert_allclose([after[:3000].mean(), after[3000:].mean()], [3, 3.1], atol=0.001)
+
+
+def test_the_frame_and_the_number_of_threads_do_not_matter() -> None:
+    before = noisy_wall(np.random.default_rng(4), noise=0.03, sigma=0.06, count=600)
+    plain = smooth_surfaces(before, CENTERS)
+    np.testing.assert_array_equal(smooth_surfaces(before, CENTERS, threads=3).points_in_world, plain.points_in_world)
+    rotation = rotation_from_rotvec((0.3, -0.8, 0.5))
+    turned = replace(
+        before,
+        points_in_world=(before.points_in_world @ rotation.T).astype(np.float32),
+        normals_in_world=(before.normals_in_world @ rotation.T).astype(np.float32),
+    )
+    found = smooth_surfaces(turned, CENTERS @ rotation.T).points_in_world @ rotation
+    # Cells lie differently, and of full ones not all points count.
+    assert np.median(np.abs(found - plain.points_in_world)[:, 2]) < 0.005
+
+
+def test_a_cloud_without_uncertainty_or_points_is_unchanged() -> None:
+    known = noisy_wall(np.random.default_rng(5), noise=0.03, sigma=0.06, count=100)
+    unknown = replace(known, uncertainty=None)
+    assert smooth_surfaces(unknown, CENTERS) is unknown
+    nothing = cloud_of(np.zeros((0, 3)), np.array([0.0, 0.0, -1.0]), 1.0)
+    assert len(smooth_surfaces(nothing, CENTERS)) == 0

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.patchmatch import kernels_match, kernels_refine
-from pano_mvs.algorithms.patchmatch.refine import _range_map_from_planes, reference_arrays, refine_range, source_arrays
+from pano_mvs.algorithms.patchmatch.refine import (
+    ViewWeights,
+    _range_map_from_planes,
+    reference_arrays,
+    refine_range,
+    source_arrays,
+)
+from pano_mvs.algorithms.patchmatch.second_round import plain_and_changed, refine_plain_surfaces
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError
@@ -18,6 +26,7 @@ from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pix
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.texture import noise as solid_noise
+from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map
 from tests.known import known
 from tests.oracles import patchmatch as oracle
 
@@ -293,3 +302,127 @@ def test_planes_that_meet_their_rays_far_beyond_what_was_swept_are_not_believed(
     assert found.range[3, 4] == found.range[5, 6] == 2
     assert np.isnan(known(found.normals_in_cam)[[3, 5], [4, 6]].astype(float)).all()
     assert np.sum(np.isclose(found.range, 2.2)) == 16 * 32 - 2
+
+
+TINY = (12, 24)
+
+
+def test_weights_are_the_matches_around_over_the_best_one() -> None:
+    rng = np.random.default_rng(0)
+    rounds = rng.uniform(-1, 1, (2, 3, *TINY)).astype(np.float32)
+    rounds[:, 2, :, :9] = -2  # does not count there
+    weights = ViewWeights(3, TINY)
+    for correlations in rounds:
+        weights.views[:] = correlations
+        weights.update()
+    match = np.where(rounds > -1.5, np.exp(-((1 - rounds) ** 2) / (2 * 0.3**2)), 0).mean(axis=0)
+    padded = np.stack([pad_panorama(one, 2) for one in match])
+    around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-1, -2))
+    np.testing.assert_allclose(weights.views, (around / around.max(axis=0)) ** 2, rtol=1e-4, atol=1e-6)
+    assert weights.known
+    assert np.all(weights.views.max(axis=0) == 1)
+    assert not weights.views[2, 3:-3, 3:6].any()  # away from the poles, where columns from across count
+
+
+def test_where_no_source_counts_none_has_weight() -> None:
+    weights = ViewWeights(2, TINY)
+    weights.views[:] = -2
+    weights.update()
+    assert not weights.views.any()
+
+
+def test_a_source_that_shows_something_else_does_less_harm() -> None:
+    """Two of three sources are turned by four pixels: the better half still contains one of them."""
+    size = (96, 192)
+    poses = capture_poses(4, seed=2, spread=0.3)
+    pictures, truth = zip(*(render(default_room(), pose, size) for pose in poses), strict=True)
+    spoilt = [pictures[1], *(np.roll(picture, 4, axis=1) for picture in pictures[2:])]
+    off = np.float32(1) + np.random.default_rng(0).normal(0, 0.01, size).astype(np.float32)
+    start = RangeMap(truth[0] * off, np.full(size, 100, np.uint8))
+
+    def median_error(*, view_weights: bool) -> float:
+        found = refine_range(
+            start,
+            pictures[0],
+            spoilt,
+            source_from_reference=[pose @ poses[0].inverse() for pose in poses[1:]],
+            view_weights=view_weights,
+        )
+        return float(np.median(np.abs(found.range / truth[0] - 1)))
+
+    assert median_error(view_weights=True) < 0.9 * median_error(view_weights=False)
+
+
+SMALL = (64, 128)
+FaintViews = tuple[list[NDArray[np.uint8]], NDArray[np.float32], list[Rigid3]]
+
+
+@pytest.fixture(scope="module")
+def faint_views() -> FaintViews:
+    """Faint pictures of the room, its true ranges in the first view, and the poses of the others."""
+    poses = capture_poses(3, seed=2, spread=0.4)
+    rendered = [render(default_room(), pose, SMALL) for pose in poses]
+    faint = [np.rint(100 + 0.06 * picture.astype(float)).astype(np.uint8) for picture, _ in rendered]
+    return faint, rendered[0][1], [pose @ poses[0].inverse() for pose in poses[1:]]
+
+
+def again(
+    faint_views: FaintViews, range_map: RangeMap, filtered: RangeMap, *, reference: NDArray[np.uint8] | None = None
+) -> tuple[RangeMap, float]:
+    pictures, _, poses = faint_views
+    masks = [np.ones(SMALL, np.bool_) for _ in poses]
+    settings: dict[str, Any] = {"source_from_reference": poses, "source_masks": masks, "halvings": 0, "rounds": 2}
+    first = pictures[0] if reference is None else reference
+    return refine_plain_surfaces(range_map, filtered, first, sources=pictures[1:], **settings)
+
+
+def test_plain_surfaces_start_from_the_filtered_ranges(faint_views: FaintViews) -> None:
+    truth = faint_views[1]
+    swept, filtered = as_map(1.3 * truth), as_map(1.03 * truth, TRUSTED)
+    found, share = again(faint_views, swept, filtered)
+    found.check()
+    assert share == 1
+    assert np.median(np.abs(found.range / truth - 1)) < 0.02
+    assert (found.confidence == SEEN).all()
+    assert found.normals_in_cam is not None
+
+
+def test_pixels_with_texture_keep_their_ranges(faint_views: FaintViews) -> None:
+    truth = faint_views[1]
+    reference = faint_views[0][0].copy()
+    reference[:, 40:50:2] = 255
+    textured = has_texture(reference)
+    assert 0.05 < textured.mean() < 0.2
+    found, share = again(faint_views, as_map(1.3 * truth), as_map(truth), reference=reference)
+    np.testing.assert_array_equal(found.range[textured], (1.3 * truth).astype(np.float32)[textured])
+    assert (found.range != 1.3 * truth)[~textured].all()
+    assert share == pytest.approx(1 - textured.mean())
+
+
+def test_pixels_that_filters_did_not_change_or_that_were_not_seen_stay(faint_views: FaintViews) -> None:
+    truth = faint_views[1]
+    changed = np.arange(SMALL[1]) < 64
+    confidence = np.where(np.arange(SMALL[0]) < 32, SEEN, 40)[:, None] * np.ones(SMALL[1], int)
+    swept = as_map(1.3 * truth, confidence)
+    filtered = as_map(np.where(changed, truth, swept.range))
+    chosen = plain_and_changed(swept, filtered, faint_views[0][0])
+    np.testing.assert_array_equal(chosen, changed & (confidence == SEEN))
+    found = again(faint_views, swept, filtered)[0]
+    np.testing.assert_array_equal(found.range[~chosen], swept.range[~chosen])
+
+
+def test_the_sky_of_the_filtered_map_loses_its_ranges(faint_views: FaintViews) -> None:
+    truth = faint_views[1]
+    sky = np.zeros(SMALL, np.bool_)
+    sky[:8] = True
+    filtered = as_map(np.where(sky, np.nan, truth))
+    found = again(faint_views, as_map(1.3 * truth), RangeMap(filtered.range, filtered.confidence, sky=sky))[0]
+    found.check()
+    np.testing.assert_array_equal(found.valid, ~sky)
+    assert found.sky is not None
+    assert found.sky.sum() == sky.sum()
+
+
+def test_range_maps_of_two_sizes_are_refused(faint_views: FaintViews) -> None:
+    with pytest.raises(UsageError, match="must have one size"):
+        again(faint_views, as_map(faint_views[1]), as_map(faint_views[1][:32]))

@@ -1,17 +1,26 @@
-"""Multi-view consistency: true ranges agree, wrong ones do not, and the compiled judge equals the plain one."""
+"""Agreement between views: true ranges are confirmed, doubtful views are found, and uncertainty follows the scatter."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.filters.consistency import _step_around, check_consistency
+from pano_mvs.algorithms.filters.consistency import (
+    Agreement,
+    _step_around,
+    check_consistency,
+    checked_with_agreement,
+    nearest_views,
+    view_doubts,
+)
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY, confirmed_uncertainty, with_ranges
 from pano_mvs.algorithms.ranges.agreement import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows, count_agreeing
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room
@@ -214,3 +223,227 @@ def test_impossible_calls_are_named(true_maps: list[RangeMap]) -> None:
         check_consistency(true_maps[0], POSES[0], true_maps[1:], source_poses=POSES[2:])
     with pytest.raises(UsageError, match="min_views must be at least 1"):
         checked(true_maps, min_views=0)
+
+
+SMALL = (32, 64)
+VIEW_LIMITS: dict[str, Any] = {
+    "max_relative_error": 0.02,
+    "max_reprojection_px": 1.0,
+    "min_support": 0.85,
+    "min_motion_px": 0.01,
+    "min_views": 1,
+    "remove_inconsistent": False,
+    "min_contradictions": 2,
+}
+FIVE_POSES = capture_poses(5, seed=2, spread=0.5)
+GOOD = Agreement(compared=0.9, agreed=0.5, seen_through=0.1, hidden=0.1)
+WRONG = Agreement(compared=0.9, agreed=0.2, seen_through=0.5, hidden=0.1)
+
+
+@pytest.fixture(scope="module")
+def five_maps() -> list[RangeMap]:
+    room = default_room()
+    return [as_map(room_range(room, pose, SMALL)) for pose in FIVE_POSES]
+
+
+def agreement_of(maps: list[RangeMap], poses: list[Rigid3], view: int) -> Agreement:
+    others = [idx for idx in range(len(poses)) if idx != view]
+    return checked_with_agreement(
+        maps[view],
+        poses[view],
+        [maps[idx] for idx in others],
+        source_poses=[poses[idx] for idx in others],
+        **VIEW_LIMITS,
+    )[1]
+
+
+def line(agreements: list[Agreement]) -> tuple[dict[str, Agreement], dict[str, np.ndarray]]:
+    names = [f"{idx}.jpg" for idx in range(len(agreements))]
+    return dict(zip(names, agreements, strict=True)), {
+        name: np.array([idx, 0.0, 0.0]) for idx, name in enumerate(names)
+    }
+
+
+@pytest.mark.parametrize(("factor", "figure"), [(0.7, "seen_through"), (1.4, "hidden")])
+def test_ranges_that_are_too_short_are_seen_through_and_too_long_ones_hidden(
+    five_maps: list[RangeMap], factor: float, figure: str
+) -> None:
+    wrong = [as_map(five_maps[0].range * factor), *five_maps[1:]]
+    found = agreement_of(wrong, FIVE_POSES, 0)
+    assert getattr(found, figure) > 0.8
+    assert found.agreed + found.one_way <= 1 + 1e-9
+
+
+def test_filled_ranges_and_ranges_that_nobody_sees_are_not_compared(five_maps: list[RangeMap]) -> None:
+    half = five_maps[0].confidence.copy()
+    half[: SMALL[0] // 2] = 10
+    found = agreement_of([RangeMap(five_maps[0].range, half), *five_maps[1:]], FIVE_POSES, 0)
+    assert found.compared == pytest.approx(0.5, abs=0.01)
+    assert agreement_of(five_maps[:1], FIVE_POSES[:1], 0) == Agreement(0.0, 0.0, 0.0, 0.0)
+
+
+def test_one_source_alone_contradicts_nothing(five_maps: list[RangeMap]) -> None:
+    wrong = [as_map(five_maps[0].range * 0.7), five_maps[1]]
+    assert agreement_of(wrong, FIVE_POSES[:2], 0).one_way == 0
+
+
+def test_a_moved_camera_is_doubted_alone(five_maps: list[RangeMap]) -> None:
+    """A camera with good ranges in the wrong place; its neighbours' ranges are right."""
+    moved = list(FIVE_POSES)
+    moved[1] = Rigid3(FIVE_POSES[1].rotation, FIVE_POSES[1].translation + np.array([0.9, 0.0, 0.4]))
+    for poses, expected in ((FIVE_POSES, set()), (moved, {"1"})):
+        agreements = {str(idx): agreement_of(five_maps, poses, idx) for idx in range(len(poses))}
+        centers = {str(idx): pose.center for idx, pose in enumerate(poses)}
+        assert set(view_doubts(agreements, centers)) == expected
+
+
+def test_the_reason_names_the_figures() -> None:
+    (reason,) = view_doubts(*line([GOOD, GOOD, WRONG, GOOD])).values()
+    assert reason == (
+        "other views agree with 20 % of its ranges (usual around it: 50 %) and contradict 60 % in one direction"
+    )
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        pytest.param(replace(WRONG, agreed=0.3), id="an edge of the capture"),
+        pytest.param(replace(WRONG, seen_through=0.3), id="errors that scatter"),
+        pytest.param(replace(WRONG, compared=0.1), id="hardly anything to compare"),
+    ],
+)
+def test_views_are_not_doubted_for_less(view: Agreement) -> None:
+    assert view_doubts(*line([GOOD, GOOD, view, GOOD])) == {}
+
+
+def test_nothing_is_said_where_nobody_agrees_or_nobody_is_there_to_compare_with() -> None:
+    poor = replace(GOOD, agreed=0.09)
+    assert view_doubts(*line([poor, poor, replace(WRONG, agreed=0.01), poor])) == {}
+    assert view_doubts(*line([GOOD, WRONG])) == {}
+    agreements, centers = line([GOOD, GOOD, WRONG, GOOD])
+    assert view_doubts(agreements, {name: place for name, place in centers.items() if name != "2.jpg"}) == {}
+
+
+def test_only_the_nearest_views_count() -> None:
+    """At the far end of a long capture of a plain corridor everybody agrees little."""
+    poor = replace(WRONG, agreed=0.22)
+    assert view_doubts(*line([GOOD] * 6 + [poor] * 2 + [WRONG] + [poor] * 2)) == {}
+    assert set(view_doubts(*line([GOOD] * 8 + [WRONG] + [GOOD] * 2))) == {"8.jpg"}
+
+
+@pytest.mark.parametrize("case", ["random", "grid", "few", "coincident"])
+def test_nearest_views_are_those_of_a_plain_search(case: str) -> None:
+    rng = np.random.default_rng(0)
+    places = {
+        "random": rng.normal(size=(60, 3)),
+        "grid": np.argwhere(np.ones((5, 5, 2))).astype(float),
+        "few": rng.normal(size=(3, 3)),
+        "coincident": np.repeat(rng.normal(size=(4, 3)), 9, axis=0),
+    }[case]
+    for idx, around in enumerate(nearest_views(places)):
+        distances = np.linalg.norm(places - places[idx], axis=1)
+        distances[idx] = np.inf
+        assert around.tolist() == np.argsort(distances, kind="stable")[: min(4, len(places) - 1)].tolist()
+
+
+def noisy_maps(noise: float) -> list[RangeMap]:
+    rng = np.random.default_rng(0)
+    room = default_room()
+    return [as_map(room_range(room, pose, SIZE) * np.exp(rng.normal(0, noise, SIZE))) for pose in POSES]
+
+
+@pytest.fixture(scope="module")
+def noisy_checked() -> RangeMap:
+    return checked_of(noisy_maps(0.002))
+
+
+def checked_of(maps: list[RangeMap]) -> RangeMap:
+    result = check_consistency(maps[0], POSES[0], maps[1:], source_poses=POSES[1:], min_motion_px=0.01)
+    result.check()
+    return result
+
+
+def uncertainty_of(range_map: RangeMap) -> np.ndarray:
+    assert range_map.uncertainty is not None
+    return range_map.uncertainty.astype(np.float64)
+
+
+def test_every_range_has_one_and_unconfirmed_ones_have_the_same(noisy_checked: RangeMap) -> None:
+    sigma = uncertainty_of(noisy_checked)
+    confirmed = noisy_checked.confidence >= 128
+    np.testing.assert_array_equal(np.isfinite(sigma), noisy_checked.valid)
+    np.testing.assert_allclose(sigma[noisy_checked.valid & ~confirmed], UNCONFIRMED_UNCERTAINTY, rtol=1e-3)
+    assert np.median(sigma[confirmed]) < 0.03
+
+
+def test_it_is_the_formula() -> None:
+    """σ = 5.4 e (ρ M)^¼ (1 + 5 d)^⅓ / M, each factor on its own."""
+    size = (64, 128)
+    whole, flat, steep = np.ones(size, np.bool_), np.zeros(size, np.float32), np.full(size, 0.2, np.float32)
+    checks = np.where(np.add.outer(np.arange(64), np.arange(128)) % 2 == 0, 1.0, -1.0)
+
+    def middle(
+        *,
+        consistent: np.ndarray = whole,
+        rough: float = 0.01,
+        step: np.ndarray = flat,
+        error_px: float = 0.1,
+        motion: float = 20,
+    ) -> float:
+        support = np.full(size, 2.0)
+        found = confirmed_uncertainty(
+            consistent,
+            (2 / (1 + rough * checks)).astype(np.float32),
+            support=support,
+            squared_error=support * error_px**2,
+            motion=support * motion / 2,
+            step=step,
+        )
+        return float(found[32, 64])
+
+    assert middle() == pytest.approx(5.4 * 0.1 * (0.01 * 20) ** 0.25 / 20, rel=0.02)
+    assert middle(motion=40) == pytest.approx(middle() / 2**0.75, rel=2e-3)
+    assert middle(error_px=0.2) == pytest.approx(2 * middle(), rel=2e-3)
+    assert middle(step=steep) == pytest.approx(6 ** (1 / 3) * middle(), rel=2e-3)
+    assert middle(rough=0.04) == pytest.approx(4**0.25 * middle(), rel=0.02)
+    assert middle(rough=0) == pytest.approx((0.01 / 0.2) ** 0.25 * middle(), rel=0.02)
+    # Ranges that no other view confirms say nothing about the surface.
+    assert middle(consistent=checks > 0) == pytest.approx(middle(rough=0), rel=0.02)
+
+
+def test_changes_add_to_it(noisy_checked: RangeMap) -> None:
+    before, valid = uncertainty_of(noisy_checked), noisy_checked.valid
+    moved = np.where(np.arange(SIZE[1]) < 100, noisy_checked.range * np.float32(1.05), noisy_checked.range)
+    after = with_ranges(noisy_checked, moved)
+    after.check()
+    sigma, confirmed = uncertainty_of(after), noisy_checked.confidence >= 128
+    left = np.broadcast_to(np.arange(SIZE[1]) < 100, SIZE)
+    np.testing.assert_array_equal(sigma[~left & valid], before[~left & valid])
+    np.testing.assert_allclose(sigma[left & confirmed], np.hypot(before, 0.05)[left & confirmed], rtol=2e-3)
+    assert (sigma[left & valid & ~confirmed] >= 0.149).all()
+
+
+def test_filled_pixels_get_a_large_one_and_removed_ones_none(noisy_checked: RangeMap) -> None:
+    hole = np.zeros(SIZE, np.bool_)
+    hole[40:60, 100:120] = True
+    open_map = with_ranges(
+        noisy_checked,
+        np.where(hole, np.float32(np.nan), noisy_checked.range),
+        np.where(hole, 0, noisy_checked.confidence),
+    )
+    open_map.check()
+    filled = with_ranges(
+        open_map, np.where(hole, np.float32(2), open_map.range), np.where(hole, 30, open_map.confidence)
+    )
+    filled.check()
+    np.testing.assert_allclose(uncertainty_of(filled)[hole], UNCONFIRMED_UNCERTAINTY, rtol=1e-3)
+    assert with_ranges(replace(noisy_checked, uncertainty=None), noisy_checked.range).uncertainty is None
+
+
+def test_wrong_uncertainties_are_refused(noisy_checked: RangeMap) -> None:
+    zero = np.zeros(SIZE, np.float16)
+    with pytest.raises(ContractError, match="an uncertainty is not positive or infinite"):
+        replace(noisy_checked, uncertainty=zero).check()
+    with pytest.raises(ContractError, match="uncertainty must be float16"):
+        replace(noisy_checked, uncertainty=zero.astype(np.float32)).check()
+    replace(noisy_checked, uncertainty=np.full(SIZE, np.nan, np.float16)).check()
