@@ -81,7 +81,7 @@ def surface_heights(
         targets = np.flatnonzero(marked[cells[-1]])
         marked[some] = False
 
-        def find(first: int, count: int, targets: IntArray = targets, cells: tuple[IntArray, ...] = cells) -> None:
+        def find(first: int, count: int, *, targets: IntArray = targets, cells: tuple[IntArray, ...] = cells) -> None:
             find_heights(cloud, radii, targets, cells, per_column, heights, (first, first + count))
 
         for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
