@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.masks.static import reduced_to_width, static_content
 from quickstart_pictures import IMAGES, ROOT
 
-from pano_mvs.testing.rig import stick_and_hand, with_rig
+from tests.synthetic.rig import stick_and_hand, with_rig
 
 SAMPLE = ROOT / "workflows" / "samples" / "classroom" / "images"
 NADIR_DEG = 40.0

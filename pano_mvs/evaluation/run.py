@@ -11,9 +11,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.evaluation.capture import score_capture
 from pano_mvs.evaluation.clouds.evaluate import CLOUD_FILE, MODEL_FOLDER, CloudEvaluation, evaluate_cloud
-from pano_mvs.evaluation.inputs.cameras import camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.range_files import find_ranges
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
+from pano_mvs.evaluation.inputs import camera_groups, find_ranges, find_true_ranges, read_cameras
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.model_writer import is_colmap_model

@@ -19,8 +19,8 @@ from pano_mvs.algorithms.masks.person_network import SIDE_PX, person_presence, p
 from pano_mvs.algorithms.masks.person_views import SeenPanorama, rolled, stereographic_look
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
-from pano_mvs.testing.persons import Drawn, draw_people, person
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.persons import Drawn, draw_people, person
 
 SIZE_HW = (512, 1024)
 SAMPLE = Path(__file__).parents[2] / "workflows" / "samples" / "classroom" / "images" / "003.png"

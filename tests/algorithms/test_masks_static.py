@@ -10,8 +10,8 @@ from pano_mvs.algorithms.masks.frame_agreement import color_difference, evenly_s
 from pano_mvs.algorithms.masks.static_content import MIN_VIEWS, reduced_to_width, static_content
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle
-from pano_mvs.testing.rig import RIGS, with_rig
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.rig import RIGS, with_rig
 
 SIZE_HW = (256, 512)
 CENTERS = [(0.0, 0.0, 0.0), (0.5, 0.1, 0.2), (-0.3, 0.0, 0.6), (0.2, -0.2, -0.5)]

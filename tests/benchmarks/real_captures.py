@@ -38,7 +38,7 @@ from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.algorithms.rendering.cloud import draw_cloud
 from pano_mvs.algorithms.rendering.viewpoints import inside_camera, viewpoints
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.residuals import reprojection_residuals
 from pano_mvs.results.run_output import RunOutput

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.poses.alignment import align_centers
-from pano_mvs.evaluation.poses.errors import center_errors, relative_pose_errors
+from pano_mvs.evaluation.poses import align_centers, center_errors, relative_pose_errors
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
 

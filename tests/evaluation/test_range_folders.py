@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.inputs.range_files import RangeFile, find_ranges
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
+from pano_mvs.evaluation.inputs import RangeFile, find_ranges, find_true_ranges
 from pano_mvs.io.images.names import pair_image_names, without_extension
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from tests.stored import write_npz

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.evaluation.ranges.pairs import resized_labels, resized_range
 from tests.algorithms.range_scenes import box_range
 
 

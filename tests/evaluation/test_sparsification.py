@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.capture import score_capture
-from pano_mvs.evaluation.ranges.pixels import scored_pixels
-from pano_mvs.evaluation.ranges.sparsification import Sparsification
-from pano_mvs.evaluation.ranges.sparsification import sparsify as sparsify_pixels
+from pano_mvs.evaluation.ranges.view_scores import Sparsification, scored_pixels
+from pano_mvs.evaluation.ranges.view_scores import sparsify as sparsify_pixels
 from pano_mvs.geometry import Rigid3
 
 SIZE = (16, 32)

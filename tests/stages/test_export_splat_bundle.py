@@ -41,11 +41,11 @@ from pano_mvs.stages.exports.splat_bundle import (
     splat_frames,
     splat_frames_memory_bytes,
 )
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points
 from tests.stored import read_picture
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW = (128, 256)
 STEP = 0.001

@@ -15,8 +15,7 @@ import numpy as np
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
-from pano_mvs.evaluation.inputs.range_files import find_ranges
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import find_ranges, read_truth
 from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.clouds.ply_writer import read_ply, write_ply

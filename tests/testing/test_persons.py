@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
-from pano_mvs.testing.persons import OUTFITS, POSES, draw_people, person
+from tests.synthetic.persons import OUTFITS, POSES, draw_people, person
 
 SIZE_HW = (64, 128)
 GROUND_Y = 1.6

@@ -7,8 +7,8 @@ import pytest
 
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import colors_along, default_room, range_along
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW, FOCAL_PX = (90, 120), 200.0
 POSE = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))

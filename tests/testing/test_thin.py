@@ -7,7 +7,7 @@ import pytest
 
 from pano_mvs.testing.scenes import poles
 from pano_mvs.testing.surfaces import Rod
-from pano_mvs.testing.thin import THIN_KINDS, thin_pixels, thin_scene
+from tests.synthetic.thin import THIN_KINDS, thin_pixels, thin_scene
 
 
 @pytest.mark.parametrize("kind", THIN_KINDS)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.testing.scenes import SKIES, courtyard, yard
+from pano_mvs.testing.scenes import SKIES, courtyard
+from tests.synthetic.places import yard
 
 SIZE_HW = (32, 64)
 

@@ -17,7 +17,7 @@ from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.commands import run_command

@@ -13,8 +13,8 @@ from pano_mvs.algorithms.rendering.cloud import draw_cloud
 from pano_mvs.algorithms.rendering.viewpoints import viewpoints
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds.distances import Points, PointsInMemory
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation
-from pano_mvs.evaluation.clouds.points import Points, PointsInMemory
 from pano_mvs.evaluation.drawing import WIDTH, put_text, strip, write_stack
 
 _COLORS = ("red", "green", "blue")

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.range_files import RangeMaps
-from pano_mvs.evaluation.inputs.sources import as_path, source_name
-from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.inputs import Cameras, RangeMaps, as_path, camera_groups, read_cameras, source_name
+from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges
 from pano_mvs.evaluation.ranges.view_scores import BASELINES, ScoreSettings, ViewScores, mean_scores, score_view
 from pano_mvs.evaluation.tables import finite_values

@@ -13,9 +13,8 @@ import numpy as np
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural, shortened_list
-from pano_mvs.evaluation.ranges.errors import DELTAS
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
-from pano_mvs.evaluation.ranges.view_scores import BASELINES, PROTOCOLS, ViewScores
+from pano_mvs.evaluation.ranges.view_scores import BASELINES, DELTAS, PROTOCOLS, ViewScores
 from pano_mvs.evaluation.tables import Summary, TextTable
 
 _PROTOCOL_HEADINGS = ("every pixel", "… on sphere", "estimated", "… on sphere")

@@ -19,8 +19,8 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.evaluation.inputs.truth import read_truth
-from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.inputs import read_truth
+from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Panorama, Pose, RangeMap
 from pano_mvs.stages.depth import SweepParams

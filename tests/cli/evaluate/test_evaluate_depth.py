@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import write_ply

@@ -14,8 +14,8 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import LensRig
 from pano_mvs.io.colmap.lens_rig import LensPictures, rig_configuration, write_lens_rig_model
 from pano_mvs.scene import Poses
-from pano_mvs.testing.fisheye_rig import example_rig
 from tests.algorithms.poses.rig_capture import RigCapture, rig_capture
+from tests.synthetic.fisheye_rig import example_rig
 
 
 def pictures(poses: Poses, rig: LensRig) -> dict[str, LensPictures]:
