@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import below, exists, is_file, is_folder
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.images.exr import read_exr
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.poses.json_files import PosedView, read_posed_views
-from pano_mvs.io.ranges.files import read_confidence_png
-from pano_mvs.io.ranges.npy import keys_of_npz, read_npy, read_npz
+from pano_mvs.io.ranges import keys_of_npz, read_confidence_png, read_exr, read_npy, read_npz
 from pano_mvs.scene import FilePart, Poses, RangeMap
-from pano_mvs.scene.image_files.decoding import decode_picture
+from pano_mvs.scene.image_file import decode_picture
 from pano_mvs.scene.pose_groups import split_groups
 
 

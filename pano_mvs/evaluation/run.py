@@ -14,7 +14,7 @@ from pano_mvs.evaluation.clouds.evaluate import CLOUD_FILE, MODEL_FOLDER, CloudE
 from pano_mvs.evaluation.inputs import camera_groups, find_ranges, find_true_ranges, read_cameras
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.colmap.model_writer import is_colmap_model
+from pano_mvs.io.colmap.reader import is_colmap_model
 from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.scene import Scores
 

@@ -17,8 +17,8 @@ from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture, resized
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.masks.cropping import inside_crop
-from pano_mvs.scene.static_masks import StaticMasks, camera_of
+from pano_mvs.scene.masking import inside_crop
+from pano_mvs.scene.panorama import StaticMasks, camera_of
 
 VERSION = 1
 """Raise it when the pictures or the kinds change: earlier pages' are then drawn again."""

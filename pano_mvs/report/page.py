@@ -15,8 +15,7 @@ from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural
-from pano_mvs.report.advice import MAX_SUGGESTIONS
-from pano_mvs.report.content import Content, gather
+from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
 from pano_mvs.results.records import Verdict

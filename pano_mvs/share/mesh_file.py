@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh
+from pano_mvs.io.ply import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.up_direction import WORLD_UP
-from pano_mvs.scene.upright import world_up, y_up_from_world
+from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 from pano_mvs.share.glb_file import read_glb
 
 TEXTURED = "mesh_textured.glb"

@@ -25,7 +25,7 @@ from pano_mvs.io.images.keyframe_file import keyframe_file, read_times, store_ti
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.source import working_size
 
 # Motion is measured in at most this number of frames per second.

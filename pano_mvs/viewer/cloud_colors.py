@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.clouds.ply_reader import PlyPoints
+from pano_mvs.io.ply import PlyPoints
 
 POINT_BUDGET = 2_000_000
 COLORINGS = ("rgb", "confidence", "views", "normals", "height")

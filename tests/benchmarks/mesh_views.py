@@ -24,8 +24,7 @@ from pano_mvs.algorithms.mesh.texture import TexturedMesh
 from pano_mvs.algorithms.mesh.triangles import Mesh
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import PointCloud, RangeMap
-from pano_mvs.stages.exports.mesh import MeshParams, solved_mesh
-from pano_mvs.stages.exports.mesh_textured import TexturedParams, textured_mesh
+from pano_mvs.stages.exports.mesh import MeshParams, TexturedParams, solved_mesh, textured_mesh
 from pano_mvs.stages.fusion import FusionParams, vote
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, given_records, true_poses

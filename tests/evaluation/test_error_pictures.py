@@ -13,7 +13,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.clouds.pictures import _top_view, distance_colors, write_error_cloud
 from pano_mvs.evaluation.drawing import WIDTH
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
-from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.ply import open_ply_points
 from tests.stored import read_picture
 
 GREY, BLACK = (128, 128, 128), (25, 25, 25)

@@ -14,7 +14,7 @@ from pano_mvs.evaluation import RunEvaluation, evaluate_cloud, evaluate_depth, e
 from pano_mvs.evaluation.capture import score_capture
 from pano_mvs.evaluation.tables import TextTable
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_writer import write_ply
+from pano_mvs.io.ply import write_ply
 from pano_mvs.scene import PointCloud, Poses, RangeMap
 from tests.stored import write_npz
 

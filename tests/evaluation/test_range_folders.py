@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.evaluation.inputs import RangeFile, find_ranges, find_true_ranges
 from pano_mvs.io.images.names import pair_image_names, without_extension
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from tests.stored import write_npz
 
 RANGES = np.random.default_rng(0).uniform(0.5, 60, (4, 8)).astype(np.float32)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.images.preview import (
     color_mapped,
     mark_unconfirmed,
@@ -23,7 +22,8 @@ from pano_mvs.io.images.preview import (
     unconfirmed_classes,
     write_preview,
 )
-from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
+from pano_mvs.io.ply import read_ply, write_ply
+from pano_mvs.io.ranges import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
 from tests.stored import read_picture

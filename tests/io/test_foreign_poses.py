@@ -16,7 +16,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Similarity3, pixel_from_ray, rotation_from_rotvec
 from pano_mvs.io.poses.files import read_poses, recorded_pictures
 from pano_mvs.io.poses.metashape import write_metashape
-from pano_mvs.io.poses.openmvg import write_openmvg
+from pano_mvs.io.poses.other_json import write_openmvg
 from pano_mvs.scene import Poses
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.testing.room import capture_poses

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.ranges.npy import read_npy, read_npz
+from pano_mvs.io.ranges import read_npy, read_npz
 
 
 def header(shape: str, descr: str = "'<f4'") -> bytes:

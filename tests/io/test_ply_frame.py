@@ -12,9 +12,7 @@ import trimesh
 from pano_mvs.api import Context, InputError, PointCloud, Poses
 from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
-from pano_mvs.io.clouds.ply_reader import open_ply_points, read_ply_points
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
+from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.stages.exports.files import PlyParams, ply
 from pano_mvs.viewer.cloud_colors import drawn_cloud

@@ -10,8 +10,7 @@ import pytest
 
 from pano_mvs.api import Context
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.clouds.ply_reader import open_ply_points, read_ply_points
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
+from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_points, write_ply
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import PlyParams, ply
 

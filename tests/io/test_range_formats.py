@@ -14,10 +14,11 @@ from pydantic import ValidationError
 
 from pano_mvs.api import Context, RangeMap, UsageError
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.images import exr
-from pano_mvs.io.ranges.files import (
+from pano_mvs.io.ranges import (
+    read_exr,
     read_normals,
     read_range_png,
+    write_exr,
     write_normals_png,
     write_normals_tiff,
     write_range_png,
@@ -81,10 +82,10 @@ def test_normals_come_back_from_tiff_and_png(tmp_path: Path) -> None:
 def test_an_exr_keeps_every_bit(tmp_path: Path) -> None:
     values = some_ranges()
     for name in ("a.exr", "b.exr"):
-        exr.write_exr(tmp_path / name, {"Z": values})
+        write_exr(tmp_path / name, {"Z": values})
     with OpenEXR.File(str(tmp_path / "a.exr")) as file:
         np.testing.assert_array_equal(file.channels()["Z"].pixels, values)
-    np.testing.assert_array_equal(exr.read_exr(tmp_path / "a.exr")["Z"], values)
+    np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")["Z"], values)
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
@@ -93,9 +94,9 @@ def test_without_openexr_the_remedy_is_told_before_anything_runs(monkeypatch: py
     with pytest.raises(ValidationError, match=r"pip install 'pano-mvs\[exr\]'"):
         RangesParams(formats=("tiff", "exr"))
     with pytest.raises(UsageError, match=r"pip install 'pano-mvs\[exr\]'"):
-        exr.write_exr(Path("a.exr"), {"Z": some_ranges()})
+        write_exr(Path("a.exr"), {"Z": some_ranges()})
     with pytest.raises(UsageError, match=r"pip install 'pano-mvs\[exr\]'"):
-        exr.read_exr(Path("a.exr"))
+        read_exr(Path("a.exr"))
 
 
 def test_other_arrays_and_other_files_are_refused(tmp_path: Path) -> None:
@@ -105,14 +106,14 @@ def test_other_arrays_and_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.png: normals are a float32 TIFF or a 16-bit PNG"):
         read_normals(tmp_path / "a.png")
     with pytest.raises(InputError, match=r"a\.png: not a readable EXR file"):
-        exr.read_exr(tmp_path / "a.png")
+        read_exr(tmp_path / "a.png")
     doubles: Any = np.zeros((2, 4))
     with pytest.raises(UsageError, match=r"a range map is \(H, W\) float32"):
         write_range_png(tmp_path / "b.png", doubles, unit=1)
     with pytest.raises(UsageError, match=r"normals are \(H, W, 3\) float32"):
         write_normals_png(tmp_path / "b.png", np.zeros((2, 4), np.float32))
     with pytest.raises(UsageError, match="channels of an EXR file are"):
-        exr.write_exr(tmp_path / "b.exr", {"Z": doubles})
+        write_exr(tmp_path / "b.exr", {"Z": doubles})
 
 
 def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
@@ -134,7 +135,7 @@ def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
     tiff = read_picture(files["range/{item}.tiff"], cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(tiff, np.where(mask, true_range, np.float32(np.nan)))
     np.testing.assert_array_equal(np.load(files["range/{item}.npy"]), tiff)
-    np.testing.assert_array_equal(exr.read_exr(files["range/{item}.exr"])["Z"], tiff)
+    np.testing.assert_array_equal(read_exr(files["range/{item}.exr"])["Z"], tiff)
     unit = json.loads(files["range/{item}.json"].read_text())["unit"]
     np.testing.assert_allclose(read_range_png(files["range/{item}.png"], unit=unit), tiff, atol=0.00051)
     confidence = read_picture(files["confidence/{item}.png"], cv2.IMREAD_UNCHANGED)
@@ -143,7 +144,7 @@ def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
     assert np.isnan(normals[~mask]).all()
     assert np.isfinite(normals[mask]).mean() > 0.9
     np.testing.assert_array_equal(read_normals(files["normals/{item}.tiff"]), normals)
-    channels = exr.read_exr(files["normals/{item}.exr"])
+    channels = read_exr(files["normals/{item}.exr"])
     np.testing.assert_array_equal(np.stack([channels[name] for name in "RGB"], axis=-1), normals)
     np.testing.assert_allclose(read_normals(files["normals/{item}.png"]), normals, atol=2e-5)
 

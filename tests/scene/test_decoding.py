@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_files import decoding
-from pano_mvs.scene.image_files.decoding import check_stated_size, decode_picture
-from pano_mvs.scene.image_files.header import stated_size, stated_size_of_file
-from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.scene.masks.masking import decode_mask
+from pano_mvs.scene import image_file
+from pano_mvs.scene.image_file import check_stated_size, decode_image, decode_picture
+from pano_mvs.scene.image_header import stated_size, stated_size_of_file
+from pano_mvs.scene.masking import decode_mask
 from tests.io.images.pictures import png_chunk
 
 NOISE = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
@@ -154,7 +153,7 @@ def test_padding_in_front_of_the_end_marker_does_no_harm(tmp_path: Path) -> None
 
 def test_what_others_write_while_a_jpeg_is_decoded_is_passed_on(capfd: pytest.CaptureFixture[str]) -> None:
     said: list[str] = []
-    with decoding._warnings_of_libjpeg(said):
+    with image_file._warnings_of_libjpeg(said):
         os.write(2, b"somebody else\nCorrupt JPEG data: premature end of data segment\n")
     os.write(2, b"behind\n")
     assert said == ["Corrupt JPEG data: premature end of data segment"]

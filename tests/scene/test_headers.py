@@ -11,11 +11,18 @@ import pytest
 
 from pano_mvs.core.errors import ContractError
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.decoding import decoding_bytes_per_pixel
-from pano_mvs.scene.image_files.header import riff_chunks, stated_size, stated_size_of_file
-from pano_mvs.scene.image_files.jpeg import Segment, is_cut_short, jpeg_segments
-from pano_mvs.scene.image_files.tiff_directory import Entry, open_tiff
-from pano_mvs.scene.masks.cropping import inside_crop, same_shape
+from pano_mvs.scene.image_file import decoding_bytes_per_pixel
+from pano_mvs.scene.image_header import (
+    Entry,
+    Segment,
+    is_cut_short,
+    jpeg_segments,
+    open_tiff,
+    riff_chunks,
+    stated_size,
+    stated_size_of_file,
+)
+from pano_mvs.scene.masking import inside_crop, same_shape
 
 
 def segment(marker: int, body: bytes) -> bytes:

@@ -23,14 +23,11 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.files import group_file, item_stems
+from pano_mvs.scene.files import FaceFiles, group_file, item_stems
 from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
 from pano_mvs.scene.scores import Scores
-from pano_mvs.scene.structure import Structure
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 from tests.scene.pose_groups import drawn_group
 
 RNG = np.random.default_rng(5)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.geometry.rotation import rotation_from_rotvec
-from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+from pano_mvs.geometry.transforms import rotation_from_rotvec
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 
 
 def tilted(deg: float) -> np.ndarray:

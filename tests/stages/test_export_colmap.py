@@ -13,10 +13,10 @@ import pytest
 
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import angle_between, ray_grid
-from pano_mvs.io.colmap.maps import read_colmap_map
+from pano_mvs.io.colmap.workspace import read_colmap_map
 from pano_mvs.scene import FilePart, Files, Panorama, Poses, RangeMap
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.files import FaceFiles
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
     DenseParams,
@@ -30,7 +30,7 @@ from pano_mvs.stages.exports.colmap import (
     colmap_masks,
     faces_memory_bytes,
 )
-from pano_mvs.stages.points import SurfaceParams, TrackedParams, surface, tracked
+from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.benchmarks.colmap_dense import context, deliver, fused_points, wall_distances, write_workspace
 from tests.stored import read_picture

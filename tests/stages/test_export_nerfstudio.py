@@ -16,10 +16,9 @@ from scipy.spatial import cKDTree
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
+from pano_mvs.io.ply import open_ply_points, read_ply
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import (
     NerfstudioFramesParams,

@@ -28,12 +28,12 @@ from pano_mvs.api import (
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import SplatFrames
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_confidence_png, read_normals
+from pano_mvs.io.ranges import read_confidence_png, read_normals
+from pano_mvs.io.splats import SplatFrames
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import TrackedPoints
 from pano_mvs.stages.exports.splat_bundle import (
     SplatBundleParams,
     SplatFramesParams,

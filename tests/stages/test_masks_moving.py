@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama, Pose, RangeMap
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.masks import MovingParams, moving
 from pano_mvs.testing.room import default_room, render
 from tests.synthetic.persons import draw_people, person

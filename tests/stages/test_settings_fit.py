@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from pano_mvs.stages.depth import SweepParams
+from pano_mvs.stages.depth import PatchMatchParams, SweepParams
 from pano_mvs.stages.filters import GaussianParams, MedianParams
-from pano_mvs.stages.patchmatch import PatchMatchParams
 
 
 @pytest.mark.parametrize("params", [SweepParams, MedianParams, GaussianParams, PatchMatchParams])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.source import FolderParams, folder, list_folder
 
 NAMES = ("a/1.jpg.png", "a/2.png", "3.png")  # the first could be the mask of a/1.jpg

@@ -11,9 +11,8 @@ import pytest
 
 from pano_mvs.engine.stages.stage import spec_of
 from pano_mvs.scene import FilePart, Panorama, RangeMap
-from pano_mvs.stages.depth import SweepParams, sweep, sweep_memory_bytes
+from pano_mvs.stages.depth import SweepParams, exchange, patchmatch, sweep, sweep_memory_bytes
 from pano_mvs.stages.filters import bilateral_solver, consistency, fill, planes
-from pano_mvs.stages.patchmatch import exchange, patchmatch
 
 PIXELS = 512 * 1024
 

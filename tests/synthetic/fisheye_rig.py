@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import Room, colors_along
 
 Layout = Literal["side_by_side", "folders", "suffixes"]

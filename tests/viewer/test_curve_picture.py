@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.settings import SweepSettings
-from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
-from pano_mvs.viewer.inspect.inspection import Inspection, SourceSight
+from pano_mvs.scene.image_file import decode_image
+from pano_mvs.viewer.curves import write_curve_picture
+from pano_mvs.viewer.inspection import Inspection, SourceSight
 from tests.viewer.test_curve_text import curve
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.sweep.cost_curve import CostCurve
-from pano_mvs.viewer.inspect.curve_text import curve_text
+from pano_mvs.viewer.curves import curve_text
 
 
 def curve(planes: int, winner: int, *, by_paths: bool = False) -> CostCurve:

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.faces.icosahedron import face_centers
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, spiral_rays
-from pano_mvs.scene.face_files import FaceLayout
+from pano_mvs.scene.files import FaceLayout
 
 __all__ = ["CUBE_NAMES", "CUBE_ROTATIONS", "Face", "FaceLayout", "covers_sphere", "default_face_size", "panorama_faces"]
 

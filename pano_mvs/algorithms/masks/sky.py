@@ -25,7 +25,7 @@ from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
-from pano_mvs.scene.masks.masking import placed_mask
+from pano_mvs.scene.masking import placed_mask
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
 Mask = NDArray[np.bool_]

@@ -17,7 +17,7 @@ from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.scene.masks.masking import placed_mask
+from pano_mvs.scene.masking import placed_mask
 
 MIN_VIEWS = 3
 """With fewer views, chance agreement cannot be distinguished from content that moves with the camera."""

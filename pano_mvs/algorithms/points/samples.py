@@ -11,7 +11,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, spiral_rays
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.surfaces import SurfaceSamples
 
 
 @checks_settings

@@ -17,8 +17,7 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 
 # Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So the
 # distance of neighbouring points is proportional to the square root of the distance to the nearest camera.

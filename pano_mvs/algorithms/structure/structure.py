@@ -12,7 +12,7 @@ from pano_mvs.algorithms.structure.view import Picture, plane_view
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.structure import Structure
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
 
 

@@ -20,7 +20,7 @@ from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.masks.masking import placed_mask
+from pano_mvs.scene.masking import placed_mask
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Rounding the limits outward to steps of a quarter octave keeps the planes, and with them the ranges, the same when

@@ -23,8 +23,7 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.session.commands import run_command
 from pano_mvs.session.session import Session
 from pano_mvs.stages.depth import SweepParams
-from pano_mvs.viewer.inspect.inspection import Inspection
-from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
+from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
 
 _SHOWN = 6
 
@@ -147,7 +146,7 @@ def _truth_of(session: Session, image: str) -> Path | None:
 
 
 def _write_plot(path: Path, found: Inspection) -> None:
-    from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
+    from pano_mvs.viewer.curves import write_curve_picture
 
     if path.suffix.lower() != ".png":
         raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")

@@ -42,10 +42,10 @@ from pano_mvs.evaluation.inputs import (
 from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.images.names import pair_image_names
+from pano_mvs.io.ply import open_ply_points
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 
 CLOUD_FILE, MODEL_FOLDER = "cloud.ply", "colmap/sparse/0"
 # Distances are measured up to this multiple of the largest tolerance, for quantiles and files.

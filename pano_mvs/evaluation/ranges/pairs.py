@@ -15,9 +15,8 @@ from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import shortened_list
 from pano_mvs.evaluation.inputs import RangeMaps, StoredRange, find_ranges, find_true_ranges, source_name
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.io.images.mask_files import find_mask
-from pano_mvs.io.images.names import pair_image_names, without_extension
-from pano_mvs.scene.masks.masking import decode_mask, placed_mask
+from pano_mvs.io.images.names import find_mask, pair_image_names, without_extension
+from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
 @dataclass(frozen=True, eq=False)

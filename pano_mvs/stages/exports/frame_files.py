@@ -31,12 +31,18 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
-from pano_mvs.io.colmap.image_copies import write_picture
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, Variant
-from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, transforms_document
-from pano_mvs.io.ranges.files import write_confidence_png, write_normals_png, write_range_png
+from pano_mvs.io.colmap.workspace import write_picture
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.ranges import write_confidence_png, write_normals_png, write_range_png
+from pano_mvs.io.splats import (
+    NerfstudioFrame,
+    PanoramaFrames,
+    Variant,
+    is_common_picture,
+    open_mask,
+    transforms_document,
+)
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.static_masks import StaticMasks
+from pano_mvs.scene.panorama import StaticMasks
 from pano_mvs.testing.scenes import SCENES
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain

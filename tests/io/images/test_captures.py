@@ -20,7 +20,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.io.images import captures
 from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.decoding import MAX_PIXELS
+from pano_mvs.scene.image_file import MAX_PIXELS
 from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
 from tests.permissions import permissions_hold
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.exif import focal_from_exif, orientation_from_exif, position_from_exif
+from pano_mvs.io.images.metadata import focal_from_exif, orientation_from_exif, position_from_exif, read_container
 from tests.io.images.pictures import app1, exif, write_jpeg
 
 

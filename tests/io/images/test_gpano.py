@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pano_mvs.geometry import rotation_from_rotvec
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import GPano, find_gpano
+from pano_mvs.io.images.metadata import GPano, find_gpano, read_container
 from tests.io.images.pictures import full_sphere, gpano_of, sound_files, write_jpeg, write_png, xmp
 
 FIELDS = full_sphere(32, 64, PoseHeadingDegrees="180.0", PosePitchDegrees="1.4", PoseRollDegrees="-2.5")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.images.mask_files import find_mask, require_masks
+from pano_mvs.io.images.names import find_mask, require_masks
 
 
 @pytest.mark.parametrize(
