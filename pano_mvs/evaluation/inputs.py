@@ -40,23 +40,13 @@ class TruthView:
     sha256: str | None
 
     def belongs_to(self, image: FilePart) -> bool:
-        """Return whether an image file has the bytes that the truth states, if it states any.
-
-        Raises:
-            InputError: if the file cannot be read.
-        """
+        """Return whether an image file has the bytes that the truth states, if it states any."""
         return self.sha256 is None or image.sha256() == self.sha256
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of a capture; range maps are read on demand.
-
-    Attributes:
-        folder: the folder that holds it.
-        views: image name, as in poses.json, to ground truth.
-        metric: whether lengths are metres.
-    """
+    """Ground truth of a capture; range maps are read on demand."""
 
     folder: Path
     views: Mapping[str, TruthView]
@@ -72,11 +62,7 @@ class Truth:
         return {name: self.views[known] for name, known in match_image_names(names, self.views).items()}
 
     def range_map(self, view: TruthView) -> NDArray[np.float32] | None:
-        """Return the true range (H, W) float32 of a view, NaN where there is no surface; None without a range map.
-
-        Raises:
-            InputError: if the file is damaged.
-        """
+        """Return the true range (H, W) float32 of a view, NaN where there is no surface; None without a range map."""
         return None if view.range_file is None else view.range_file.read()
 
 
@@ -102,10 +88,6 @@ def read_truth(folder: Path) -> Truth:
 def find_true_ranges(truth: RangeMaps, *, unit: float = 1.0) -> dict[str, StoredRange]:
     """Return the true range maps by image name.
 
-    Args:
-        truth: a folder with poses.json and depth.npz (see `read_truth`), or anything that `find_ranges` accepts.
-        unit: factor from the stored numbers to the wanted unit.
-
     Raises:
         InputError: if there are no range maps, or a file is damaged.
     """
@@ -119,11 +101,7 @@ def find_true_ranges(truth: RangeMaps, *, unit: float = 1.0) -> dict[str, Stored
 
 
 def _claimed_keys(path: Path, views: Sequence[PosedView], keys: frozenset[str]) -> dict[str, str]:
-    """Return the array of each view that has one, by the view's name.
-
-    Raises:
-        InputError: if an array might belong to several views.
-    """
+    """Return the array of each view that has one, by the view's name."""
     whole = {view.name: (view.name.rsplit(".", 1)[0], view.name) for view in views}
     claimed = {name: key for name, tried in whole.items() if (key := _first(tried, keys)) is not None}
     owners = {key: name for name, key in claimed.items()}
@@ -182,11 +160,7 @@ class RangeFile:
         return str(self.path)
 
     def read(self) -> NDArray[np.float32]:
-        """Return the range map (H, W) float32; zero, negative and infinite ranges become NaN.
-
-        Raises:
-            InputError: if the file cannot be read or holds no range map.
-        """
+        """Return the range map (H, W) float32; zero, negative and infinite ranges become NaN."""
         array = self._array()
         if array.ndim == 3 and array.shape[-1] == 1:
             array = array[..., 0]
@@ -199,11 +173,7 @@ class RangeFile:
         return _positive_or_nan(array, self.unit)
 
     def read_confidence(self) -> NDArray[np.uint8] | None:
-        """Return the confidence (H, W) uint8, or None if there is none.
-
-        Raises:
-            InputError: if the file cannot be read.
-        """
+        """Return the confidence (H, W) uint8, or None if there is none."""
         return None if self.confidence_path is None else read_confidence_png(self.confidence_path)
 
     def _array(self) -> NDArray[Any]:
@@ -223,14 +193,7 @@ class RangeFile:
 
 @dataclass(frozen=True, eq=False)
 class RangeArray:
-    """A range map in memory, with the methods of a `RangeFile`.
-
-    Attributes:
-        name: the image's name.
-        array: (H, W) ranges.
-        unit: factor to the unit that `read` returns.
-        confidence: (H, W) uint8, or None.
-    """
+    """A range map in memory, with the methods of a `RangeFile`."""
 
     name: str
     array: NDArray[np.floating]
@@ -261,10 +224,6 @@ def find_ranges(source: RangeMaps, *, unit: float = 1.0) -> dict[str, StoredRang
 
     A folder with a subfolder `range` counts as the output of a run, with its `confidence`. In any other folder, all
     files below it with one of the `RANGE_SUFFIXES` are taken; a single `depth.npz` stands for its arrays.
-
-    Args:
-        source: a folder, an .npz file with one array per image, or arrays or `RangeMap` records by image name.
-        unit: factor from the stored numbers to the wanted unit.
 
     Raises:
         InputError: if there are no range maps, or an archive is damaged.
@@ -351,11 +310,7 @@ def camera_groups(source: Cameras) -> list[Mapping[str, Rigid3]]:
 
 
 def read_cameras(source: Cameras) -> tuple[Mapping[str, Rigid3], bool]:
-    """Return cam_from_world by image name, of the largest group alone, and whether lengths are known to be metres.
-
-    Raises:
-        InputError: if a file cannot be read or holds no poses.
-    """
+    """Return cam_from_world by image name, of the largest group alone, and whether lengths are known to be metres."""
     if isinstance(source, Path):
         poses = read_poses(source)
         return poses.cameras, poses.metric

@@ -302,10 +302,6 @@ def relative_pose_errors(
 def center_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> CenterErrors:
     """Return the distances of the camera centres from the true ones after similarity alignment.
 
-    Args:
-        estimated: cam_from_world by image name; names without truth are ignored.
-        truth: true cam_from_world by image name.
-
     Raises:
         UsageError: if the poses determine no alignment (see `align_centers`).
     """
@@ -318,13 +314,7 @@ def center_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
 
 
 def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float | None = None) -> _RelativePoses:
-    """Return second_from_first of all pairs of some images.
-
-    Args:
-        poses: cam_from_world by image name, in one world.
-        names: the images.
-        extent: largest distance between two centres of the capture; None: between two of these images.
-    """
+    """Return second_from_first of all pairs of some images."""
     rotations = np.array([poses[name].rotation for name in names])
     centers = np.array([poses[name].center for name in names])
     first, second = np.triu_indices(len(names), 1)

@@ -24,14 +24,7 @@ Evaluation = TypeVar("Evaluation")
 
 @dataclass(frozen=True, eq=False)
 class RunEvaluation:
-    """Scores of the results in an output folder; None for a result that cannot be compared.
-
-    Attributes:
-        poses: scores of the poses.
-        depth: scores of the range maps.
-        cloud: scores of the cloud.
-        not_compared: "poses", "ranges" or "cloud" to the reason why it has no scores.
-    """
+    """Scores of the results in an output folder; None for a result that cannot be compared."""
 
     poses: Scores | None
     depth: DepthEvaluation | None

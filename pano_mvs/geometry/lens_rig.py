@@ -242,12 +242,7 @@ class LensRig:
         return origins, directions
 
     def bearings_from_rays(self, origins: ArrayLike, directions: ArrayLike) -> FloatArray:
-        """Return the bearings (..., 3) at which the panorama shows rays of its lenses: `rays_from_bearings`, inverted.
-
-        Args:
-            origins: (..., 3) the lens centres, in metres.
-            directions: (..., 3) unit.
-        """
+        """Return the bearings (..., 3) at which the panorama shows rays of its lenses; inverts `rays_from_bearings`."""
         rays = np.asarray(directions, dtype=np.float64)
         start = np.asarray(origins, dtype=np.float64) / self.stitch_distance_m
         along = np.sum(start * rays, axis=-1, keepdims=True)

@@ -39,11 +39,6 @@ MIME_TYPES: Final[dict[TextureFormat, str]] = {"jpeg": "image/jpeg", "png": "ima
 def encoded_texture(texture: NDArray[np.uint8], form: TextureFormat, *, quality: int) -> bytes:
     """Return a texture (H, W, 3) RGB as the bytes of an image file.
 
-    Args:
-        texture: (H, W, 3) uint8 RGB.
-        form: file format.
-        quality: quality of a JPEG, 1 to 100; its colours keep their full resolution, because charts have sharp edges.
-
     Raises:
         UsageError: if OpenCV cannot write it, for example because it is larger than 65535 pixels.
     """
@@ -67,14 +62,7 @@ _UNLIT = "KHR_materials_unlit"
 
 
 def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: TextureFormat) -> None:
-    """Write a mesh with its texture as one GLB file, without lighting (KHR_materials_unlit), visible from both sides.
-
-    Args:
-        path: the file to write.
-        mesh: the mesh, y up.
-        picture: bytes of the texture's image file.
-        form: format of that file.
-    """
+    """Write a mesh, y up, with its texture as one GLB file, without lighting and visible from both sides."""
     parts = [
         np.ascontiguousarray(mesh.positions, "<f4").tobytes(),
         np.ascontiguousarray(mesh.uv, "<f4").tobytes(),
@@ -137,13 +125,7 @@ _MATERIAL = "texture"
 
 
 def write_obj(path: Path, mesh: TexturedArrays, *, material_file: str) -> None:
-    """Write a mesh as OBJ: v, vt (with the origin in the lower-left corner, as OBJ has it) and f.
-
-    Args:
-        path: the file to write.
-        mesh: the mesh.
-        material_file: name of the MTL file of `write_mtl`, in the same folder.
-    """
+    """Write a mesh as OBJ: v, vt (with the origin in the lower-left corner, as OBJ has it) and f."""
     flipped = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1)
     corners = (mesh.faces + 1).repeat(2, axis=1)  # the texture coordinate has the number of the vertex
     with path.open("w", encoding="utf-8", newline="\n") as stream:
@@ -154,12 +136,7 @@ def write_obj(path: Path, mesh: TexturedArrays, *, material_file: str) -> None:
 
 
 def write_mtl(path: Path, *, texture_file: str) -> None:
-    """Write the material of `write_obj`: an image without lighting.
-
-    Args:
-        path: the file to write.
-        texture_file: name of the image file, in the same folder.
-    """
+    """Write the material of `write_obj`: an image without lighting."""
     lines = [f"newmtl {_MATERIAL}", "Ka 1 1 1", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 0", f"map_Kd {texture_file}"]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
@@ -234,14 +211,7 @@ def Xform "mesh" (
 
 
 def write_usdz(path: Path, mesh: TexturedArrays, picture: bytes, *, form: TextureFormat) -> None:
-    """Write a mesh with its texture as one USDZ file; its colours need no light (they are emitted).
-
-    Args:
-        path: the file to write.
-        mesh: the mesh, y up.
-        picture: bytes of the texture's image file.
-        form: format of that file.
-    """
+    """Write a mesh with its texture as one USDZ file; its colours need no light (they are emitted)."""
     texture = f"texture{SUFFIXES[form]}"
     flipped = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1)
     scene = _SCENE.format(

@@ -39,13 +39,7 @@ class PlanDrawing:
 
 
 def world_file_text(pixel: float, left: float, top: float) -> str:
-    """Return a world file (.pgw): pixel size, no rotation, and the centre of the upper left pixel.
-
-    Args:
-        pixel: edge of a pixel.
-        left: x of the left edge of the picture.
-        top: y of its upper edge.
-    """
+    """Return a world file (.pgw): pixel size, no rotation, and the centre of the upper left pixel."""
     return "".join(f"{value:.12g}\n" for value in (pixel, 0, 0, -pixel, left + pixel / 2, top - pixel / 2))
 
 

@@ -65,14 +65,7 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 def ply_header(count: int, layout: np.dtype[np.void], *, comments: str = "", more: str = "") -> bytes:
-    """Return the header of a binary little-endian file whose vertices are float32 and uint8 numbers.
-
-    Args:
-        count: number of vertices.
-        layout: their properties.
-        comments: lines of comments.
-        more: lines of further elements.
-    """
+    """Return the header of a binary little-endian file whose vertices are float32 and uint8 numbers."""
     kinds = {"f": "float", "u": "uchar"}
     properties = "".join(f"property {kinds[layout[name].kind]} {name}\n" for name in layout.names or ())
     vertices = f"element vertex {count}\n{properties}"

@@ -1,4 +1,8 @@
-"""Range maps, normals and confidences as image files that other programs read."""
+"""Range maps, normals and confidences as files that other programs read.
+
+Writers raise UsageError for arrays of another shape or type, readers InputError for files that cannot be read or have
+another layout.
+"""
 
 from __future__ import annotations
 
@@ -26,25 +30,13 @@ _MAX_STEP = 65535
 
 
 def write_range_tiff(path: Path, range_map: NDArray[np.float32]) -> None:
-    """Write a range map as a one-channel float32 TIFF; NaN stays NaN, and no precision is lost.
-
-    Args:
-        path: the file to write.
-        range_map: (H, W) float32.
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write a range map as a one-channel float32 TIFF; NaN stays NaN, and no precision is lost."""
     _require(range_map, np.float32, "a range map")
     path.write_bytes(_encoded(".tiff", range_map, [cv2.IMWRITE_TIFF_COMPRESSION, _DEFLATE]))
 
 
 def read_range_tiff(path: Path) -> NDArray[np.float32]:
-    """Return the range map (H, W) float32 in a TIFF file, NaN where invalid.
-
-    Raises:
-        InputError: if the file cannot be read or is not a one-channel float32 image.
-    """
+    """Return the range map (H, W) float32 in a TIFF file, NaN where invalid."""
     return np.asarray(_one_channel(path, np.float32, "a range map is a one-channel float32 TIFF"))
 
 
@@ -53,16 +45,8 @@ def write_range_png(path: Path, range_map: NDArray[np.float32], *, unit: float) 
 
     A range below half a step is written as one step, so that it stays valid; a range beyond 65535 steps as 0.
 
-    Args:
-        path: the file to write.
-        range_map: (H, W) float32, scene units, NaN invalid.
-        unit: scene units of one step.
-
     Returns:
         The number of ranges beyond the last step.
-
-    Raises:
-        UsageError: if the array has another shape or type.
     """
     _require(range_map, np.float32, "a range map")
     steps = np.maximum(np.rint(range_map / np.float64(unit)), 1)  # NaN stays NaN
@@ -73,44 +57,24 @@ def write_range_png(path: Path, range_map: NDArray[np.float32], *, unit: float) 
 
 
 def read_range_png(path: Path, *, unit: float) -> NDArray[np.float32]:
-    """Return the range map (H, W) float32 in a 16-bit PNG file, NaN where it has 0.
-
-    Args:
-        path: the file.
-        unit: scene units of one step.
-
-    Raises:
-        InputError: if the file cannot be read or is not a 16-bit grey image.
-    """
+    """Return the range map (H, W) float32 in a 16-bit PNG file, NaN where it has 0."""
     steps = np.asarray(_one_channel(path, np.uint16, "a range map in steps is a 16-bit grey PNG"), np.float64)
     return np.where(steps > 0, steps * unit, np.nan).astype(np.float32)
 
 
 def write_normals_tiff(path: Path, normals: NDArray[np.float32]) -> None:
-    """Write normals (H, W, 3) as a float32 TIFF whose red, green and blue are x, y and z; NaN stays NaN.
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write normals (H, W, 3) as a float32 TIFF whose red, green and blue are x, y and z; NaN stays NaN."""
     path.write_bytes(_encoded(".tiff", _checked_normals(normals)[..., ::-1], [cv2.IMWRITE_TIFF_COMPRESSION, _DEFLATE]))
 
 
 def write_normals_png(path: Path, normals: NDArray[np.float32]) -> None:
-    """Write normals (H, W, 3) as a 16-bit PNG: x, y, z from −1 to 1 as red, green, blue from 1 to 65535; 0 0 0 unknown.
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write normals (H, W, 3) as a 16-bit PNG: −1 to 1 of x, y, z as steps 1 to 65535 of red, green, blue."""
     steps = 1 + np.rint((np.clip(_checked_normals(normals), -1, 1) + 1) / 2 * (_MAX_STEP - 1))
     path.write_bytes(_encoded(".png", np.nan_to_num(steps).astype(np.uint16)[..., ::-1], []))
 
 
 def read_normals(path: Path) -> NDArray[np.float32]:
-    """Return the normals (H, W, 3) float32 in a file of `write_normals_tiff` or `write_normals_png`, NaN where unknown.
-
-    Raises:
-        InputError: if the file cannot be read or has another layout.
-    """
+    """Return the normals (H, W, 3) float32 of `write_normals_tiff` or `write_normals_png`, NaN where unknown."""
     array = _decoded(path)
     if array is None or array.dtype not in (np.float32, np.uint16) or array.ndim != 3:
         what = "not an image" if array is None else f"{array.shape} {array.dtype}"
@@ -131,21 +95,13 @@ def _checked_normals(normals: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def write_confidence_png(path: Path, confidence: NDArray[np.uint8]) -> None:
-    """Write confidences (H, W) uint8 as an 8-bit grey PNG, 0 = invalid.
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write confidences (H, W) uint8 as an 8-bit grey PNG, 0 = invalid."""
     _require(confidence, np.uint8, "a confidence map")
     path.write_bytes(_encoded(".png", confidence, []))
 
 
 def read_confidence_png(path: Path) -> NDArray[np.uint8]:
-    """Return the confidences (H, W) uint8 in a PNG file, 0 = invalid.
-
-    Raises:
-        InputError: if the file cannot be read or is not an 8-bit grey image.
-    """
+    """Return the confidences (H, W) uint8 in a PNG file, 0 = invalid."""
     return np.asarray(_one_channel(path, np.uint8, "a confidence map is an 8-bit grey PNG"))
 
 
@@ -202,11 +158,6 @@ def read_npy(path: Path) -> NDArray[Any]:
 def read_npz(path: Path, key: str, *, what: str = "") -> NDArray[Any]:
     """Return the array under a key of an .npz file.
 
-    Args:
-        path: the file.
-        key: the array's name.
-        what: description of the array in error messages; its name by default.
-
     Raises:
         InputError: if the file cannot be read, or has no complete array of numbers of that name.
     """
@@ -236,12 +187,7 @@ def keys_of_npz(path: Path) -> list[str]:
 
 
 def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
-    """Return the array in a stream of at most `size_bytes` bytes.
-
-    Raises:
-        ValueError: if it contains objects, or is larger than the stream or than the limit of images.
-        Exception: one of `DAMAGE` if the stream is damaged.
-    """
+    """Return the array in a stream of at most `size_bytes` bytes."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"version {version} of the format is not supported")
@@ -283,15 +229,7 @@ def has_exr() -> bool:
 
 
 def write_exr(path: Path, channels: dict[str, NDArray[np.float32]]) -> None:
-    """Write channels of one size as a scan-line EXR file, 32-bit float, with lossless ZIP compression.
-
-    Args:
-        path: the file to write.
-        channels: name to (H, W) float32.
-
-    Raises:
-        UsageError: if OpenEXR is not installed, or an array has another shape or type.
-    """
+    """Write channels of one size as a scan-line EXR file, 32-bit float, with lossless ZIP compression."""
     if not has_exr():
         raise UsageError(EXR_REMEDY)
     import OpenEXR

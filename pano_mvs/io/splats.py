@@ -241,14 +241,7 @@ _CONVENTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class BundleView:
-    """One image of a bundle.
-
-    Attributes:
-        panorama: name of its panorama in the capture.
-        group: number of the group of poses.
-        frame: its files and its camera.
-        cam_from_world: its pose.
-    """
+    """One image of a bundle."""
 
     panorama: str
     group: int

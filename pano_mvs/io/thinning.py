@@ -49,12 +49,7 @@ class Selection:
 
 
 class SelectedPoints:
-    """Selected points of a cloud, one bit per point.
-
-    Attributes:
-        count: the number of selected points.
-        voxel: edge of the voxels that were used; 0 without voxels.
-    """
+    """Selected points of a cloud, one bit per point."""
 
     def __init__(self, bits: NDArray[np.uint8], *, voxel: float) -> None:
         """Take the bits; that of the first point is the lowest of the first byte."""

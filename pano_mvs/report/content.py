@@ -49,14 +49,7 @@ _MAX_COMPARED = 60
 def advice(
     summary: RunSummary, values: StoredValues, earlier: EarlierPage, *, chosen: Sequence[str]
 ) -> tuple[Suggestion, ...]:
-    """Return what to do next time, the most urgent first.
-
-    Args:
-        summary: of the run, with shares of the unmasked sphere.
-        values: of the run.
-        earlier: the earlier page, whose figures are reused.
-        chosen: names of the views to examine if there are more than 60.
-    """
+    """Return what to do next time, the most urgent first."""
     names = [view.name for view in summary.views]
     return suggestions(summary, _coverage(values, earlier, names if len(names) <= _MAX_COMPARED else chosen))
 
@@ -261,14 +254,7 @@ def panorama_rows(
     residuals: Residuals | None,
     thumbnails: Mapping[str, Picture],
 ) -> tuple[Row, ...]:
-    """Return at most 5,000 rows in the order of the capture, followed by images that were left out.
-
-    Args:
-        summary: of the run.
-        shares: image name to its shares of the sphere.
-        residuals: of the points, if known.
-        thumbnails: image name to its small picture.
-    """
+    """Return at most 5,000 rows in the order of the capture, followed by images that were left out."""
     poses = summary.poses
     registered = set(poses.registered)
     rejected = {name: rejection.reason for name, rejection in summary.rejected.items()} | dict(poses.rejected)
@@ -359,14 +345,7 @@ class Content:
 
 
 def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:
-    """Return the content of the page; missing or damaged values are left out and named in the notes.
-
-    Args:
-        out_dir: the output folder.
-        summary: of the run.
-        values: the values of the run.
-        earlier: the earlier page, whose images and figures are reused.
-    """
+    """Return the content of the page; missing or damaged values are left out and named in the notes."""
     poses, views = summary.poses, summary.views
     groups = poses.by_group()
     rejected_pairs = _rejected_pairs(poses.links, values)

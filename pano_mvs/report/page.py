@@ -36,9 +36,6 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
             reused if they show the same values.
         summary: of the run.
         values: the values of the run; None if only the summary is known.
-
-    Raises:
-        StoreError: if the page cannot be written.
     """
     report = gather_report(out_dir, summary, values)
     write_page(out_dir, summary, report)
@@ -52,11 +49,7 @@ def gather_report(out_dir: Path, summary: RunSummary, values: StoredValues | Non
 
 
 def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
-    """Write `report.html`: one file without references to others, at most 30 MB.
-
-    Raises:
-        StoreError: if it cannot be written.
-    """
+    """Write `report.html`: one file without references to others, at most 30 MB."""
     scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
     page = (

@@ -55,12 +55,7 @@ class Shares:
 
 
 def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Shares:
-    """Return the shares of a view by the solid angle of its pixels, sampling every n-th row and column of large maps.
-
-    Args:
-        confidence: (H, W) uint8 as of range maps.
-        mask: (H, W) bool, False is masked or sky; None if neither is known.
-    """
+    """Return the shares of a view by the solid angle of its pixels; large maps are sampled."""
     step = max(1, confidence.shape[0] // _ROWS)
     sampled = np.asarray(confidence[step // 2 :: step, step // 2 :: step])
     height, width = sampled.shape

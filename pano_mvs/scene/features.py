@@ -92,11 +92,7 @@ class GlobalDescriptor(Record):
 
 @dataclass(frozen=True, eq=False)
 class WeakImage(Record):
-    """Whether an image needs learned key points.
-
-    Attributes:
-        wanted: whether it is weakly matched, or similar to an image that is.
-    """
+    """Whether an image needs learned key points."""
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 

@@ -91,11 +91,7 @@ def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX
 
 
 def check_stated_size(data: bytes, path: Path, max_pixels: int = MAX_PIXELS) -> Size | None:
-    """Return the (height, width) in an image's header, or None if it cannot be read.
-
-    Raises:
-        InputError: if that is more than the limit, or than the file can contain.
-    """
+    """Return the (height, width) in an image's header, or None if it cannot be read."""
     size = stated_size(data)
     if size is None:
         return None
@@ -185,11 +181,6 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
     """Return an image as (H, W, 3) uint8 RGB. 16-bit images are scaled; EXIF orientation and transparency are ignored.
 
     Only the first page of an image with several pages is read.
-
-    Args:
-        path: the file.
-        data: its bytes, if they have been read already.
-        max_pixels: the limit of pixels, which is compared with the header before memory is allocated.
 
     Raises:
         InputError: if the file cannot be read, is not an image, is truncated or damaged, is larger than the limit, or

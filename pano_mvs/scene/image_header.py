@@ -38,11 +38,7 @@ def image_kind(data: bytes) -> ImageKind | None:
 
 
 def stated_size(data: bytes) -> Size | None:
-    """Return the (height, width) that an image file's header states, or None if it cannot be read.
-
-    Args:
-        data: the file's bytes, or as many as contain the header.
-    """
+    """Return the (height, width) that an image file's header states, or None if it cannot be read."""
     kind = image_kind(data)
     try:
         return None if kind is None else _READERS[kind](data)
@@ -219,11 +215,7 @@ class Tiff:
     is_big: bool
 
     def directory(self, offset: int) -> Mapping[int, Entry]:
-        """Return the entries of the directory at an offset by tag, without those that point outside of the data.
-
-        Raises:
-            struct.error: if it is truncated.
-        """
+        """Return the entries of the directory at an offset by tag, without those that point outside of the data."""
         head, row, wide = ("Q", "HHQ", 8) if self.is_big else ("H", "HHI", 4)
         (count,) = struct.unpack_from(self.order + head, self.data, offset)
         entries: dict[int, Entry] = {}
@@ -249,11 +241,7 @@ class Tiff:
         return int(value)
 
     def rationals(self, entry: Entry, count: int) -> tuple[float, ...] | None:
-        """Return the first `count` numbers of a field of fractions, or None if it has not as many.
-
-        Raises:
-            ZeroDivisionError: if a denominator is zero.
-        """
+        """Return the first `count` numbers of a field of fractions, or None if it has not as many."""
         if entry.kind != _RATIONAL or entry.end - entry.start < 8 * count:
             return None
         numbers = struct.unpack_from(f"{self.order}{2 * count}I", self.data, entry.start)

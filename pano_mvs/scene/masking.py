@@ -102,10 +102,6 @@ def decode_mask(path: Path, data: bytes | None = None) -> Mask:
     Pixels that are transparent by an alpha channel are ignored too; if all colours are black, only alpha counts. In a
     JPEG, where black is not exactly 0, the threshold is half the brightness.
 
-    Args:
-        path: the file.
-        data: its bytes, if they have been read already.
-
     Raises:
         InputError: if the file cannot be read or is not an image.
     """

@@ -28,11 +28,7 @@ from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require, requir
 
 
 class RecentPictures:
-    """Decoded pictures by what they depend on; the least recently used are dropped beyond a number of bytes.
-
-    Args:
-        limit_bytes: of all pictures; those of more than a quarter of it are not kept.
-    """
+    """Decoded pictures by what they depend on; the least recently used are dropped beyond a number of bytes."""
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit_bytes = limit_bytes
@@ -147,11 +143,7 @@ class Panorama(Record):
         return picture if valid.all() else painted_over(picture, valid)
 
     def load_unmasked(self) -> NDArray[np.uint8]:
-        """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop.
-
-        Raises:
-            InputError: see `load`.
-        """
+        """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop."""
         data = self.image.read_bytes()
         key = digest_from_bytes(data), self.size_hw, self.source_size_hw, self.crop_ltwh
         picture = _RECENT.get(key)
@@ -200,9 +192,6 @@ class Panorama(Record):
         Args:
             valid: (H, W) bool, or of another size that a mask file may have; False is ignored.
             folder: the folder of the new mask file: `ctx.scratch` of a stage.
-
-        Raises:
-            InputError: if it has the shape of neither the sphere nor the crop.
         """
         further = np.asarray(valid, np.bool_)
         keep = self.load_mask() & (

@@ -26,9 +26,6 @@ _MIN_AGREEMENT = 0.5
 def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
     """Return the mean of the cameras' own up directions, −y of each camera, in the world.
 
-    Args:
-        rotations: (N, 3, 3), camera from world. N may be 0.
-
     Returns:
         A unit vector (3,), or None if the cameras do not agree: if the mean of the N unit vectors is not longer than
         0.5. For two cameras, that is an angle of 120° or more between their up directions.
@@ -91,8 +88,5 @@ def y_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
 
     For `up` = −y, it maps (x, y, z) to (x, −y, −z). It agrees with `z_up_from_world` in the way in which programs with
     z up import glTF: (x, y, z) of a file with y up is (x, −z, y) with z up.
-
-    Args:
-        up: (3,) unit vector, the up direction in the world; see `world_up`.
     """
     return np.array(_Y_UP_FROM_Z_UP) @ z_up_from_world(up) + 0.0

@@ -33,12 +33,7 @@ class LogSteps:
 
 
 def log_steps(values: ArrayLike, dtype: type[np.uint8 | np.uint16]) -> LogSteps:
-    """Return values in logarithmic steps; values that are not finite and positive become step 0.
-
-    Args:
-        values: of any shape.
-        dtype: of the steps; its largest number is the last step.
-    """
+    """Return values in logarithmic steps; values that are not finite and positive become step 0."""
     given = np.asarray(values, np.float64)
     steps = np.zeros(given.shape, dtype)
     valid = np.isfinite(given) & (given > 0)
@@ -81,9 +76,6 @@ def encode_ranges(ranges: NDArray[np.float32]) -> tuple[str, float, float]:
     """Return ranges as base64 of uint16 in logarithmic steps, and the smallest and the largest range.
 
     Step 0 stands for no range. The steps are below 0.01 % of the range for ranges that differ by a factor of up to 500.
-
-    Args:
-        ranges: (H, W) float32; NaN where there is none.
     """
     encoded = log_steps(ranges, np.uint16)
     return encode_arrays(encoded.steps.astype("<u2")), encoded.low, encoded.high
@@ -128,12 +120,7 @@ class OctreeNode:
 
 
 def octree(points: NDArray[np.float32], *, node_points: int = NODE_POINTS) -> list[OctreeNode]:
-    """Return the nodes of a cloud's octree, parents before their children; each point is in exactly one node.
-
-    Args:
-        points: (N, 3) float32.
-        node_points: largest number of points of a node that has children.
-    """
+    """Return the nodes of a cloud's octree, parents before their children; each point is in exactly one node."""
     if not len(points):
         return []
     lower = points.min(axis=0).astype(np.float64)
@@ -186,10 +173,6 @@ def mesh_pieces(mesh: SharedMesh, facts: VertexFacts) -> Iterator[tuple[dict[str
     The arrays are places within a cube (V, 3) uint16, places in the texture (V, 2) uint16 if there is one, corners
     (F, 3) uint16, colours (V, 3) uint8 if there is no texture, steps of the standard deviation (V,) uint8 and view
     counts (V,) uint8.
-
-    Args:
-        mesh: the mesh, in the frame of the page.
-        facts: of its vertices.
     """
     for chosen in _divided(mesh):
         used, corners = _by_first_use(mesh.faces[chosen])
@@ -252,12 +235,7 @@ def level_count(width: int, max_width: int) -> int:
 
 
 def panorama_tiles(image: NDArray[np.uint8], levels: int) -> Iterator[tuple[int, int, int, NDArray[np.uint8]]]:
-    """Yield (level, column, row, pixels) of all tiles.
-
-    Args:
-        image: (H, W, 3) uint8, a panorama.
-        levels: number of levels.
-    """
+    """Yield (level, column, row, pixels) of all tiles."""
     for level in range(levels):
         width = TILE << level
         shrinks = width < image.shape[1]

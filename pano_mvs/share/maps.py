@@ -55,12 +55,7 @@ class MapPlace:
 
 
 def place_around(points: NDArray[np.float32], centers: ArrayLike) -> MapPlace:
-    """Return where a map of all but the outermost percent of the points and of all cameras lies.
-
-    Args:
-        points: (N, 3) in the frame of the page, at least one.
-        centers: (M, 3) of the cameras.
-    """
+    """Return where a map of all but the outermost percent of the points and of all cameras lies."""
     box = np.percentile(points.astype(np.float64), [1, 99], axis=0)
     shown = np.concatenate([box, np.asarray(centers, np.float64).reshape(-1, 3)])[:, [0, 2]]
     lower, upper = shown.min(axis=0), shown.max(axis=0)
@@ -70,12 +65,7 @@ def place_around(points: NDArray[np.float32], centers: ArrayLike) -> MapPlace:
 
 
 def cut_height(points: NDArray[np.float32], centers: ArrayLike) -> float:
-    """Return the height above which a map shows nothing: a little above the cameras; infinity without cameras.
-
-    Args:
-        points: (N, 3) in the frame of the page, at least one.
-        centers: (M, 3) of the cameras.
-    """
+    """Return the height above which a map shows nothing: a little above the cameras; infinity without cameras."""
     heights = np.asarray(centers, np.float64).reshape(-1, 3)[:, 1]
     if not len(heights):
         return np.inf
@@ -111,11 +101,7 @@ def top_view(
 
 
 def coverage_colors(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours of view counts, (..., 4) RGBA: red for one, yellow for three or four, green for six and more.
-
-    Args:
-        views: (...) uint8; 0 becomes transparent.
-    """
+    """Return the colours of view counts, (..., 4) RGBA: red for one, yellow for three or four, green from six."""
     channels = [np.interp(views, _RAMP_VIEWS, _RAMP_RGB[:, idx]) for idx in range(3)]
     return np.stack([*channels, np.where(views > 0, 255, 0)], axis=-1).astype(np.uint8)
 
@@ -153,12 +139,7 @@ class StoreyMap:
 
 
 def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap], str]:
-    """Return the floor plans of the largest group of a run, one per storey, and a note, or "".
-
-    Args:
-        run: the output of a run.
-        page_from_world: the frame of the page.
-    """
+    """Return the floor plans of the largest group of a run, one per storey, and a note, or ""."""
     if not run.has_file(PLAN):
         return [], ""
     path = run.out / PLAN

@@ -48,9 +48,6 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
 
     Files that an earlier run left behind are not used.
 
-    Args:
-        run: the output of a run.
-
     Returns:
         The mesh, or None if there is none or it cannot be read; and what the reader of the page should know, or "".
     """
@@ -73,10 +70,6 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
 
     A textured mesh is returned as it is, because the places in its texture would be lost; `export.mesh_textured`
     thins the mesh before it is unwrapped.
-
-    Args:
-        mesh: the mesh.
-        max_faces: number of triangles.
     """
     if mesh.texture is not None or max_faces >= len(mesh.faces):
         return mesh, ""

@@ -74,12 +74,7 @@ class ShareOptions:
 
 @dataclass(frozen=True, eq=False)
 class ShownCloud:
-    """A cloud as the page shows it.
-
-    Attributes:
-        cloud: thinned, in the frame of the page.
-        sigmas: standard deviations of its points in logarithmic steps.
-    """
+    """A cloud as the page shows it."""
 
     cloud: PointCloud
     sigmas: LogSteps
@@ -93,13 +88,7 @@ class ShownCloud:
 
 
 def shown_cloud(cloud: PointCloud | None, frame: Rigid3, *, max_points: int) -> ShownCloud:
-    """Return a cloud with at most `max_points` points, drawn at random, in the frame of the page.
-
-    Args:
-        cloud: of one group; None for an empty one.
-        frame: page_from_world.
-        max_points: the largest number of points.
-    """
+    """Return a cloud with at most `max_points` points, drawn at random, in the frame of the page."""
     if cloud is None:
         empty = np.zeros((0, 3), np.float32)
         cloud = PointCloud(empty, empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
@@ -154,14 +143,7 @@ def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_qual
 def put_maps(
     page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], *, centers: NDArray[np.float64]
 ) -> list[dict[str, Any]]:
-    """Write the floor plans, or without them the cloud from above; return where they lie.
-
-    Args:
-        page: the page.
-        shown: the cloud, which also gives the coverage.
-        plans: of the storeys; may be empty.
-        centers: (N, 3) of the cameras in the page.
-    """
+    """Write the floor plans, or without them the cloud from above; return where they lie."""
     if plans:
         return [
             _put_map(page, number, plan.place, colors=encode_png(plan.picture), shown=shown, heights=plan.heights)

@@ -51,12 +51,7 @@ from pano_mvs.scene.surfaces import Structure
 
 
 def bytes_per_pixel(own: int, *, each_source: int = 0) -> Callable[[Params, Mapping[str, Any]], int]:
-    """Return a function that computes the memory of a unit with a port `range_map` and, optionally, `sources`.
-
-    Args:
-        own: bytes per pixel of the range map.
-        each_source: additional bytes per pixel for each source.
-    """
+    """Return a function that computes the memory of a unit with a port `range_map` and, optionally, `sources`."""
 
     def needed(_: Params, inputs: Mapping[str, Any]) -> int:
         pixels: int = inputs["range_map"].range.size

@@ -186,11 +186,7 @@ class TourParams(Params):
 
 
 def list_tour(params: TourParams) -> Iterator[SourceItem]:
-    """List the scenes of a tour.
-
-    Raises:
-        InputError: if there are fewer than two.
-    """
+    """List the scenes of a tour."""
     notes: list[str] = []
     scenes = list_scenes(params.path, notes)
     if len(scenes) < 2:

@@ -36,11 +36,7 @@ if (sideMC * dot(facingMC, seenMC) > 0.0) {{ gl_Position = vec4(2.0, 2.0, 2.0, 1
 
 
 class CloudActor:
-    """The actor of a cloud.
-
-    Attributes:
-        actor: to be added to a plotter.
-    """
+    """The actor of a cloud."""
 
     def __init__(self, cloud: DrawnCloud) -> None:
         import pyvista
@@ -120,14 +116,7 @@ def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) ->
 
 
 def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
-    """Return the actor of a sphere that shows a panorama, (H, W, 3) RGB, around its camera.
-
-    Args:
-        picture: the panorama.
-        cam_from_world: pose.
-        radius: in scene units.
-        surrounds: whether the viewer is inside; otherwise the near half is left out, see `panorama_sphere`.
-    """
+    """Return the actor of a sphere that shows a panorama, (H, W, 3) RGB, around its camera."""
     import pyvista
 
     mesh = panorama_sphere(cam_from_world, radius, rows=96 if surrounds else 24)
@@ -181,10 +170,6 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
 
     Weak ranges are pale and filled ones striped (`mark_unconfirmed`); pixels without a range are grey. Without readable
     ranges, the picture is None and the legend is the reason.
-
-    Args:
-        camera: with its files.
-        unit: of lengths.
     """
     if camera.range_file is None:
         return None, "no ranges of this camera: the workflow has no export.ranges, or the run did not reach it"

@@ -49,11 +49,7 @@ _TAG_WIDTH = 0.18  # largest width of the text at a mark, as a share of a panel
 
 
 def write_curve_picture(path: Path, inspection: Inspection) -> None:
-    """Write a PNG of a pixel's cost curve, with the winner, the runner-up and, if it is known, the true range.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write a PNG of a pixel's cost curve, with the winner, the runner-up and, if it is known, the true range."""
     curve = inspection.curve
     panels = [("cost before the decision, as a share of the largest possible", curve.raw)]
     if curve.aggregated is not None:
@@ -179,12 +175,6 @@ def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100
 
     Costs after semi-global matching are drawn below the original costs. If there are more ranges than columns,
     a bar shows the minimum of several ranges.
-
-    Args:
-        curve: of a pixel.
-        true_range: marked below; NaN if unknown.
-        width: characters in a line.
-        plain: whether to use ASCII alone.
     """
     group = -(-len(curve.ranges) // max(8, width - _MARGIN))
     signs, steps = (_PLAIN_SIGNS, _WHOLE) if plain else (_SIGNS, _EIGHTHS)

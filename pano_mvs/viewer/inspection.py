@@ -123,14 +123,6 @@ def inspect_pixel(
 ) -> Inspection:
     """Return the analysis of a pixel.
 
-    Args:
-        sweep_unit: the unit of a `depth.sweep` whose curve is wanted, and its record if it was computed.
-        stages: the units that produce range maps of the image, with their records.
-        store: the cache with their inputs.
-        column: of the pixel, from 0.
-        row: likewise.
-        truth: folder with poses.json and depth.npz, or None.
-
     Raises:
         UsageError: if the image has no such pixel.
         InputError: if an input file is missing or damaged.

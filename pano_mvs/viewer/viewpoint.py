@@ -49,13 +49,7 @@ class Viewpoint:
         return np.stack([right, np.cross(forward, right), forward])
 
     def ray(self, x: float, y: float, size_wh: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return the origin and the unit direction of the ray of a position in the window.
-
-        Args:
-            x: from the left edge in pixels.
-            y: from the upper edge.
-            size_wh: (width, height) of the window.
-        """
+        """Return the origin and the unit direction of the ray of a position in the window."""
         width, height = size_wh
         right, down, forward = self.axes
         # In halves of the height, from the centre.

@@ -39,12 +39,7 @@ _TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 
 class SceneWindow:
-    """A plotter with the scene of a tour.
-
-    Attributes:
-        plotter: PyVista's.
-        tour: what is shown.
-    """
+    """A plotter with the scene of a tour."""
 
     def __init__(self, tour: Tour, *, size_wh: tuple[int, int], off_screen: bool, budget: int = POINT_BUDGET) -> None:
         import pyvista
@@ -338,13 +333,7 @@ class Hands:
     """
 
     def __init__(self, tour: Tour, *, seen_from: Callable[[], Viewpoint], update: Callable[[], None]) -> None:
-        """Make a handler.
-
-        Args:
-            tour: receives the actions of the user.
-            seen_from: returns where the window's camera is now.
-            update: updates the window to the tour's state.
-        """
+        """Make a handler."""
         self._tour, self._seen_from, self._update = tour, seen_from, update
         self._pressed: dict[str, tuple[int, int]] = {}
         self._last = (0, 0)

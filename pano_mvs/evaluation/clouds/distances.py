@@ -76,9 +76,6 @@ def cloud_distances(
         true_points: the whole true surface in pieces (K, 3): everything that any view sees.
         surface: the part to be covered.
         limit: larger distances count as infinite.
-
-    Raises:
-        UsageError: if the limit is not positive.
     """
     if not limit > 0:
         raise UsageError(f"the largest distance to measure must be positive, got {limit}")
@@ -96,13 +93,7 @@ def cloud_distances(
 def score_cloud(
     distances: CloudDistances, surface: TrueSurface, thresholds: Sequence[float] = DEFAULT_THRESHOLDS
 ) -> tuple[CloudScore, ...]:
-    """Return the scores at each tolerance; an empty cloud scores 0.
-
-    Args:
-        distances: measured up to the largest tolerance at least.
-        surface: the part to be covered.
-        thresholds: tolerances, in the truth's unit.
-    """
+    """Return the scores at each tolerance; an empty cloud scores 0."""
     area = float(surface.area.sum())
     scores = []
     for threshold in thresholds:

@@ -53,9 +53,6 @@ def write_error_cloud(
         distances: (N,) of each; larger ones than `farthest` are written as `farthest`.
         limits: tolerances in rising order, for the colours (see `distance_colors`).
         farthest: the largest distance that was measured.
-
-    Raises:
-        UsageError: if there are not N points.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     start = 0
@@ -131,15 +128,7 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
 
 
 def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str, evaluation: CloudEvaluation) -> None:
-    """Write a PNG of points coloured by their distances, seen from three places, with a legend.
-
-    Args:
-        path: the file to write.
-        cloud: points (N, 3) in the truth's frame, their normals (N, 3) towards the visible side, or 0, and their
-            distances (N,); points seen from behind are left out.
-        title: what is shown.
-        evaluation: whose limits and cameras are used.
-    """
+    """Write a PNG of points coloured by their distances, seen from three places, with a legend."""
     points, normals, distances = cloud
     parts = [_legend(evaluation)]
     if len(points):

@@ -114,17 +114,7 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class DepthEvaluation:
-    """Scores of range maps.
-
-    Attributes:
-        source: name of the estimates' source.
-        truth: name of the truth's source.
-        settings: how the range maps were scored.
-        scale: factor from the estimates' unit to the truth's, before any fit.
-        views: scores by image name.
-        pairs: the range maps that were compared.
-        sizes: number of views by (height, width) of the estimate and of the truth.
-    """
+    """Scores of range maps."""
 
     source: str
     truth: str
@@ -155,11 +145,7 @@ class DepthEvaluation:
         return self.pairs.masks.missing(list(self.views))
 
     def read_maps(self, name: str) -> ViewMaps:
-        """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied.
-
-        Raises:
-            InputError: if a file can no longer be read.
-        """
+        """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied."""
         maps = self.pairs.read(name)
         estimated: NDArray[np.float32] = maps.estimated
         if self.settings.min_confidence and maps.confidence is not None:

@@ -67,11 +67,7 @@ class ViewMasks:
         return () if self.folder is None else tuple(name for name in names if find_mask(self.folder, name) is None)
 
     def read(self, name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """Return the pixels (H, W) of a view that count, None for all.
-
-        Raises:
-            InputError: if a mask cannot be read.
-        """
+        """Return the pixels (H, W) of a view that count, None for all."""
         own = None if self.folder is None else find_mask(self.folder, name)
         sphere = (0, 0, size_hw[1], size_hw[0])
         counted = [
@@ -84,17 +80,7 @@ class ViewMasks:
 
 @dataclass(frozen=True)
 class RangePairs:
-    """Range maps and their ground truth.
-
-    Attributes:
-        estimates: the estimates with ground truth, by image name.
-        truths: their true range maps.
-        true_names: the truth's names of the images.
-        masks: which pixels count.
-        truth_path: folder or file with the truth, or None.
-        without_truth: names of the estimates without truth.
-        without_estimate: the truth's names of images without an estimate.
-    """
+    """Range maps and their ground truth."""
 
     estimates: Mapping[str, StoredRange]
     truths: Mapping[str, StoredRange]
@@ -168,9 +154,6 @@ def resized_range(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDAr
 
     Returns:
         (height, width) float32; the map itself if it has that size.
-
-    Raises:
-        UsageError: if the aspect ratios differ.
     """
     if ranges.shape == size_hw:
         return ranges
@@ -188,15 +171,7 @@ def resized_range(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDAr
 
 
 def resized_labels(labels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray[Scalar]:
-    """Return a map of labels at the pixel centres of another size: the pixel that contains each centre.
-
-    Args:
-        labels: (H, W) of a full sphere.
-        size_hw: (height, width) of the result, of the same aspect ratio.
-
-    Raises:
-        UsageError: if the aspect ratios differ.
-    """
+    """Return a map of labels at the pixel centres of another size: the pixel that contains each centre."""
     height, width = labels.shape
     if height * size_hw[1] != width * size_hw[0]:
         raise UsageError(

@@ -33,15 +33,7 @@ _BASELINE_WORDS = {
 
 
 def depth_summary(evaluation: DepthEvaluation, *, baseline: str = "best") -> Summary:
-    """Return how range maps were scored, the mean of all scores, and the main scores of each view, as text.
-
-    Args:
-        evaluation: the scores.
-        baseline: which constant is shown beside each score: "best", "median" or "mean".
-
-    Raises:
-        UsageError: if the baseline is unknown.
-    """
+    """Return how range maps were scored, the mean of all scores, and the main scores of each view, as text."""
     if baseline not in BASELINES:
         raise UsageError(f"'{baseline}' is not a baseline: choose one of {', '.join(BASELINES)}")
     views = evaluation.views

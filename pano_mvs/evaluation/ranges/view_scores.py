@@ -19,12 +19,7 @@ DELTAS = {"delta_105": 1.05, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_1
 
 @dataclass(frozen=True, slots=True)
 class BadLimit:
-    """An error above which a pixel is bad.
-
-    Attributes:
-        value: the limit, a share of the truth or a length in its unit.
-        relative: whether the limit is a share.
-    """
+    """An error above which a pixel is bad."""
 
     value: float
     relative: bool = True
@@ -36,11 +31,7 @@ class BadLimit:
 
     @classmethod
     def from_text(cls, text: str) -> BadLimit:
-        """Return the limit written as "5%" or, in the truth's unit, as "0.1".
-
-        Raises:
-            UsageError: if it is neither, or not positive.
-        """
+        """Return the limit written as "5%" or, in the truth's unit, as "0.1"."""
         relative = text.strip().endswith("%")
         try:
             value = float(text.strip().removesuffix("%")) / (100 if relative else 1)
@@ -252,13 +243,6 @@ def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsifica
     """Return the sparsification curve of a range map; an empty curve with NaN areas if no pixel has an estimate.
 
     E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018, section 5.1.
-
-    Args:
-        pixels: estimates, truth and confidence of the pixels.
-        by_solid_angle: whether pixels count by their solid angle; otherwise all count the same.
-
-    Raises:
-        UsageError: if the pixels have no confidence.
     """
     both = pixels.only_valid()
     if both.confidence is None:
@@ -316,12 +300,6 @@ def best_constant_errors(
     abs_rel its median weighted by weight / truth; for a delta t the c with the most weight in c / t < true < c t, the
     best window of ratio t² in the sorted truth; for a bad b likewise with true in [c / (1 + b), c / (1 − b)], or in
     [c − b, c + b] for a length.
-
-    Args:
-        true: (N,) true ranges, positive.
-        weight: (N,) weight of each pixel.
-        peak: as in `range_errors`.
-        bad: limits of bad pixels.
     """
     names = [*mse_scores(1.0, peak), "mae", "abs_rel", *DELTAS, *(limit.name for limit in bad)]
     if not len(true):

@@ -52,12 +52,7 @@ _SPHERE_ID, _SPHERE_CAMERA = 11, struct.Struct("<IiQQ3d")
 
 @dataclass(frozen=True, slots=True)
 class ModelCamera:
-    """One camera.
-
-    Attributes:
-        model: its name, such as EQUIRECTANGULAR.
-        size_hw: (height, width) in pixels.
-    """
+    """One camera."""
 
     model: str
     size_hw: tuple[int, int]
@@ -124,9 +119,6 @@ def read_colmap_model(folder: Path) -> Poses:
 
     Images of other cameras, such as localised photographs, are left out. From SphereSfM's models, whose cameras are
     SPHERE, only the poses are read.
-
-    Args:
-        folder: contains cameras, images and points3D as .bin or .txt. Images are sorted in the natural order of names.
 
     Raises:
         InputError: if the model cannot be read, has no EQUIRECTANGULAR camera, or registers no image.
@@ -231,11 +223,7 @@ def _pose(image: ModelImage) -> Rigid3:
 def _observations(
     image: ModelImage, camera: ModelCamera, points: ModelPoints3D, *, path: Path
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the points that an image observes, and the bearings of the observations.
-
-    Raises:
-        InputError: if a point does not exist.
-    """
+    """Return the points that an image observes, and the bearings of the observations."""
     observed = image.point_ids >= 0
     ids = image.point_ids[observed]
     idx = np.searchsorted(points.ids, ids)
@@ -249,11 +237,7 @@ def _observations(
 
 
 def _errors_rad(points: ModelPoints3D, width_by_id: Mapping[int, int], path: Path) -> NDArray[np.float32]:
-    """Return the errors of points as angles, by the mean width of the images that observe each; 0 if unknown.
-
-    Raises:
-        InputError: if an image of a track does not exist.
-    """
+    """Return the errors of points as angles, by the mean width of the images that observe each; 0 if unknown."""
     observers, which = np.unique(points.track_image_ids, return_inverse=True)
     unknown = next((image_id for image_id in observers.tolist() if image_id not in width_by_id), None)
     if unknown is not None:
@@ -280,11 +264,7 @@ def model_files(folder: Path) -> tuple[Path, Path, Path] | None:
 
 
 def read_cameras(path: Path) -> dict[int, ModelCamera]:
-    """Return the cameras by id, up to and including the first that is not EQUIRECTANGULAR.
-
-    Raises:
-        InputError: if the file cannot be read, or ends early.
-    """
+    """Return the cameras by id, up to and including the first that is not EQUIRECTANGULAR."""
     with _damage_named(path):
         found = _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
         cameras: dict[int, ModelCamera] = {}
@@ -299,11 +279,7 @@ def read_cameras(path: Path) -> dict[int, ModelCamera]:
 
 
 def read_images(path: Path) -> dict[int, ModelImage]:
-    """Return the registered images by id.
-
-    Raises:
-        InputError: if the file cannot be read, or ends early.
-    """
+    """Return the registered images by id."""
     with _damage_named(path):
         images: dict[int, ModelImage] = {}
         for image_id, image in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
@@ -488,11 +464,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _number(text: str, *, below: int = 1 << 32) -> int:
-    """Return an integer from text.
-
-    Raises:
-        ValueError: if it is not an integer from 0 to below the limit.
-    """
+    """Return an integer from text."""
     if not 0 < len(text) <= 20 or not 0 <= int(text) < below:
         raise ValueError(f"{text[:40]!r} is not a number from 0 to {below - 1}")
     return int(text)

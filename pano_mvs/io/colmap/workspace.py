@@ -95,22 +95,14 @@ _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
 
 
 def write_depth_map(path: Path, z_depth: NDArray[np.float32]) -> None:
-    """Write z-depths (H, W) float32; NaN becomes COLMAP's 0.
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write z-depths (H, W) float32; NaN becomes COLMAP's 0."""
     if z_depth.ndim != 2 or z_depth.dtype != np.float32:
         raise UsageError(f"a depth map is (H, W) float32, got {z_depth.shape} {z_depth.dtype}")
     _write(path, z_depth[..., None])
 
 
 def write_normal_map(path: Path, normals_in_cam: NDArray[np.float32]) -> None:
-    """Write normals (H, W, 3) float32 in the picture's camera frame; NaN becomes (0, 0, 0).
-
-    Raises:
-        UsageError: if the array has another shape or type.
-    """
+    """Write normals (H, W, 3) float32 in the picture's camera frame; NaN becomes (0, 0, 0)."""
     if normals_in_cam.ndim != 3 or normals_in_cam.shape[2] != 3 or normals_in_cam.dtype != np.float32:
         raise UsageError(f"a normal map is (H, W, 3) float32, got {normals_in_cam.shape} {normals_in_cam.dtype}")
     _write(path, normals_in_cam)
@@ -143,13 +135,7 @@ _WRITABLE = (".bmp", ".tif", ".tiff", ".webp")
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8], size_hw: tuple[int, int] | None = None) -> None:
-    """Write an image (H, W, 3) uint8 RGB in the format of the path's suffix; other formats become JPEG (quality 95).
-
-    Args:
-        path: the file.
-        picture: the image.
-        size_hw: (height, width) to which the image is resized; by default its own size.
-    """
+    """Write an image (H, W, 3) uint8 RGB in the format of the path's suffix; other formats become JPEG (quality 95)."""
     if size_hw is not None and picture.shape[:2] != size_hw:
         enlarged = size_hw[1] > picture.shape[1]
         way = cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA

@@ -83,12 +83,7 @@ class CutPanorama:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensPictures:
-    """The fisheye pictures of one panorama.
-
-    Attributes:
-        rig: the lenses.
-        image_names: names of the pictures of both lenses, relative to the image folder.
-    """
+    """The fisheye pictures of one panorama."""
 
     rig: LensRig
     image_names: tuple[str, str]
@@ -342,11 +337,7 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
 
 
 class _ModelPoints:
-    """Collect the observations of images in tracks, and add the points to a pycolmap model.
-
-    Args:
-        poses: poses with points and tracks.
-    """
+    """Collect the observations of images in tracks, and add the points to a pycolmap model."""
 
     def __init__(self, poses: Poses) -> None:
         """Create empty tracks."""
@@ -389,12 +380,6 @@ def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int,
     """Add photographs without key points to a pycolmap.Reconstruction, each with a camera of its own.
 
     A photograph with distortion has a SIMPLE_RADIAL camera, one without a PINHOLE camera.
-
-    Args:
-        model: the model.
-        photographs: in the world of the model.
-        first_camera: id of the first camera; the following ones must be free.
-        first_image: id of the first image; the following ones must be free.
     """
     import pycolmap
 

@@ -62,10 +62,6 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
 
     Hidden files, hidden folders, folders called `masks`, output folders of runs and caches are ignored.
 
-    Args:
-        folder: the folder.
-        notes: see `files_below`.
-
     Raises:
         InputError: if the folder does not exist, cannot be listed, or contains no image.
     """
@@ -107,11 +103,6 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
 
     An image is a panorama if its GPano metadata describe a whole or cropped one, or, with a warning, if it is exactly
     twice as wide as high.
-
-    Args:
-        path: the file.
-        data: its bytes, if they have been read already.
-        max_pixels: the limit of pixels.
 
     Raises:
         InputError: if the file cannot be read, is not an image, is larger than the limit, or is not an equirectangular
@@ -259,10 +250,6 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
 
     Known are tiles of Marzipano (`2/f/0/1.jpg`), Pannellum (`2/f0_1.jpg`) and krpano (`l2/f/01/l2_f_01_02.jpg`), and
     six files (`hall_f.jpg`, `hall/front.jpg`).
-
-    Args:
-        folder: of the tour, or of its tiles.
-        notes: a warning is appended for each scene without a complete cube.
 
     Raises:
         InputError: if there is no complete scene.

@@ -46,10 +46,6 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS) -> d
     """Return, for each picture that is a copy of an earlier one, which one.
 
     Pictures that OpenCV does not read are compared with none.
-
-    Args:
-        paths: the files, by name.
-        max_pixels: larger pictures are not decoded.
     """
     known = {name: picture for name, path in paths.items() if (picture := _reduced(path, max_pixels)) is not None}
     return copies_among(known)

@@ -61,11 +61,7 @@ class Container:
 
 
 def read_container(data: bytes) -> Container:
-    """Return the size and the metadata of an image file; nothing of damaged or unknown files.
-
-    Args:
-        data: all bytes of the file, since metadata may be behind the pixels.
-    """
+    """Return the size and the metadata of an image file; nothing of damaged or unknown files."""
     kind = image_kind(data)
     if kind is None:
         return Container()
@@ -176,9 +172,6 @@ def position_from_exif(exif: bytes) -> tuple[float, float, float] | None:
     """Return (latitude deg, longitude deg, altitude m), or None if there is no valid position.
 
     North, east and up are positive. A missing altitude is 0.
-
-    Args:
-        exif: the metadata, which begins with the byte order, "II" or "MM".
     """
     try:
         tiff = open_tiff(exif)
@@ -198,12 +191,7 @@ def orientation_from_exif(exif: bytes) -> int:
 
 
 def focal_from_exif(exif: bytes, size_hw: tuple[int, int]) -> float | None:
-    """Return the focal length in pixels, from that for 35 mm film (whose diagonal is 43.27 mm), or None if not stated.
-
-    Args:
-        exif: the metadata.
-        size_hw: (height, width) of the picture.
-    """
+    """Return the focal length in pixels, from that for 35 mm film (diagonal 43.27 mm), or None if not stated."""
     try:
         tiff = open_tiff(exif)
         offset = None if tiff is None else tiff.integer(tiff.directory(tiff.first).get(_EXIF_DIRECTORY))

@@ -23,10 +23,6 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     one with the same extension. A name is left out if two are equally close. Several names may have one counterpart;
     see `pair_image_names`.
 
-    Args:
-        wanted: names relative to a capture, such as "a/001.jpg".
-        available: names in another file, such as "images/a/001.jpg" or "./001.png".
-
     Returns:
         Wanted name to available name.
     """
@@ -38,10 +34,6 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
 
 def pair_image_names(names: Iterable[str], available: Iterable[str]) -> dict[str, str]:
     """Pair image names one to one: those that are the closest to each other, as in `match_image_names`.
-
-    Args:
-        names: image names, such as "a/001".
-        available: names of the other side, such as "images/a/001.jpg".
 
     Returns:
         Name to available name.
@@ -111,10 +103,6 @@ def find_mask(folder: Path, name: str) -> Path | None:
 
     The mask of `a/b.jpg` is `a/b.jpg.png`, as COLMAP names it, else `a/b.png`. The mask of `a/b`, whose extension is
     not known, is `a/b.png` with any image extension before the last (`a/b.JPG.png`), else `a/b.png`.
-
-    Args:
-        folder: the folder of the masks.
-        name: the image's path relative to the capture, with or without its extension.
     """
     plain = without_extension(name)
     if plain == name:

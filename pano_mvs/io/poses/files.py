@@ -101,9 +101,6 @@ def read_groups(path: Path) -> list[Poses]:
 
     Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given. Each has its
     own world. Images of an earlier group are omitted.
-
-    Raises:
-        InputError: as `read_poses`.
     """
     groups = [read_poses(path)]
     model = _file_or_model(path)
@@ -117,11 +114,7 @@ def read_groups(path: Path) -> list[Poses]:
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of the images of poses by name, if the file states them (poses.json).
-
-    Raises:
-        InputError: as `read_poses`.
-    """
+    """Return the SHA-256 of the images of poses by name, if the file states them (poses.json)."""
     path = _file_or_model(path)
     value = read_json_value(path) if path.suffix.lower() in _JSON else None
     if not isinstance(value, dict) or "views" not in value or is_openmvg(value) or is_alicevision(value):

@@ -32,10 +32,6 @@ def is_openmvg(data: Any) -> bool:
 def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     """Return the poses of all views that have one, by image name.
 
-    Args:
-        data: the contents of the file; see `is_openmvg`.
-        path: the file, for error messages.
-
     Raises:
         InputError: if a value is invalid, or a camera is not spherical; it names the view or the pose.
     """
@@ -107,11 +103,6 @@ def write_openmvg(path: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, in
     """Write poses of one group with their points and tracks, as openMVG's `Save` (cereal's JSON archive) does.
 
     The world is that of the poses. Pixels follow openMVG's spherical camera: those of this package.
-
-    Args:
-        path: the file to write.
-        poses: poses of one group.
-        sizes_hw: (height, width) of each image.
     """
     sizes = list(dict.fromkeys(sizes_hw[name] for name in poses.names))
     views, extrinsics = [], []
@@ -176,10 +167,6 @@ def is_alicevision(data: Any) -> bool:
 def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     """Return the poses of all views that have one, by image path below the folder that all images share.
 
-    Args:
-        data: the contents of the file; see `is_alicevision`.
-        path: the file, for error messages.
-
     Raises:
         InputError: if a value is invalid, or a camera is not equirectangular; it names the view or the pose.
     """
@@ -238,10 +225,6 @@ def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rig
 
     The world is east, north, up in metres about `reference_lla`. Without GPS positions, OpenSfM writes a reference at
     latitude and longitude 0, and the unit of length is arbitrary.
-
-    Args:
-        data: the contents of the file; see `is_opensfm`.
-        path: the file, for error messages.
 
     Raises:
         InputError: if a value is invalid; it names the shot and the key.

@@ -217,18 +217,7 @@ def textured_mesh(
     folder: Path,
     ctx: Context,
 ) -> TexturedMesh:
-    """Return the textured surface of the cloud of one group of panoramas.
-
-    Args:
-        cloud: the cloud.
-        views: poses of the group, and images and ranges by name. Panoramas are loaded one at a time.
-        params: settings of export.mesh_textured.
-        folder: an empty folder.
-        ctx: context of the stage.
-
-    Raises:
-        InputError: if the cloud has no surface, or no panorama sees it.
-    """
+    """Return the textured surface of the cloud of one group of panoramas."""
     solved, _ = solved_mesh(cloud, params, folder, deepest=_DEEPEST)
     names = [name for name in views[0].names if name in views[1]]
 
@@ -254,11 +243,7 @@ def _without_free_space(
     *,
     smallest_part: float,
 ) -> Mesh:
-    """Return a mesh without the parts through which panoramas look.
-
-    Raises:
-        InputError: if nothing is left.
-    """
+    """Return a mesh without the parts through which panoramas look."""
     space = FreeSpace(mesh.vertices_in_world)
     for name in names:
         if name in views[2]:
