@@ -10,11 +10,6 @@ from pano_mvs.evaluation.ranges.pairs import resized_labels, resized_range
 from tests.algorithms.range_scenes import box_range
 
 
-def test_the_same_size_is_the_same_map() -> None:
-    ranges, _ = box_range((16, 32))
-    assert resized_range(ranges, (16, 32)) is ranges
-
-
 @pytest.mark.parametrize(("old", "new"), [((64, 128), (128, 256)), ((128, 256), (64, 128)), ((48, 96), (64, 128))])
 def test_walls_keep_their_distance(old: tuple[int, int], new: tuple[int, int]) -> None:
     """A walk over the seam and over both poles: the box is closed, its truth known in closed form at any size."""

@@ -105,11 +105,6 @@ def test_a_folder_without_pictures_is_named(tmp_path: Path, folder: str, what: s
         list_pictures(tmp_path / folder)
 
 
-def test_a_panorama_that_says_so_needs_no_warning(tmp_path: Path) -> None:
-    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(full_sphere(32, 64))))
-    assert (info.size_hw, info.file_size_hw, info.crop_ltwh, info.warnings) == ((32, 64), (32, 64), None, ())
-
-
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tiff", "webp"])
 def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
@@ -232,11 +227,6 @@ def test_what_is_not_a_picture_file_is_named(tmp_path: Path) -> None:
         "/d.jpg: this is not a regular file; it is skipped",
         ": images of unsupported formats (gif) are skipped: e.gif",
     ]
-
-
-def test_a_whole_panorama_made_smaller_is_whole(tmp_path: Path) -> None:
-    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (512, 1024), xmp(full_sphere(2688, 5376))))
-    assert (info.size_hw, info.crop_ltwh) == ((512, 1024), None)
 
 
 @pytest.mark.parametrize(
