@@ -12,13 +12,13 @@ import pytest
 from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.scene import Record
-from pano_mvs.testing.scenes import window_room
 from tests.benchmarks.dense_chain import DenseChain
 from tests.benchmarks.depth import ablation, sky
 from tests.benchmarks.depth.ablation import Ablation, gains, place_lines, real_lines, synthetic_lines
 from tests.benchmarks.depth.ablation_places import SYNTHETIC, AblationPlace, ablation_places, masked
 from tests.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
 from tests.benchmarks.depth.stored_chain import StoredChain
+from tests.synthetic.places import window_room
 
 ROOM = AblationPlace("weak_room", 64, 2, arguments=(("seed", 1),))
 SMALL = "depth.planes=16 depth.near=1.0 depth.far=6.0"

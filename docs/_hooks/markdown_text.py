@@ -7,7 +7,10 @@ import inspect
 import re
 from collections.abc import Iterable, Sequence
 
+from pano_mvs.cli.plugins.new import rendered
+
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Raises|Yields|Frames|Pixels|Sphere|Range|Borders|Units):?$")
+_PLUGIN = re.compile(r"<!-- plugin: (\w+) (\w+) -->\n")
 _ENTRY = re.compile(r"^(\*{0,2}[\w., ]+?)(?: \(.*?\))?: (.*)$")
 
 
@@ -62,3 +65,8 @@ def _entries(text: str) -> str:
 def _entry(entry: str) -> str:
     found = _ENTRY.match(entry)
     return f"`{found[1]}`: {escaped(found[2])}" if found else escaped(entry)
+
+
+def with_plugins(markdown: str) -> str:
+    """Return a page with the plugin that `plugin new` writes in place of each comment `plugin: KIND NAME`."""
+    return _PLUGIN.sub(lambda found: f"```python\n{rendered(found[1], found[2])[0]}```\n", markdown)

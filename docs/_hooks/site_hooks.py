@@ -6,6 +6,7 @@ from api_page import api_page
 from command_page import command_page
 from conventions_page import conventions_page
 from equations import with_mathml
+from markdown_text import with_plugins
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -31,9 +32,11 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
-    """Lead links to the repository's other files to where they are in the site."""
+    """Lead links to the repository's other files to where they are in the site, and show plugins in full."""
     place = page.file.src_uri
-    return markdown if place in PAGES else with_site_links(markdown, place, f"docs/{place}")
+    if place in PAGES:
+        return markdown
+    return with_plugins(with_site_links(markdown, place, f"docs/{place}"))
 
 
 def on_page_content(html: str, **_: object) -> str:

@@ -18,7 +18,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 from quickstart_pictures import IMAGES
 
-from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.ply import open_ply_points
 
 WIDTH, HEIGHT, STRIP, GAP = 1280, 560, 460, 30
 EYE, FOCUS, VIEW_ANGLE = (3.3, -5.2, -6.2), (0.72, 0.45, 0.2), 35.0

@@ -12,10 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.algorithms.masks.static import reduced_to_width, static_content
 from quickstart_pictures import IMAGES, ROOT
 
-from pano_mvs.testing.rig import stick_and_hand, with_rig
+from pano_mvs.algorithms.masks.areas import reduced_to_width
+from pano_mvs.algorithms.masks.static_content import static_content
+from tests.synthetic.rig import stick_and_hand, with_rig
 
 SAMPLE = ROOT / "workflows" / "samples" / "classroom" / "images"
 NADIR_DEG = 40.0

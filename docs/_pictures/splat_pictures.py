@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from quickstart_pictures import IMAGES
 
-from pano_mvs.io.ranges.files import read_normals
+from pano_mvs.io.ranges import read_normals
 
 SIZE, GAP = 300, 8
 PANORAMA, FACE = "000", "front"

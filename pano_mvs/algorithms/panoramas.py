@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray, FloatImage, Mask, Picture
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.scene.masks.masking import placed_mask
+from pano_mvs.scene.masking import placed_mask
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 

@@ -36,9 +36,9 @@ from pano_mvs.geometry import (
     sample_panorama,
 )
 from pano_mvs.geometry.geodesy import lla_from_local
-from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
-from pano_mvs.io.clouds.thinning import SelectedPoints as KeptPoints
-from pano_mvs.io.clouds.thinning import Selection as PointSelection
+from pano_mvs.io.thinning import CHUNK_POINTS, chunks, select_points
+from pano_mvs.io.thinning import SelectedPoints as KeptPoints
+from pano_mvs.io.thinning import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,
     Features,
@@ -58,7 +58,7 @@ from pano_mvs.scene import (
     Views,
 )
 from pano_mvs.scene.files import group_file
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
 from pano_mvs.scene.upright import world_up, y_up_from_world, z_up_from_world
 

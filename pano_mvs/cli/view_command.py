@@ -17,7 +17,7 @@ from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.display import quiet_vtk, require_display, require_drawing, require_window
 from pano_mvs.viewer.shown_scene import ShownScene, open_scene
-from pano_mvs.viewer.sizes import box_of
+from pano_mvs.viewer.viewpoint import box_of
 
 _SIZE = re.compile(r"([1-9][0-9]{1,4})[x×]([1-9][0-9]{1,4})")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
@@ -125,7 +125,7 @@ def mesh_points(path: Path) -> NDArray[np.float32]:
     Raises:
         InputError: if it cannot be read.
     """
-    from pano_mvs.io.clouds.ply_reader import read_ply_points
+    from pano_mvs.io.ply import read_ply_points
 
     points = read_ply_points(path)
     if not len(points):

@@ -9,12 +9,11 @@ others' results (`ranges` and `clouds` use `poses.alignment`); `capture` and `ru
 
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation, evaluate_cloud
 from pano_mvs.evaluation.clouds.pictures import write_error_clouds, write_overview
-from pano_mvs.evaluation.poses.evaluate import PoseEvaluation, evaluate_poses
+from pano_mvs.evaluation.poses import PoseEvaluation, evaluate_poses
 from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
-from pano_mvs.evaluation.ranges.errors import BadLimit
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.evaluation.ranges.tables import depth_summary, write_depth_csv, write_depth_scores
-from pano_mvs.evaluation.ranges.view_scores import ScoreSettings
+from pano_mvs.evaluation.ranges.view_scores import BadLimit, ScoreSettings
 from pano_mvs.evaluation.run import RunEvaluation, evaluate_run
 
 __all__ = [

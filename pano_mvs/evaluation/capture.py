@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.poses.alignment import align_centers
-from pano_mvs.evaluation.poses.errors import PoseErrors, relative_pose_errors
-from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.evaluation.poses import PoseErrors, align_centers, relative_pose_errors
+from pano_mvs.evaluation.ranges.pairs import resized_labels, resized_range
 from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores

@@ -25,14 +25,7 @@ def strip(height: int, text: str = "") -> Picture:
 
 
 def put_text(picture: Picture, text: str, x_y: tuple[int, int], *, centered: bool = False) -> None:
-    """Write text into a picture; what is not ASCII becomes "?".
-
-    Args:
-        picture: (H, W, 3) RGB, changed in place.
-        text: one line.
-        x_y: pixel of the left end of the baseline, or of its middle.
-        centered: whether `x_y` is the middle.
-    """
+    """Write text into a picture; what is not ASCII becomes "?"."""
     plain = text.replace("−", "-").encode("ascii", "replace").decode()
     x, y = x_y
     if centered:

@@ -11,12 +11,10 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.evaluation.capture import score_capture
 from pano_mvs.evaluation.clouds.evaluate import CLOUD_FILE, MODEL_FOLDER, CloudEvaluation, evaluate_cloud
-from pano_mvs.evaluation.inputs.cameras import camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.range_files import find_ranges
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
+from pano_mvs.evaluation.inputs import camera_groups, find_ranges, find_true_ranges, read_cameras
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.colmap.model_writer import is_colmap_model
+from pano_mvs.io.colmap.reader import is_colmap_model
 from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.scene import Scores
 
@@ -26,14 +24,7 @@ Evaluation = TypeVar("Evaluation")
 
 @dataclass(frozen=True, eq=False)
 class RunEvaluation:
-    """Scores of the results in an output folder; None for a result that cannot be compared.
-
-    Attributes:
-        poses: scores of the poses.
-        depth: scores of the range maps.
-        cloud: scores of the cloud.
-        not_compared: "poses", "ranges" or "cloud" to the reason why it has no scores.
-    """
+    """Scores of the results in an output folder; None for a result that cannot be compared."""
 
     poses: Scores | None
     depth: DepthEvaluation | None

@@ -30,24 +30,13 @@ Units
 """
 
 from pano_mvs.core import kernel_cache
-from pano_mvs.geometry.fisheye import FisheyeLens
-from pano_mvs.geometry.lens_rig import LensRig
+from pano_mvs.geometry.lens_rig import FisheyeLens, LensRig
 from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import (
     pad_panorama,
     roll_panorama,
     rotate_panorama,
     sample_panorama,
-)
-from pano_mvs.geometry.rotation import (
-    geodesic_angle,
-    nearest_rotation,
-    quat_wxyz_from_rotation,
-    rotation_from_quat_wxyz,
-    rotation_from_rotvec,
-    rotation_from_two_vectors,
-    rotvec_from_rotation,
-    skew,
 )
 from pano_mvs.geometry.sphere import (
     angle_between,
@@ -58,7 +47,19 @@ from pano_mvs.geometry.sphere import (
     sines_of_grid,
     spiral_rays,
 )
-from pano_mvs.geometry.transforms import Rigid3, Similarity3, similarity_from_points
+from pano_mvs.geometry.transforms import (
+    Rigid3,
+    Similarity3,
+    geodesic_angle,
+    nearest_rotation,
+    quat_wxyz_from_rotation,
+    rotation_from_quat_wxyz,
+    rotation_from_rotvec,
+    rotation_from_two_vectors,
+    rotvec_from_rotation,
+    similarity_from_points,
+    skew,
+)
 from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_bearings
 
 kernel_cache.use_kernel_cache()

@@ -37,10 +37,6 @@ class PinholeView:
         """Return the rays, (h, W, 3), through one place in each pixel of some rows, in the panorama's camera frame.
 
         They are not of unit length: their length is 1 / cos of the angle to the view's axis.
-
-        Args:
-            rows: which rows.
-            offset_xy: the place, (0.5, 0.5) the pixel's centre.
         """
         x = np.arange(self.size_hw[1]) + offset_xy[0]
         y = np.arange(self.size_hw[0])[rows] + offset_xy[1]

@@ -41,10 +41,6 @@ def ranges_from_bearings(
 def triangulate_bearings(bearings: ArrayLike, cams_from_world: list[Rigid3]) -> FloatArray:
     """Return the point with the least sum of squared distances to all rays of one or many tracks.
 
-    Args:
-        bearings: (N, ..., 3) unit rays, the n-th in camera n.
-        cams_from_world: N ≥ 2 camera poses.
-
     Returns:
         (..., 3) points in the world. NaN where the rays are parallel.
 

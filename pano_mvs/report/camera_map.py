@@ -41,12 +41,7 @@ class WalkPath:
 
 
 def find_walk(count: int, pairs: Sequence[tuple[int, int]]) -> WalkPath | None:
-    """Return the walk along which cameras were taken, or None if they were not taken along one.
-
-    Args:
-        count: number of cameras, in the order of the capture.
-        pairs: positions of the matched pairs.
-    """
+    """Return the walk along which cameras were taken, or None if they were not taken along one."""
     if count < _MIN_CAMERAS or not pairs:
         return None
     distinct = {(min(pair), max(pair)) for pair in pairs}

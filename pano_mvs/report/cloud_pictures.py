@@ -38,12 +38,7 @@ Arrays = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class CloudPictures:
-    """The pictures of a cloud.
-
-    Attributes:
-        shown: (title, image); empty if there is no cloud.
-        note: remark on how they were rendered, or "".
-    """
+    """The pictures of a cloud."""
 
     shown: tuple[tuple[str, Picture], ...] = ()
     note: str = ""
@@ -55,12 +50,6 @@ def cloud_pictures(
     """Return images of the cloud, reusing those of an earlier page if they show the same cloud.
 
     If there are several groups of poses, the largest is shown.
-
-    Args:
-        results: with the cloud and the poses.
-        kept: the earlier page's.
-        up: (3,) unit vector away from the ground, in the world.
-        command: the rendering command, which receives a folder as argument.
     """
     digest = results.digest("cloud")
     if not digest:

@@ -53,12 +53,6 @@ def turnable_cloud(
     """Return the cloud of the largest group of cameras for the viewer; None if there is none.
 
     The points are kept among the facts of the page, so that the next page can reuse them.
-
-    Args:
-        values: with the cloud.
-        poses: of the largest group.
-        earlier: the earlier page.
-        up: (3,) unit vector away from the ground, in the world.
     """
     digest = values.digest("cloud")
     if not digest:
@@ -95,10 +89,6 @@ def encoded(cloud: PointCloud, level_from_world: FloatArray) -> dict[str, Any]:
     `data` is base64 of 12 bytes a point: the place in a cube as three uint16, the normal as three int8, the colour as
     three uint8. The cube has its smallest coordinates at `lower` and edges of `size`. `spacing` is a typical distance
     between neighbours; `middle` and `radius` describe a sphere around nearly all points.
-
-    Args:
-        cloud: at least one point.
-        level_from_world: see `level_axes`.
     """
     step = -(-len(cloud) // _MAX_SAMPLED)
     points = np.asarray(cloud.points_in_world[::step], np.float64) @ level_from_world.T
@@ -129,10 +119,6 @@ def encoded(cloud: PointCloud, level_from_world: FloatArray) -> dict[str, Any]:
 
 def one_per_voxel(points: FloatArray, most: int) -> tuple[NDArray[np.intp], float]:
     """Return the first point of each voxel, and the edge of the voxels: the smallest that leaves at most `most` points.
-
-    Args:
-        points: (N, 3), N > 0.
-        most: largest number of points.
 
     Returns:
         Positions in `points`, ascending, and the edge to about 1 %; if all points are kept, a typical distance.

@@ -27,14 +27,7 @@ def write_scene(
     *,
     size_hw: tuple[int, int],
 ) -> None:
-    """Write the scene to render.
-
-    Args:
-        folder: an empty folder.
-        arrays: points (N, 3), normals (N, 3) and colours (N, 3) in the world.
-        seen_from: one for each picture.
-        size_hw: (height, width) of the pictures.
-    """
+    """Write the scene to render."""
     for idx, name in enumerate(_ARRAYS):
         np.save(folder / f"{name}.npy", arrays[idx])
     views = [

@@ -6,22 +6,31 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from datetime import UTC, datetime
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
-from pano_mvs.report.advice import MAX_SUGGESTIONS, advice
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
-from pano_mvs.report.capture_facts import CaptureFacts, capture_facts
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.cloud_points import TurnableCloud, turnable_cloud
-from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.masked_areas import MaskedAreas, masked_areas
-from pano_mvs.report.view_cards import ViewCard, chosen_views, key_of, view_cards
+from pano_mvs.report.view_cards import (
+    Shares,
+    ViewCard,
+    chosen_views,
+    fact_of,
+    key_of,
+    shares_from_fact,
+    shares_of,
+    view_cards,
+)
+from pano_mvs.results import coverage as view_coverage
+from pano_mvs.results.coverage import ViewCoverage, coverage, coverage_from_fact, coverage_key
 from pano_mvs.results.figures import score_tables, side_by_side
-from pano_mvs.results.next_time import Suggestion, marks_of
+from pano_mvs.results.next_time import Suggestion, marks_of, suggestions
 from pano_mvs.results.pictures import Picture, picture, preview_panels
 from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
@@ -30,6 +39,120 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.pairs_and_views import pair_name
 from pano_mvs.scene.scores import NO_TRUTH
+
+MAX_SUGGESTIONS = 12
+"""Suggestions that the page shows."""
+
+_MAX_COMPARED = 60
+
+
+def advice(
+    summary: RunSummary, values: StoredValues, earlier: EarlierPage, *, chosen: Sequence[str]
+) -> tuple[Suggestion, ...]:
+    """Return what to do next time, the most urgent first."""
+    names = [view.name for view in summary.views]
+    return suggestions(summary, _coverage(values, earlier, names if len(names) <= _MAX_COMPARED else chosen))
+
+
+def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) -> dict[str, ViewCoverage]:
+    if not values.digest("poses"):
+        return {}
+    key = coverage_key(values, names)
+    known = coverage_from_fact(earlier.fact(key))
+    if known is None:
+        known = coverage(values, names)
+        earlier.keep(key, view_coverage.fact_of(known))
+    return known
+
+
+_MAX_MEASURED = 100
+_MAX_SIZES = 4
+# Names of folders that do not say which capture it is: the name of the folder above comes first.
+_GENERIC = {
+    "images",
+    "image",
+    "img",
+    "photos",
+    "pictures",
+    "panoramas",
+    "panos",
+    "frames",
+    "input",
+    "jpg",
+    "png",
+    "raw",
+}
+_MONTHS = "Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"
+
+
+@dataclass(frozen=True)
+class CaptureFacts:
+    """The capture of a run.
+
+    Attributes:
+        name: of the folder with the images, or else of the workflow.
+        date: when the run began, in words; "" if unknown.
+        panoramas: number of images of the capture.
+        sizes: ((height, width) of the full sphere in the file, number of images), the most frequent size first.
+        measured: number of images whose size was looked up: at most 100, evenly spaced.
+        working_hw: (height, width) at which most images are processed; None if that is the size of the files.
+    """
+
+    name: str
+    date: str
+    panoramas: int
+    sizes: tuple[tuple[tuple[int, int], int], ...] = ()
+    measured: int = 0
+    working_hw: tuple[int, int] | None = None
+
+
+def capture_facts(summary: RunSummary, values: StoredValues, *, panoramas: int) -> CaptureFacts:
+    """Return what is known of the capture of a run; `panoramas` is its number of images."""
+    names = list(values.refs.get("images", {}))
+    known = [values.panorama(name) for name in names[:: -(-len(names) // _MAX_MEASURED) or 1]]
+    found = [panorama for panorama in known if panorama is not None]
+    sizes = Counter(panorama.source_size_hw for panorama in found)
+    working = Counter(panorama.size_hw for panorama in found).most_common(1)
+    same = bool(found) and all(panorama.size_hw == panorama.source_size_hw for panorama in found)
+    return CaptureFacts(
+        capture_name(summary),
+        date_in_words(summary.started),
+        panoramas,
+        tuple(sizes.most_common(_MAX_SIZES)),
+        len(found),
+        working[0][0] if working and not same else None,
+    )
+
+
+def capture_name(summary: RunSummary) -> str:
+    """Return the name of the folder or video with the images, else that of the workflow.
+
+    >>> stages = [{"name": "images", "use": "source.folder", "params": {"path": "/tours/old mill/images"}}]
+    >>> capture_name(RunSummary.from_json({"stages": stages}))
+    'old mill / images'
+    """
+    folder = summary.source_folder
+    path = PurePath(folder) if folder is not None else PurePath()
+    if not path.name:
+        return summary.workflow.name
+    parent = path.parent.name
+    return f"{parent} / {path.name}" if parent and path.name.lower() in _GENERIC else path.name
+
+
+def date_in_words(started: str) -> str:
+    """Return a date and time of ISO 8601 in words; other texts as they are.
+
+    >>> date_in_words("2026-11-02T18:10:03+00:00")
+    '2 Nov 2026, 18:10 UTC'
+    """
+    try:
+        when = datetime.fromisoformat(started)
+    except ValueError:
+        return started
+    zone = " UTC" if when.tzinfo is not None else ""
+    when = when.astimezone(UTC) if zone else when
+    return f"{when.day} {_MONTHS[when.month - 1]} {when.year}, {when:%H:%M}{zone}"
+
 
 MAX_THUMBNAILS = 1000
 MAX_MEASURED = 1000
@@ -131,14 +254,7 @@ def panorama_rows(
     residuals: Residuals | None,
     thumbnails: Mapping[str, Picture],
 ) -> tuple[Row, ...]:
-    """Return at most 5,000 rows in the order of the capture, followed by images that were left out.
-
-    Args:
-        summary: of the run.
-        shares: image name to its shares of the sphere.
-        residuals: of the points, if known.
-        thumbnails: image name to its small picture.
-    """
+    """Return at most 5,000 rows in the order of the capture, followed by images that were left out."""
     poses = summary.poses
     registered = set(poses.registered)
     rejected = {name: rejection.reason for name, rejection in summary.rejected.items()} | dict(poses.rejected)
@@ -229,14 +345,7 @@ class Content:
 
 
 def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:
-    """Return the content of the page; missing or damaged values are left out and named in the notes.
-
-    Args:
-        out_dir: the output folder.
-        summary: of the run.
-        values: the values of the run.
-        earlier: the earlier page, whose images and figures are reused.
-    """
+    """Return the content of the page; missing or damaged values are left out and named in the notes."""
     poses, views = summary.poses, summary.views
     groups = poses.by_group()
     rejected_pairs = _rejected_pairs(poses.links, values)

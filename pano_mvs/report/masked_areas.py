@@ -17,8 +17,8 @@ from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture, resized
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.masks.cropping import inside_crop
-from pano_mvs.scene.static_masks import StaticMasks, camera_of
+from pano_mvs.scene.masking import inside_crop
+from pano_mvs.scene.panorama import StaticMasks, camera_of
 
 VERSION = 1
 """Raise it when the pictures or the kinds change: earlier pages' are then drawn again."""
@@ -32,13 +32,7 @@ _EXAMINED_HW = (256, 512)
 
 @dataclass(frozen=True)
 class MaskKind:
-    """A reason for masking.
-
-    Attributes:
-        name: in the page's style sheet.
-        label: what is masked.
-        color_rgb: its tint.
-    """
+    """A reason for masking."""
 
     name: str
     label: str
@@ -58,13 +52,7 @@ KINDS = (
 
 @dataclass(frozen=True)
 class MaskedCount:
-    """How much is masked for one reason.
-
-    Attributes:
-        kind: the reason.
-        panoramas: number of examined panoramas in which something is.
-        mean_share: mean share of the sphere over these panoramas.
-    """
+    """How much is masked for one reason."""
 
     kind: MaskKind
     panoramas: int
@@ -133,9 +121,6 @@ def masked_kinds(panorama: Panorama, *, static: StaticMasks | None = None, sky: 
         panorama: of at most 256 rows, or its mask is reduced to that.
         static: what moves with the cameras.
         sky: (H, W) of the panorama's range map, of any size.
-
-    Raises:
-        InputError: if its mask file cannot be read.
     """
     size_hw = min(panorama.size_hw, _EXAMINED_HW)
     height = size_hw[0]

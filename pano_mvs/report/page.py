@@ -15,8 +15,7 @@ from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural
-from pano_mvs.report.advice import MAX_SUGGESTIONS
-from pano_mvs.report.content import Content, gather
+from pano_mvs.report.content import MAX_SUGGESTIONS, Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
 from pano_mvs.results.records import Verdict
@@ -37,9 +36,6 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
             reused if they show the same values.
         summary: of the run.
         values: the values of the run; None if only the summary is known.
-
-    Raises:
-        StoreError: if the page cannot be written.
     """
     report = gather_report(out_dir, summary, values)
     write_page(out_dir, summary, report)
@@ -53,11 +49,7 @@ def gather_report(out_dir: Path, summary: RunSummary, values: StoredValues | Non
 
 
 def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
-    """Write `report.html`: one file without references to others, at most 30 MB.
-
-    Raises:
-        StoreError: if it cannot be written.
-    """
+    """Write `report.html`: one file without references to others, at most 30 MB."""
     scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
     page = (

@@ -14,16 +14,16 @@ from pano_mvs.core.file_names import file_inside, item_problem
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_groups
-from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
+from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
 from pano_mvs.results.records import Verdict, ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.results.verdict import verdict
 from pano_mvs.scene import PointCloud, Poses, RangeMap
 from pano_mvs.scene.files import group_file
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import join_groups
 
 

@@ -16,7 +16,7 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
-from pano_mvs.scene.static_masks import StaticMasks
+from pano_mvs.scene.panorama import StaticMasks
 
 ROLES = ("images", "pairs", "poses", "ranges", "cloud", "static")
 """The final values of a run by role; run.json says which stage made each."""

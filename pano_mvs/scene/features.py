@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -66,3 +67,61 @@ class Features(Record):
         require_array(self, "sizes_rad", dtype=np.float32, shape=(count,))
         require_array(self, "scores", dtype=np.float32, shape=(count,))
         require_array(self, "colors_rgb", dtype=np.uint8, shape=(count, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalDescriptor(Record):
+    """Global descriptor of a panorama; similar panoramas have vectors with a large scalar product.
+
+    Attributes:
+        vector: (D,) float32 of about the same length for all panoramas; zero for a panorama without key points.
+        sample: (S, B) int16 descriptors of a few key points; matching them against the sample of
+            another panorama identifies neighbours far better than the vectors do. May be empty.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+
+    vector: NDArray[np.float32]
+    sample: NDArray[np.int16] = field(default_factory=lambda: np.zeros((0, 0), np.int16))
+
+    def check(self) -> None:
+        """Raise ContractError unless the arrays have their shapes and types, and the vector is finite."""
+        require_array(self, "vector", dtype=np.float32, shape=(None,))
+        require_array(self, "sample", dtype=np.int16, shape=(None, None))
+
+
+@dataclass(frozen=True, eq=False)
+class WeakImage(Record):
+    """Whether an image needs learned key points."""
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+
+    wanted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class WeakImages(Record):
+    """Which images of a capture are weakly matched.
+
+    Attributes:
+        weak: names of these images.
+        similar: names of other images that they may match.
+        others: names of all other images.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+    explodes_into: ClassVar[type[Record] | None] = WeakImage
+
+    weak: tuple[str, ...] = field(default=())
+    similar: tuple[str, ...] = field(default=())
+    others: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Convert the names, which are stored as lists."""
+        for name in ("weak", "similar", "others"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    def explode(self) -> Mapping[str, WeakImage]:
+        """Return for each image whether it needs learned key points."""
+        wanted = {*self.weak, *self.similar}
+        return {name: WeakImage(name in wanted) for name in (*self.weak, *self.similar, *self.others)}

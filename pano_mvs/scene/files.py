@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
 
@@ -89,3 +89,83 @@ def item_stems(names: Iterable[str]) -> dict[str, str]:
 def _dots(folder: str) -> list[int]:
     """Return the positions of dots in the last component of a path."""
     return [idx for idx in range(folder.rfind("/") + 1, len(folder)) if folder[idx] == "."]
+
+
+FaceLayout = Literal["cube", "octagon", "icosahedron"]
+
+
+@dataclass(frozen=True, eq=False)
+class FaceFiles(Files):
+    """Files of the faces of one panorama for the output folder, with the layout of the faces.
+
+    Attributes:
+        layout: name of the layout; see `panorama_faces`.
+        fov_deg: horizontal and vertical field of view of a face.
+        size_px: width and height of a face.
+        suffix: suffix of the image files, such as ".jpg".
+    """
+
+    axis: ClassVar[Axis | None] = Axis.VIEW
+
+    layout: FaceLayout = "cube"
+    fov_deg: float = 96.0
+    size_px: int = 0
+    suffix: str = ".jpg"
+
+    def check(self) -> None:
+        """Raise ContractError if a target would leave the output folder, or the faces have no size."""
+        Files.check(self)
+        require(self.size_px > 0, self, f"size_px must be positive, got {self.size_px}")
+
+    def to_parts(self) -> Parts:
+        """Return the files as `Files` does, with the layout in `meta`."""
+        parts = dict(Files.to_parts(self))
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        cut = {"layout": self.layout, "fov_deg": self.fov_deg, "size_px": self.size_px, "suffix": self.suffix}
+        return parts | {"meta": meta | cut}
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the record from the result of `to_parts`."""
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        files = Files.from_parts(parts).files
+        return cls(files, meta["layout"], meta["fov_deg"], meta["size_px"], meta["suffix"])
+
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelPanorama(Files):
+    """The files of one level panorama.
+
+    Attributes:
+        picture: target of the picture; `{item}` stands for the name of the panorama.
+        level_from_world: rotation (three rows) from the world of its group into the axes of the level panorama: x
+            right, y down along gravity, z towards the middle of the picture.
+        heading_deg: compass heading of the middle of the picture, or None if north is not known.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+
+    picture: str = ""
+    level_from_world: Rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    heading_deg: float | None = None
+
+    def to_parts(self) -> Parts:
+        """Return the files under numbers, their targets and the rotation as JSON."""
+        parts = dict(super().to_parts())
+        meta = parts["meta"]
+        assert isinstance(meta, Mapping)
+        own = {"picture": self.picture, "level_from_world": self.level_from_world, "heading_deg": self.heading_deg}
+        return parts | {"meta": {**meta, **own}}
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the record from the result of `to_parts`."""
+        meta = parts["meta"]
+        assert isinstance(meta, Mapping)
+        rows = tuple(tuple(map(float, row)) for row in meta["level_from_world"])
+        return cls(Files.from_parts(parts).files, meta["picture"], rows, meta["heading_deg"])

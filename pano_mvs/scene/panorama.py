@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Self
+from threading import Lock
+from typing import ClassVar, Self, TypeAlias
 
 import cv2
 import numpy as np
@@ -13,12 +16,44 @@ from numpy.typing import NDArray
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import LensRig
-from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
-from pano_mvs.scene.image_files.recent_pictures import RecentPictures
-from pano_mvs.scene.masks.cropping import inside_crop, placed_picture, same_shape
-from pano_mvs.scene.masks.masking import decode_mask, painted_over, placed_mask
-from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
+from pano_mvs.scene.image_file import (
+    MASK_BYTES_PER_PIXEL,
+    MAX_PIXELS,
+    decode_image,
+    decoding_bytes_per_pixel,
+    write_png,
+)
+from pano_mvs.scene.masking import decode_mask, inside_crop, painted_over, placed_mask, placed_picture, same_shape
+from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require, require_array
+
+
+class RecentPictures:
+    """Decoded pictures by what they depend on; the least recently used are dropped beyond a number of bytes."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit_bytes = limit_bytes
+        self._pictures: OrderedDict[Hashable, NDArray[np.uint8]] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, key: Hashable) -> NDArray[np.uint8] | None:
+        """Return a copy of a picture, or None if it is not there."""
+        with self._lock:
+            picture = self._pictures.get(key)
+            if picture is None:
+                return None
+            self._pictures.move_to_end(key)
+        return picture.copy()
+
+    def put(self, key: Hashable, picture: NDArray[np.uint8]) -> None:
+        """Keep a copy of a picture."""
+        if 4 * picture.nbytes > self._limit_bytes:
+            return
+        with self._lock:
+            self._pictures[key] = picture.copy()
+            self._pictures.move_to_end(key)
+            while sum(kept.nbytes for kept in self._pictures.values()) > self._limit_bytes:
+                self._pictures.popitem(last=False)
+
 
 _OF_RIGS = frozenset({"rig", "first_lens", "second_lens"})
 _RECENT = RecentPictures(limit_bytes=48 << 20)
@@ -108,11 +143,7 @@ class Panorama(Record):
         return picture if valid.all() else painted_over(picture, valid)
 
     def load_unmasked(self) -> NDArray[np.uint8]:
-        """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop.
-
-        Raises:
-            InputError: see `load`.
-        """
+        """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop."""
         data = self.image.read_bytes()
         key = digest_from_bytes(data), self.size_hw, self.source_size_hw, self.crop_ltwh
         picture = _RECENT.get(key)
@@ -161,9 +192,6 @@ class Panorama(Record):
         Args:
             valid: (H, W) bool, or of another size that a mask file may have; False is ignored.
             folder: the folder of the new mask file: `ctx.scratch` of a stage.
-
-        Raises:
-            InputError: if it has the shape of neither the sphere nor the crop.
         """
         further = np.asarray(valid, np.bool_)
         keep = self.load_mask() & (
@@ -209,3 +237,45 @@ def _resized(image: NDArray[np.uint8], size_hw: tuple[int, int]) -> NDArray[np.u
         return image
     resized: NDArray[np.uint8] = cv2.resize(image, size_hw[::-1], interpolation=cv2.INTER_AREA)
     return resized
+
+
+Camera: TypeAlias = tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class StaticMasks(Record):
+    """The content that stays in place in the images while the world moves: tripod, rig, stick, hand.
+
+    Attributes:
+        pixels: (G, h, 2 h) uint8, one mask for each camera in which something was found: 1 where it is.
+        cameras: the camera of each mask, see `camera_of`.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+
+    pixels: NDArray[np.uint8]
+    cameras: tuple[Camera, ...] = ()
+
+    def check(self) -> None:
+        """Raise ContractError unless there is one mask of a full sphere for each camera."""
+        pixels = require_array(self, "pixels", dtype=np.uint8, shape=(len(self.cameras), None, None))
+        require(pixels.shape[2] == 2 * pixels.shape[1], self, "the masks are not of full spheres")
+        require(not pixels.size or int(pixels.max()) <= 1, self, "pixels are 0 or 1")
+
+    def of(self, panorama: Panorama) -> NDArray[np.bool_] | None:
+        """Return the pixels of a panorama that move with its camera, (H, W) bool at working resolution, or None."""
+        camera = camera_of(panorama)
+        if camera not in self.cameras:
+            return None
+        height, width = panorama.size_hw
+        mask = self.pixels[self.cameras.index(camera)].astype(np.float32)
+        wrapped = np.concatenate([mask[:, -1:], mask, mask[:, :1]], axis=1)  # so that the seam is interpolated as well
+        columns = (np.arange(width, dtype=np.float32) + 0.5) * mask.shape[1] / width + 0.5
+        rows = (np.arange(height, dtype=np.float32) + 0.5) * mask.shape[0] / height - 0.5
+        at_xy = np.meshgrid(columns, np.clip(rows, 0, mask.shape[0] - 1))
+        return np.asarray(cv2.remap(wrapped, at_xy[0], at_xy[1], cv2.INTER_LINEAR) >= 0.5)
+
+
+def camera_of(panorama: Panorama) -> Camera:
+    """Return what identifies a camera: the sizes of the sphere in its file and here, and the part that it covers."""
+    return (*panorama.source_size_hw, *panorama.covers_ltwh, *panorama.size_hw)

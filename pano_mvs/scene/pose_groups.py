@@ -97,12 +97,7 @@ def require_one_group(pose: Pose, others: Iterable[Pose]) -> None:
 
 
 def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:
-    """Return poses of one group with a subset of its cameras; points with fewer than two of them are removed.
-
-    Args:
-        poses: poses of one group.
-        kept: (N,) the cameras of the subset.
-    """
+    """Return poses of one group with a subset of its cameras; points with fewer than two of them are removed."""
     if kept.all():
         return poses
     seen = np.bincount(poses.track_point_idx[kept[poses.track_image_idx]], minlength=len(poses.points_in_world)) >= 2

@@ -151,11 +151,7 @@ class TwoView(Record):
 
 @dataclass(frozen=True, eq=False)
 class TwoViews(Record):
-    """The two-view geometries of all pairs of a capture, for stages that judge pairs together.
-
-    Attributes:
-        views: pair of image names to its geometry.
-    """
+    """The two-view geometries of all pairs of a capture, for stages that judge pairs together."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
     explodes_into: ClassVar[type[Record] | None] = TwoView

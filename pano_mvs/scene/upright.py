@@ -11,12 +11,30 @@ import re
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.scene.poses import Poses
-from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+
+WORLD_UP: Final = (0.0, -1.0, 0.0)
+"""The up direction of a world that nothing has levelled: −y, that of the first camera."""
+
+_MIN_AGREEMENT = 0.5
+
+
+def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
+    """Return the mean of the cameras' own up directions, −y of each camera, in the world.
+
+    Returns:
+        A unit vector (3,), or None if the cameras do not agree: if the mean of the N unit vectors is not longer than
+        0.5. For two cameras, that is an angle of 120° or more between their up directions.
+    """
+    ups = -np.asarray(rotations, np.float64).reshape(-1, 3, 3)[:, 1]
+    mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > _MIN_AGREEMENT else None
+
 
 _Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
@@ -70,8 +88,5 @@ def y_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
 
     For `up` = −y, it maps (x, y, z) to (x, −y, −z). It agrees with `z_up_from_world` in the way in which programs with
     z up import glTF: (x, y, z) of a file with y up is (x, −z, y) with z up.
-
-    Args:
-        up: (3,) unit vector, the up direction in the world; see `world_up`.
     """
     return np.array(_Y_UP_FROM_Z_UP) @ z_up_from_world(up) + 0.0

@@ -9,7 +9,7 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView
-from pano_mvs.scene.static_masks import StaticMasks
+from pano_mvs.scene.panorama import StaticMasks
 
 _ROLES: Mapping[str, type[Record]] = {
     "images": Panorama,

@@ -40,8 +40,7 @@ from pano_mvs.results.records import (
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView, TwoViews
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.up_direction import mean_up_direction
-from pano_mvs.scene.upright import world_up, z_up_from_world
+from pano_mvs.scene.upright import mean_up_direction, world_up, z_up_from_world
 from pano_mvs.session.camera_height import camera_height, height_note
 from pano_mvs.session.final_stages import chain_of, final_stages, latest
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.scene import PointCloud
-from pano_mvs.share.octree import OctreeNode
+from pano_mvs.share.mesh_file import SharedMesh
 
 _LEVELS = 65535
 
@@ -31,12 +33,7 @@ class LogSteps:
 
 
 def log_steps(values: ArrayLike, dtype: type[np.uint8 | np.uint16]) -> LogSteps:
-    """Return values in logarithmic steps; values that are not finite and positive become step 0.
-
-    Args:
-        values: of any shape.
-        dtype: of the steps; its largest number is the last step.
-    """
+    """Return values in logarithmic steps; values that are not finite and positive become step 0."""
     given = np.asarray(values, np.float64)
     steps = np.zeros(given.shape, dtype)
     valid = np.isfinite(given) & (given > 0)
@@ -79,9 +76,6 @@ def encode_ranges(ranges: NDArray[np.float32]) -> tuple[str, float, float]:
     """Return ranges as base64 of uint16 in logarithmic steps, and the smallest and the largest range.
 
     Step 0 stands for no range. The steps are below 0.01 % of the range for ranges that differ by a factor of up to 500.
-
-    Args:
-        ranges: (H, W) float32; NaN where there is none.
     """
     encoded = log_steps(ranges, np.uint16)
     return encode_arrays(encoded.steps.astype("<u2")), encoded.low, encoded.high
@@ -98,3 +92,156 @@ def encode_png(image: NDArray[np.uint8]) -> str:
     swapped = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     data = cv2.imencode(".png", cv2.cvtColor(image, swapped))[1]
     return base64.b64encode(data.tobytes()).decode("ascii")
+
+
+NODE_POINTS = 30_000
+"""Largest number of points that a node adds."""
+
+_SMALL_CHILD = 500
+_MAX_DEPTH = 20
+_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class OctreeNode:
+    """A cube of the octree.
+
+    Attributes:
+        name: "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z.
+        lower: (3,) float64, the cube's corner with the smallest coordinates.
+        size: length of its edges.
+        chosen: (K,) int64, the points that this node adds, in no order.
+    """
+
+    name: str
+    lower: NDArray[np.float64]
+    size: float
+    chosen: NDArray[np.int64]
+
+
+def octree(points: NDArray[np.float32], *, node_points: int = NODE_POINTS) -> list[OctreeNode]:
+    """Return the nodes of a cloud's octree, parents before their children; each point is in exactly one node."""
+    if not len(points):
+        return []
+    lower = points.min(axis=0).astype(np.float64)
+    size = float((points.max(axis=0) - lower).max()) * (1 + 1e-6) or 1.0
+    order = np.random.default_rng(_SEED).permutation(len(points)).astype(np.int64)
+    nodes: list[OctreeNode] = []
+    pending = [("r", lower, size, order)]
+    while pending:
+        name, lower, size, inside = pending.pop(0)
+        if len(inside) <= node_points + _SMALL_CHILD or len(name) > _MAX_DEPTH:
+            nodes.append(OctreeNode(name, lower, size, inside))
+            continue
+        half = size / 2
+        rest = inside[node_points:]
+        octants = (points[rest] >= lower + half) @ np.array([1, 2, 4])
+        kept = [inside[:node_points]]
+        for octant in range(8):
+            child = rest[octants == octant]
+            if len(child) < _SMALL_CHILD:  # a file of its own would not pay
+                kept.append(child)
+            else:
+                corner = lower + half * np.array([octant & 1, octant >> 1 & 1, octant >> 2 & 1])
+                pending.append((f"{name}{octant}", corner, half, child))
+        nodes.append(OctreeNode(name, lower, size, np.concatenate(kept)))
+    return nodes
+
+
+PIECE_FACES = 20_000
+"""Largest number of triangles of a piece; even if no two share a corner, two bytes count its vertices."""
+
+_Z_BITS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class VertexFacts:
+    """What the page knows of vertices besides their place and colour.
+
+    Attributes:
+        sigma_steps: (V,) uint8 steps of the standard deviation of the position; 0 if unknown.
+        view_counts: (V,) uint8 number of views that agree on the surface there.
+    """
+
+    sigma_steps: NDArray[np.uint8]
+    view_counts: NDArray[np.uint8]
+
+
+def mesh_pieces(mesh: SharedMesh, facts: VertexFacts) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield the pieces of a mesh: what the page needs to know of it, and its arrays as base64.
+
+    The arrays are places within a cube (V, 3) uint16, places in the texture (V, 2) uint16 if there is one, corners
+    (F, 3) uint16, colours (V, 3) uint8 if there is no texture, steps of the standard deviation (V,) uint8 and view
+    counts (V,) uint8.
+    """
+    for chosen in _divided(mesh):
+        used, corners = _by_first_use(mesh.faces[chosen])
+        vertices = mesh.vertices[used]
+        lower = vertices.min(axis=0).astype(np.float64)
+        size = float((vertices.max(axis=0) - lower).max()) * (1 + 1e-6) or 1.0
+        parts: list[NDArray[np.generic]] = [quantised(vertices, lower, size)]
+        if mesh.uv is not None:
+            parts.append(np.rint(mesh.uv[used].clip(0, 1) * 65535).astype("<u2"))
+        parts.append(corners.astype("<u2"))
+        if mesh.colors_rgb is not None:
+            parts.append(mesh.colors_rgb[used])
+        parts += [facts.sigma_steps[used], facts.view_counts[used]]
+        described = {"lower": lower.tolist(), "size": size, "vertices": len(used), "faces": len(chosen)}
+        yield described, encode_arrays(*parts)
+
+
+def _by_first_use(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Return the vertices that faces use, in the order of their first use, and the faces' corners among them."""
+    used, first, corners = np.unique(faces, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order))
+    return used[order], rank[corners.reshape(faces.shape)]
+
+
+def _divided(mesh: SharedMesh) -> Iterator[NDArray[np.int64]]:
+    """Yield the triangles of each piece.
+
+    They follow a Z-order curve, so that a piece is compact, and triangles that share corners are near each other in the
+    order of drawing, which spares graphics processors to compute the corners again.
+    """
+    centers = mesh.vertices[mesh.faces].mean(axis=1)
+    order = np.argsort(z_order(centers), kind="stable")
+    for first in range(0, len(order), PIECE_FACES):
+        yield order[first : first + PIECE_FACES]
+
+
+def z_order(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the positions of points (N, 3) along a Z-order curve through their cube (N,), in 2^10 cells per side."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    lower = points.min(axis=0)
+    size = float(np.ptp(points, axis=0).max()) or 1.0
+    cells = ((points - lower) / size * (1 << _Z_BITS)).astype(np.int64).clip(0, (1 << _Z_BITS) - 1)
+    codes = np.zeros(len(points), np.int64)
+    for bit in range(_Z_BITS):
+        for axis in range(3):
+            codes |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return codes
+
+
+TILE = 1024
+"""Width of a tile in pixels: level 0 is one tile of 1024 x 512, level L is 2^L columns by 2^(L-1) rows."""
+
+
+def level_count(width: int, max_width: int) -> int:
+    """Return how many levels a panorama has: the last one is not wider than the panorama, unless it is the only one."""
+    return max(0, int(np.log2(min(width, max_width) / TILE))) + 1
+
+
+def panorama_tiles(image: NDArray[np.uint8], levels: int) -> Iterator[tuple[int, int, int, NDArray[np.uint8]]]:
+    """Yield (level, column, row, pixels) of all tiles."""
+    for level in range(levels):
+        width = TILE << level
+        shrinks = width < image.shape[1]
+        scaled = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+        height = min(TILE, width // 2)
+        for row in range(width // 2 // height):
+            for column in range(1 << level):
+                tile = scaled[row * height : (row + 1) * height, column * TILE : (column + 1) * TILE]
+                yield level, column, row, np.asarray(tile, np.uint8)

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh
+from pano_mvs.io.ply import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.up_direction import WORLD_UP
-from pano_mvs.scene.upright import world_up, y_up_from_world
+from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 from pano_mvs.share.glb_file import read_glb
 
 TEXTURED = "mesh_textured.glb"
@@ -49,9 +48,6 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
 
     Files that an earlier run left behind are not used.
 
-    Args:
-        run: the output of a run.
-
     Returns:
         The mesh, or None if there is none or it cannot be read; and what the reader of the page should know, or "".
     """
@@ -74,10 +70,6 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
 
     A textured mesh is returned as it is, because the places in its texture would be lost; `export.mesh_textured`
     thins the mesh before it is unwrapped.
-
-    Args:
-        mesh: the mesh.
-        max_faces: number of triangles.
     """
     if mesh.texture is not None or max_faces >= len(mesh.faces):
         return mesh, ""

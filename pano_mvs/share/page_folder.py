@@ -67,22 +67,14 @@ class PageFolder:
         self.written: dict[str, int] = {}
 
     def put(self, key: str, value: Any) -> None:
-        """Write one piece of data; `value` is anything that JSON can hold.
-
-        Raises:
-            StoreError: if it cannot be written.
-        """
+        """Write one piece of data; `value` is anything that JSON can hold."""
         path = f"data/{key}.js"
         text = f"PanoMvs.receive({json.dumps(key)}, {_json(value)});\n"
         write_text(self.folder / path, text)
         self.written[path] = len(text.encode())
 
     def finish(self, title: str, *, max_single_file_bytes: int) -> Path | None:
-        """Write the page itself; return the single file, or None if it would be larger than the limit.
-
-        Raises:
-            StoreError: if a file cannot be written.
-        """
+        """Write the page itself; return the single file, or None if it would be larger than the limit."""
         for name in (*SCRIPTS, "page.css", "three.LICENSE.txt"):
             write_text(self.folder / name, _resource(name))
         write_text(self.folder / "index.html", _page(title, scripts=(), style=""))

@@ -11,26 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunView
 from pano_mvs.scene import PointCloud
 from pano_mvs.share.encoding import (
     LogSteps,
+    VertexFacts,
     encode_arrays,
     encode_jpeg,
     encode_png,
     encode_points,
     encode_ranges,
+    level_count,
     log_steps,
+    mesh_pieces,
+    octree,
+    panorama_tiles,
 )
+from pano_mvs.share.maps import MapPlace, StoreyMap, cut_height, place_around, top_view
 from pano_mvs.share.mesh_file import SharedMesh
-from pano_mvs.share.mesh_pieces import VertexFacts, mesh_pieces
-from pano_mvs.share.octree import octree
-from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.plan_file import StoreyMap
-from pano_mvs.share.tiles import level_count, panorama_tiles
-from pano_mvs.share.top_view import MapPlace, cut_height, place_around, top_view
 
 RANGES_HW = (256, 512)
 """Size of the range map that the page walks and measures on."""
@@ -39,14 +40,41 @@ MAX_TEXTURE = 4096
 """Largest width and height of the texture of a mesh, which all graphics processors in use can hold."""
 
 
-@dataclass(frozen=True, eq=False)
-class ShownCloud:
-    """A cloud as the page shows it.
+@dataclass(frozen=True)
+class ShareOptions:
+    """What a shared page contains.
 
     Attributes:
-        cloud: thinned, in the frame of the page.
-        sigmas: standard deviations of its points in logarithmic steps.
+        title: heading of the page; empty for the name of the output folder.
+        max_points: largest number of points of the cloud; 0 for none. Those kept are drawn at random.
+        max_triangles: about the largest number of triangles of a mesh without texture; 0 for no mesh.
+        max_width: largest width of a panorama in pixels, at least 1024.
+        jpeg_quality: of the panoramas, 1 to 100.
+        max_single_file_bytes: size up to which everything is also written as one HTML file.
     """
+
+    title: str = ""
+    max_points: int = 5_000_000
+    max_triangles: int = 300_000
+    max_width: int = 4096
+    jpeg_quality: int = 85
+    max_single_file_bytes: int = 40_000_000
+
+    def __post_init__(self) -> None:
+        """Raise UsageError if an option is out of its range."""
+        if self.max_points < 0:
+            raise UsageError(f"--points {self.max_points}: give a number of points, or 0 for none")
+        if self.max_triangles < 0:
+            raise UsageError(f"--triangles {self.max_triangles}: give a number of triangles, or 0 for no mesh")
+        if self.max_width < 1024:
+            raise UsageError(f"--width {self.max_width}: panoramas need at least 1024 pixels")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise UsageError(f"--quality {self.jpeg_quality}: give 1 to 100")
+
+
+@dataclass(frozen=True, eq=False)
+class ShownCloud:
+    """A cloud as the page shows it."""
 
     cloud: PointCloud
     sigmas: LogSteps
@@ -60,13 +88,7 @@ class ShownCloud:
 
 
 def shown_cloud(cloud: PointCloud | None, frame: Rigid3, *, max_points: int) -> ShownCloud:
-    """Return a cloud with at most `max_points` points, drawn at random, in the frame of the page.
-
-    Args:
-        cloud: of one group; None for an empty one.
-        frame: page_from_world.
-        max_points: the largest number of points.
-    """
+    """Return a cloud with at most `max_points` points, drawn at random, in the frame of the page."""
     if cloud is None:
         empty = np.zeros((0, 3), np.float32)
         cloud = PointCloud(empty, empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8))
@@ -121,14 +143,7 @@ def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_qual
 def put_maps(
     page: PageFolder, shown: ShownCloud, plans: Sequence[StoreyMap], *, centers: NDArray[np.float64]
 ) -> list[dict[str, Any]]:
-    """Write the floor plans, or without them the cloud from above; return where they lie.
-
-    Args:
-        page: the page.
-        shown: the cloud, which also gives the coverage.
-        plans: of the storeys; may be empty.
-        centers: (N, 3) of the cameras in the page.
-    """
+    """Write the floor plans, or without them the cloud from above; return where they lie."""
     if plans:
         return [
             _put_map(page, number, plan.place, colors=encode_png(plan.picture), shown=shown, heights=plan.heights)

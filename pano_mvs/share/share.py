@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,35 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import PointCloud, Poses
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.upright import states_y_down
-from pano_mvs.share.frame import page_from_world
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
+from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
-from pano_mvs.share.options import ShareOptions
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.plan_file import run_plans
-from pano_mvs.share.scene_parts import RANGES_HW, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
+from pano_mvs.share.scene_parts import RANGES_HW, ShareOptions, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
+
+
+def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:
+    """Return the transform into the frame of the page.
+
+    Args:
+        cameras: the poses, cam_from_world. Up is the cameras' common up direction, or -y of the world if they were
+            turned at random.
+        is_level: whether y of the world points down along gravity, so that -y is up whatever the cameras say.
+    """
+    common = mean_up_direction([camera.rotation for camera in cameras]) if cameras and not is_level else None
+    up = np.array(WORLD_UP) if common is None else common
+    ahead = cameras[0].rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(np.eye(3)[int(np.argmin(np.abs(up)))], up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, up, np.cross(right, up)])
+    centers = np.array([camera.center for camera in cameras]).reshape(-1, 3)
+    origin = np.median(centers, axis=0) if len(centers) else np.zeros(3)
+    return Rigid3(rotation, -rotation @ origin)
+
 
 _INTERRUPTED = 130
 

@@ -3,15 +3,13 @@
 They are registered through the entry point `pano_mvs.plugins`, like stages of plugins.
 """
 
-from pano_mvs.stages.depth import sweep
+from pano_mvs.stages.depth import exchange, nearest, patchmatch, plain_surfaces, sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
-from pano_mvs.stages.exports.files import ply, previews, ranges
+from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges
 from pano_mvs.stages.exports.floor_plan import floor_plan
-from pano_mvs.stages.exports.mesh import mesh
-from pano_mvs.stages.exports.mesh_textured import mesh_textured
+from pano_mvs.stages.exports.mesh import mesh, mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
-from pano_mvs.stages.exports.poses import poses_files
 from pano_mvs.stages.exports.splat_bundle import splat_bundle, splat_frames
 from pano_mvs.stages.exports.tour import panoramas, tour_of_panoramas
 from pano_mvs.stages.features import aliked, orb_tangent, sift_tangent, sphorb
@@ -25,27 +23,24 @@ from pano_mvs.stages.filters import (
     guided,
     median,
     planes,
+    prior,
     scale_ranges,
+    scene_planes,
+    sky,
     speckle,
+    structure,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.fusion import photographs, scale_cloud, vote
+from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge, weak
 from pano_mvs.stages.pairs import automatic, exhaustive, learned, position, retrieval, sequential, vlad
-from pano_mvs.stages.patchmatch import exchange, patchmatch, plain_surfaces
-from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.poses_localise import localise
-from pano_mvs.stages.rigs.dual_fisheye import dual_fisheye
-from pano_mvs.stages.rigs.exports import colmap_lenses
-from pano_mvs.stages.sky import sky
-from pano_mvs.stages.source import folder
-from pano_mvs.stages.source_tour import tour
+from pano_mvs.stages.rigs import colmap_lenses, dual_fisheye
+from pano_mvs.stages.source import folder, tour
 from pano_mvs.stages.source_video import video
-from pano_mvs.stages.structure import prior, scene_planes, structure
-from pano_mvs.stages.views import nearest
 
 __all__ = [
     "aliked",

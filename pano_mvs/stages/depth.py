@@ -7,27 +7,36 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from pano_mvs.algorithms.patchmatch.exchange import SourceView, exchange_ranges
+from pano_mvs.algorithms.patchmatch.refine import refine_range
+from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale, refine_plain_surfaces
 from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, ranges_of_levels, reduced, sharp_halvings
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
+from pano_mvs.algorithms.views import select_views
 from pano_mvs.api import (
     NOT_IN_KEY,
     Context,
     Each,
     Near,
+    One,
     Panorama,
     Params,
     Pose,
+    Poses,
     RangeMap,
     RegisteredIn,
+    Views,
+    arguments_from,
     params_from,
     settings_from,
     stage,
 )
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene.pose_groups import require_one_group
+from pano_mvs.stages.filters import bytes_per_pixel
 
 _PICTURE_BYTES, _RESULT_BYTES = 16, 40
 
@@ -124,3 +133,126 @@ def sweep(
     ctx.metric("near", near)
     ctx.metric("far", far)
     return range_map
+
+
+@params_from(select_views)
+class NearestParams(Params):
+    """Settings of views.nearest."""
+
+
+@stage("views.nearest")
+def nearest(poses: One[Poses], params: NearestParams, ctx: Context) -> Views:
+    """Choose images that see the same points from sufficiently different positions, best first."""
+    views = select_views(poses, **arguments_from(select_views, params))
+    for name in poses.names:
+        if name not in views.neighbours:
+            ctx.reject(name, "no other image was taken from a different position nearby")
+    return views
+
+
+@params_from(refine_range)
+class PatchMatchParams(Params):
+    """Settings of depth.patchmatch."""
+
+    scale: Literal["sharp", "nominal"] = Field(
+        default="sharp", description="where to begin: the resolution at which the panorama is sharp, or its own"
+    )
+    multiscale: bool = Field(
+        default=True,
+        description="refine panoramas of 2048 columns and more also at half the resolution, down to 1024 columns, for "
+        "what shows only noise at the full one; not with scale: nominal",
+    )
+
+
+@stage("depth.patchmatch", memory=bytes_per_pixel(140, each_source=20))
+def patchmatch(
+    range_map: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[Panorama],
+    source_poses: Near[Pose],
+    params: PatchMatchParams,
+    ctx: Context,
+) -> RangeMap:
+    """Fit slanted planes to the ranges and move them to where the images match best; also gives normals."""
+    require_one_group(pose, source_poses)
+    reference = ref.load()
+    is_nominal = params.scale == "nominal"
+    refined = refine_at_scale(
+        range_map,
+        reference,
+        [source.load() for source in sources],
+        source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
+        source_masks=[source.load_mask() for source in sources],
+        halvings=0 if is_nominal else sharp_halvings(reference),
+        levels=coarser_levels(ref.size_hw) if params.multiscale and not is_nominal else 0,
+        **arguments_from(refine_range, params),
+    )
+    ctx.metric("completeness", float(refined.valid.mean()))
+    ctx.metric("sources", len(sources))
+    return refined
+
+
+@stage("depth.plain_surfaces", memory=bytes_per_pixel(150, each_source=20))
+def plain_surfaces(
+    range_map: Each[RangeMap],
+    filtered: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[Panorama],
+    source_poses: Near[Pose],
+    params: PatchMatchParams,
+    ctx: Context,
+) -> RangeMap:
+    """Refine pixels without texture again where filters changed their ranges; all other pixels keep theirs.
+
+    `range_map` comes from depth.patchmatch, `filtered` from a consistency check and filters after it.
+    """
+    require_one_group(pose, source_poses)
+    reference = ref.load()
+    refined, share = refine_plain_surfaces(
+        range_map,
+        filtered,
+        reference,
+        sources=[source.load() for source in sources],
+        source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
+        source_masks=[source.load_mask() for source in sources],
+        halvings=sharp_halvings(reference) if params.scale == "sharp" else 0,
+        **arguments_from(refine_range, params),
+    )
+    ctx.metric("completeness", float(refined.valid.mean()))
+    ctx.metric("refined", share)
+    ctx.metric("sources", len(sources))
+    return refined
+
+
+@params_from(exchange_ranges)
+class ExchangeParams(Params):
+    """Settings of depth.exchange."""
+
+
+@stage("depth.exchange", memory=bytes_per_pixel(205, each_source=40))
+def exchange(
+    range_map: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[RangeMap],
+    source_images: Near[Panorama],
+    source_poses: Near[Pose],
+    params: ExchangeParams,
+    ctx: Context,
+) -> RangeMap:
+    """Give unconfirmed pixels the nearer ranges that other views found, where the images match better.
+
+    Follow it with filters.consistency that compares with the ranges before the exchange (`in: {sources: ...}`):
+    otherwise, exchanged ranges confirm each other.
+    """
+    require_one_group(pose, source_poses)
+    views = [
+        SourceView(image.load(), source, other.cam_from_world @ pose.cam_from_world.inverse(), image.load_mask())
+        for source, image, other in zip(sources, source_images, source_poses, strict=True)
+    ]
+    exchanged, share = exchange_ranges(range_map, ref.load(), views, **arguments_from(exchange_ranges, params))
+    ctx.metric("exchanged", share)
+    ctx.metric("sources", len(sources))
+    return exchanged

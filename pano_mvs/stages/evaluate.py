@@ -24,7 +24,7 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
     aligned with the truth on its own; pairs across groups count as not registered.
     """
     from pano_mvs.evaluation.capture import score_capture  # the package takes 0.1 s to import
-    from pano_mvs.evaluation.inputs.truth import read_truth
+    from pano_mvs.evaluation.inputs import read_truth
 
     known = read_truth(params.truth)
     notes: list[str] = []

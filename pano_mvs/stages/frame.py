@@ -173,11 +173,7 @@ def unit_translations(poses: One[Poses], params: UnitTranslationsParams) -> Pose
 def _scaled(
     poses: Poses, groups: list[Poses], chosen: list[int], *, scaled: Callable[[Poses], Poses], ctx: Context
 ) -> Poses:
-    """Return all groups, with the chosen ones scaled if possible.
-
-    Raises:
-        InputError: the error of the first chosen group, if none can be scaled.
-    """
+    """Return all groups, with the chosen ones scaled if possible."""
     found, refused = list(groups), {}
     for number in chosen:
         try:
@@ -197,11 +193,7 @@ def _scaled(
 
 
 def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
-    """Return the number of the group that contains both images; None if one of them is in no group.
-
-    Raises:
-        InputError: if they are in different groups.
-    """
+    """Return the number of the group that contains both images; None if one of them is in no group."""
     homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
     if len(homes) < 2:
         return None

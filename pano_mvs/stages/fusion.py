@@ -12,22 +12,27 @@ from pydantic import Field
 from pano_mvs.algorithms.fusion.fuse import fuse_stream
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
+from pano_mvs.algorithms.points.tracking import sample_surface, track_points
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.api import (
     All,
     Context,
+    Each,
     One,
     Panorama,
     Params,
     PointCloud,
     Pose,
+    Poses,
     RangeMap,
+    arguments_from,
     params_from,
     settings_from,
     stage,
 )
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
+from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 
 
 @params_from(FusionSettings)
@@ -154,3 +159,40 @@ def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
         f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
         "min_views"
     )
+
+
+@params_from(sample_surface)
+class SurfaceParams(Params):
+    """Settings of points.surface."""
+
+
+@stage("points.surface")
+def surface(image: Each[Panorama], range_map: Each[RangeMap], params: SurfaceParams, ctx: Context) -> SurfaceSamples:
+    """Sample the surfaces that each view sees, evenly over its sphere, as input of points.tracked."""
+    samples = sample_surface(image.load(), image.load_mask(), range_map, **arguments_from(sample_surface, params))
+    ctx.metric("points", len(samples))
+    return samples
+
+
+@params_from(track_points)
+class TrackedParams(Params):
+    """Settings of points.tracked."""
+
+
+@stage("points.tracked")
+def tracked(
+    poses: One[Poses], samples: All[SurfaceSamples], ranges: All[RangeMap], params: TrackedParams, ctx: Context
+) -> TrackedPoints:
+    """Select evenly distributed points with the views that see them: initial points for splats, tracks for COLMAP."""
+    settings = arguments_from(track_points, params)
+    settings["min_views"] = min(settings["min_views"], len(samples))
+    usable = {name: samples[name] for name in samples if name in ranges}
+    points = track_points(usable, poses, ranges.__getitem__, rng=ctx.rng, **settings)
+    ctx.metric("points", len(points))
+    ctx.metric("views_per_point", len(points.track_point_idx) / max(len(points), 1))
+    if len(points) < settings["count"]:
+        ctx.note(
+            f"only {len(points)} of {settings['count']} points: the range maps contain no more reliable ones. Raise "
+            "`count` of points.surface, or lower its `min_confidence`"
+        )
+    return points

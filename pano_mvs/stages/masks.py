@@ -29,7 +29,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
-from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
+from pano_mvs.scene.panorama import Camera, StaticMasks, camera_of
 
 
 @params_from(areas_of_color)

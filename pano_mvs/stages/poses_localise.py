@@ -35,9 +35,8 @@ from pano_mvs.api import (
 )
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, files_below, list_pictures
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.exif import focal_from_exif
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.io.images.metadata import focal_from_exif, read_container
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.record import FilePart

@@ -6,18 +6,25 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
-from pano_mvs.api import NOT_IN_KEY, Context, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.images.captures import FACES, PictureInfo, describe_picture, list_pictures, list_scenes
 from pano_mvs.io.images.copies import Copy, find_copies
-from pano_mvs.io.images.mask_files import find_mask, require_masks
-from pano_mvs.io.images.names import printable_name
-from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
-from pano_mvs.scene.image_files.header import stated_size_of_file
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.io.images.names import find_mask, printable_name, require_masks
+from pano_mvs.scene.image_file import (
+    MASK_BYTES_PER_PIXEL,
+    MAX_PIXELS,
+    decode_image,
+    decoding_bytes_per_pixel,
+    write_png,
+)
+from pano_mvs.scene.image_header import stated_size_of_file
 
 
 class FolderParams(Params):
@@ -167,3 +174,67 @@ def _is_mask(path: Path, params: FolderParams) -> bool:
     """Return whether an image found among the panoramas is one of their masks."""
     masks, mask = (given and given.absolute() for given in (params.masks, params.mask))
     return path.absolute() == mask or (masks is not None and path.absolute().is_relative_to(masks))
+
+
+class TourParams(Params):
+    """Settings of source.tour."""
+
+    path: SourcePath = Field(description="folder of the tour, searched recursively")
+    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight down (tripod)")
+    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
+    max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
+
+
+def list_tour(params: TourParams) -> Iterator[SourceItem]:
+    """List the scenes of a tour."""
+    notes: list[str] = []
+    scenes = list_scenes(params.path, notes)
+    if len(scenes) < 2:
+        raise InputError(f"{params.path}: contains only one scene ({scenes[0].name}); depth needs two or more")
+    for scene in scenes:
+        files = {f"{face}_{row}_{column}": path for (face, row, column), path in scene.tiles.items()}
+        yield SourceItem(f"{scene.name}.png", files, notes=tuple(notes))
+
+
+@source("source.tour", list_items=list_tour, memory="1GB")
+def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
+    """Read the panoramas of a virtual tour from the tiles of their cubes, in the finest resolution.
+
+    Known are the tiles of Marzipano, Pannellum and krpano, and six files for each scene. The panoramas are stored
+    without loss, as `<scene>.png`, with the front face in the middle.
+    """
+    faces = {face: _joined(item, face) for face in FACES}
+    side = faces["f"].shape[0]
+    width = min(params.max_width, 4 * side) // 4 * 4
+    kept = ctx.scratch / "panorama.png"
+    write_png(kept, panorama_from_cube(faces, width))
+    size_hw = width // 2, width
+    ctx.metric("face_px", side)
+    return Panorama(
+        image=FilePart(kept),
+        size_hw=size_hw,
+        source_size_hw=size_hw,
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+    )
+
+
+def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:
+    """Return a face from its tiles."""
+    tiles = {tuple(map(int, key.split("_")[1:])): key for key in item.files if key.startswith(f"{face}_")}
+    rows = [
+        [_picture(item, tiles[row, column]) for column in sorted({column for _, column in tiles})]
+        for row in sorted({row for row, _ in tiles})
+    ]
+    try:
+        return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
+    except ValueError as error:
+        place = item.file(tiles[0, 0]).path
+        raise InputError(
+            f"{place}: this tile and those beside it do not fit together. Export the tour again"
+        ) from error
+
+
+def _picture(item: SourceItem, key: str) -> NDArray[np.uint8]:
+    file = item.file(key)
+    return decode_image(file.path, file.read_bytes())

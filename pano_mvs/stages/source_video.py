@@ -24,7 +24,7 @@ from pano_mvs.io.images.keyframe_file import keyframe_file, read_times, store_ti
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.source import working_size
 
 # Motion is measured in at most this number of frames per second.
@@ -157,11 +157,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
 
 
 def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:
-    """Yield the videos with their names relative to the capture, without suffix where that is unambiguous.
-
-    Raises:
-        InputError: if two videos of a list have the same name.
-    """
+    """Yield the videos with their names relative to the capture, without suffix where that is unambiguous."""
     named: dict[str, Path] = {}
     for path in params.path if isinstance(params.path, list) else [params.path]:
         base = path if is_folder(path) else path.parent
@@ -255,11 +251,7 @@ def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
 def _best_frame(
     path: Path, time_s: float, params: VideoParams, *, info: VideoInfo, threads: int
 ) -> tuple[float, float, NDArray[np.uint8]]:
-    """Return the time, the sharpness and the image (BGR) of the frame to use around a time.
-
-    Raises:
-        InputError: if there is no frame that can be decoded.
-    """
+    """Return the time, the sharpness and the image (BGR) of the frame to use around a time."""
     reach_s = params.reach_s(info)
     best: tuple[float, float, NDArray[np.uint8]] | None = None
     least = np.inf

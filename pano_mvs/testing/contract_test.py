@@ -8,12 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ContractTest:
-    """A test of a contract.
-
-    Attributes:
-        name: what is tested.
-        check: raises AssertionError if the contract is broken; any other exception counts as a failure, too.
-    """
+    """A test of a contract."""
 
     name: str
     check: Callable[[], None]

@@ -4,7 +4,15 @@
     picture, true_range = scene.view(0, (256, 512))
 
 All lengths can be read as metres. Unless `turned=False`, every camera, but no place, is rotated arbitrarily. The images
-have sensor noise, drawn separately for each view.
+have sensor noise, drawn separately for each view. All scenes take the same settings:
+
+Args:
+    seed: seed of textures, cameras and exposures.
+    views: number of cameras.
+    turned: whether every camera is rotated arbitrarily.
+    exposure: standard deviation of the logarithm of the gain of each view and colour; 0.15 is large. Offsets have a
+        standard deviation of 40 grey levels times this value.
+    sky: one of `SKIES`.
 """
 
 from __future__ import annotations
@@ -17,27 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.testing.courtyard import courtyard_surfaces
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Texture
 from pano_mvs.testing.room import Room, default_room, render, write_views
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod, Surface, Vector
-from pano_mvs.testing.window_room import window_room_surfaces
-from pano_mvs.testing.yard import yard_surfaces
-
-__all__ = [
-    "SCENES",
-    "SKIES",
-    "Scene",
-    "corridor",
-    "courtyard",
-    "desk",
-    "large_plain_room",
-    "poles",
-    "white_room",
-    "window_room",
-    "write_scene",
-    "yard",
-]
 
 Painted = tuple[Surface, Texture]
 
@@ -85,67 +75,18 @@ class Scene:
 def courtyard(
     *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "cloudy"
 ) -> Scene:
-    """Return a paved court of 24 × 78 under an open sky: facades, columns, trees, a van; ranges from 1.4 to 60.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 1.2 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: standard deviation of the logarithm of the gain of each view and colour; 0.15 is large. Offsets have a
-            standard deviation of 40 grey levels times this value.
-        sky: one of `SKIES`.
-    """
-    surfaces: list[Painted] = [(surface, "outdoor") for surface in courtyard_surfaces()]
-    room = _painted("outdoor", surfaces, seed=seed, lamp=(30.0, -80.0, 25.0), sky=sky)
-    return _scene(
+    """Return a paved court of 24 × 78 under an open sky: facades, columns, trees, a van; ranges from 1.4 to 60."""
+    surfaces: list[Painted] = [
+        (surface, "outdoor") for surface in (*_buildings(), *_arcade(), *_trees(), *_street_furniture())
+    ]
+    room = painted("outdoor", surfaces, seed=seed, lamp=(30.0, -80.0, 25.0), sky=sky)
+    return placed(
         "courtyard", room, views=views, turned=turned, spread=(1.2, 0.25, 1.2), exposure=exposure, outdoor=True
     )
 
 
-def yard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "blue") -> Scene:
-    """Return a yard of 60 × 60 under an open sky that is seen behind branches, through windows and between slats.
-
-    It is not one of `SCENES`, since the branches take long to render.
-
-    Args:
-        seed: seed of trees, textures, cameras and exposures.
-        views: number of cameras, about 0.8 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-        sky: one of `SKIES`.
-    """
-    surfaces: list[Painted] = [(surface, "outdoor") for surface in yard_surfaces(seed)]
-    room = _painted("yard", surfaces, seed=seed, lamp=(-20.0, -60.0, -30.0), sky=sky)
-    return _scene("yard", room, views=views, turned=turned, spread=(0.8, 0.2, 0.8), exposure=exposure, outdoor=True)
-
-
-def window_room(
-    *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "overcast"
-) -> Scene:
-    """Return a room of 6 × 2.8 × 5 with white walls, a balcony door and two windows, through which the sky is seen.
-
-    It is not one of `SCENES`, since its sky is for `filters.sky` alone.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.6 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-        sky: one of `SKIES`.
-    """
-    room = _painted("windows", list(window_room_surfaces()), seed=seed, lamp=(0.4, -1.2, 0.3), sky=sky)
-    return _scene("window_room", room, views=views, turned=turned, spread=(0.7, 0.25, 0.7), exposure=exposure)
-
-
 def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return a room of 6 × 2.8 × 5 with plain walls, ceiling and doors, and texture on the floor and furniture.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.6 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-    """
+    """Return a room of 6 × 2.8 × 5 with plain walls, ceiling and doors, and texture on the floor and furniture."""
     surfaces: list[Painted] = [
         (Cuboid((-3.0, -1.5, -2.5), (3.0, 1.3, 2.5), WHITE), "none"),
         (Quad((-3.0, 1.299, -2.5), (6.0, 0.0, 0.0), (0.0, 0.0, 5.0), OAK), "strong"),
@@ -160,19 +101,12 @@ def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: 
         (Ball((2.2, 0.3, -1.7), 0.2, RED), "strong"),
         (Ball((0.9, 1.05, 1.7), 0.25, LEAVES), "strong"),
     ]
-    room = _painted("white", surfaces, seed=seed, lamp=(0.4, -1.2, 0.3))
-    return _scene("white_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
+    room = painted("white", surfaces, seed=seed, lamp=(0.4, -1.2, 0.3))
+    return placed("white_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
 
 
 def poles(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return the furnished room with 26 rods, upright, leaning and level, most of them 2–4 px thick at 1024×512.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.5 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-    """
+    """Return the furnished room with 26 rods, upright, leaning and level, most of them 2–4 px thick at 1024×512."""
     rng = np.random.default_rng([seed, 0xB0])
     surfaces: list[Painted] = [(surface, "strong") for surface in default_room().surfaces]
     for number in range(26):
@@ -185,20 +119,14 @@ def poles(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float
         # A pixel of 1024×512 is 6.1 mrad.
         radius = 0.5 * rng.uniform(2, 4) * 2 * np.pi / 1024 * distance
         surfaces.append((Rod(foot, head, float(radius), (STEEL, RED, OAK)[number % 3]), "strong"))
-    room = _painted("poles", surfaces, seed=seed, lamp=(0.4, -1.2, 0.3))
-    return _scene("poles", room, views=views, turned=turned, spread=(0.5, 0.25, 0.5), exposure=exposure)
+    room = painted("poles", surfaces, seed=seed, lamp=(0.4, -1.2, 0.3))
+    return placed("poles", room, views=views, turned=turned, spread=(0.5, 0.25, 0.5), exposure=exposure)
 
 
 def corridor(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
     """Return a corridor of 1.9 × 2.5 × 26 with doors, lamps and pipes, and a row of cameras along it.
 
     The baselines are parallel to the corridor: its far end is near the epipoles, where range is difficult to measure.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, 0.6–0.9 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
     """
     surfaces: list[Painted] = [
         (Cuboid((-0.95, -1.1, -8.0), (0.95, 1.4, 18.0), STONE), "weak"),
@@ -212,11 +140,11 @@ def corridor(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: fl
         frame = (min(side, 0.9 * side), -0.65, z), (max(side, 0.9 * side), 1.4, z + 0.9)
         surfaces.append((Cuboid(*frame, (OAK, BLUE, BRICK)[number % 3]), "strong"))
         surfaces.append((Cuboid((-0.3, -1.1, z + 1.6), (0.3, -1.03, z + 1.8), WHITE), "none"))
-    room = _painted("corridor", surfaces, seed=seed, lamp=(0.2, -1.0, 2.0))
+    room = painted("corridor", surfaces, seed=seed, lamp=(0.2, -1.0, 2.0))
     rng = np.random.default_rng([seed, 0xC0])
     along = np.concatenate([[0.0], np.cumsum(rng.uniform(0.6, 0.9, max(0, views - 1)))])
     centers = np.stack([rng.uniform(-0.15, 0.15, views), rng.uniform(-0.1, 0.1, views), along], axis=1)
-    return _scene("corridor", room, views=views, turned=turned, centers=centers, exposure=exposure)
+    return placed("corridor", room, views=views, turned=turned, centers=centers, exposure=exposure)
 
 
 def desk(
@@ -231,14 +159,6 @@ def desk(
     """Return a room of 6 × 2.9 × 5 with cameras 0.42 above a large desk: the baselines are longer than that.
 
     Straight below the cameras, most sources see the desk at 45–80° from the reference's direction.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.9 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-        reach: factor of the distances between the cameras; with 1.6, the desk is at 0.2 to 0.5 baselines.
-        top: texture of the desk top.
     """
     surfaces: list[Painted] = [
         (Cuboid((-3.0, -1.7, -2.5), (3.0, 1.2, 2.5), STONE), "strong"),
@@ -253,80 +173,15 @@ def desk(
     surfaces += [
         (Rod((x, 0.46, z), (x, 1.2, z), 0.04, OAK), "strong") for x, z in ((-1.6, -0.9), (1.6, -0.9), (1.6, 0.9))
     ]
-    room = _painted("desk", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
+    room = painted("desk", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
     spread = 0.9 * reach, 0.06 * reach, 0.6 * reach
-    return _scene("desk", room, views=views, turned=turned, spread=spread, exposure=exposure)
-
-
-def plain_table(
-    *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, height: float = 0.4
-) -> Scene:
-    """Return a room of 6 × 2.9 × 5 with cameras above a large table that has hardly any texture, and nothing on it.
-
-    All other surfaces are farther away. It is not one of `SCENES`, since it is for near limits alone.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.9 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-        height: of the cameras above the table.
-    """
-    surfaces: list[Painted] = [
-        (Cuboid((-3.0, -1.7, -2.5), (3.0, 1.2, 2.5), STONE), "strong"),
-        (Cuboid((-1.6, height, -1.1), (1.6, height + 0.04, 1.1), OAK), "faint"),
-        (Cuboid((2.0, 0.3, -2.4), (2.8, 1.2, -1.0), BLUE), "strong"),
-        (Cuboid((-2.8, -0.3, 1.4), (-2.0, 1.2, 2.4), BRICK), "strong"),
-    ]
-    room = _painted("table", surfaces, seed=seed, lamp=(0.4, -1.4, 0.3))
-    return _scene("plain_table", room, views=views, turned=turned, spread=(0.9, 0.06, 0.6), exposure=exposure)
+    return placed("desk", room, views=views, turned=turned, spread=spread, exposure=exposure)
 
 
 def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return the furnished room of `pano_mvs.testing.room` with its nearly plain texture.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 0.6 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-    """
+    """Return the furnished room of `pano_mvs.testing.room` with its nearly plain texture."""
     room = default_room(seed, "weak")
-    return _scene("weak_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
-
-
-def large_plain_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return a nearly empty room of 12 × 4 × 9: plain walls and ceiling, a faint floor, a few small objects.
-
-    Most key points are coarse, faint and few, so that they determine poses poorly. It is not one of `SCENES`, since
-    most of its surfaces have no texture at all and no reliable ranges.
-
-    Args:
-        seed: seed of textures, cameras and exposures.
-        views: number of cameras, about 1.5 apart.
-        turned: whether every camera is rotated arbitrarily.
-        exposure: as in `courtyard`.
-    """
-    frame = ((0.70, 0.72, 0.74), (0.70, 0.72, 0.74))
-    surfaces: list[Painted] = [
-        (Cuboid((-6.0, -2.4, -4.5), (6.0, 1.6, 4.5), WHITE), "none"),
-        (Quad((-6.0, 1.599, -4.5), (12.0, 0.0, 0.0), (0.0, 0.0, 9.0), STONE), "weak"),
-        (Cuboid((-0.6, -0.6, 4.46), (0.5, 1.6, 4.5), frame), "none"),
-        (Cuboid((2.5, -0.9, -4.5), (4.5, 0.7, -4.46), frame), "none"),
-        (Cuboid((-4.0, 1.0, -4.5), (-2.2, 1.5, -4.38), WHITE), "none"),
-        (Quad((-5.99, -0.6, -1.0), (0.0, 0.0, 1.4), (0.0, 1.0, 0.0), BLUE), "weak"),
-        (Quad((2.0, -0.7, 4.49), (1.6, 0.0, 0.0), (0.0, 1.1, 0.0), RED), "weak"),
-        (Quad((5.99, -0.4, 1.5), (0.0, 0.0, 0.9), (0.0, 0.7, 0.0), LEAVES), "strong"),
-        (Cuboid((-5.0, 0.85, 2.2), (-3.2, 0.9, 3.2), OAK), "strong"),
-        (Rod((-4.9, 0.9, 2.3), (-4.9, 1.6, 2.3), 0.04, OAK), "strong"),
-        (Rod((-3.3, 0.9, 3.1), (-3.3, 1.6, 3.1), 0.04, OAK), "strong"),
-        (Cuboid((4.6, 0.0, -2.2), (5.6, 1.6, -1.2), WHITE), "none"),
-        (Ball((-2.6, 1.3, -3.4), 0.3, LEAVES), "strong"),
-        (Ball((0.0, -1.9, 0.0), 0.25, WHITE), "none"),
-        (Rod((0.0, -2.4, 0.0), (0.0, -1.9, 0.0), 0.02, STEEL), "none"),
-    ]
-    room = _painted("large plain room", surfaces, seed=seed, lamp=(1.0, -1.2, 0.8))
-    return _scene("large_plain_room", room, views=views, turned=turned, spread=(2.0, 0.4, 2.0), exposure=exposure)
+    return placed("weak_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
 
 
 SCENES: dict[str, Callable[..., Scene]] = {
@@ -339,7 +194,7 @@ def write_scene(folder: Path, scene: Scene, size_hw: tuple[int, int]) -> None:
     write_views(folder, (scene.view(idx, size_hw) for idx in range(len(scene.poses))), scene.poses)
 
 
-def _painted(name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky: str | None = None) -> Room:
+def painted(name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky: str | None = None) -> Room:
     """Return a room of surfaces with a texture each, which depend on the name of the room; `sky` is one of `SKIES`."""
     zenith, horizon, clouds = SKIES[sky] if sky else ((0.0,) * 3, (0.0,) * 3, 0.0)
     own = seed + sum(map(ord, name))
@@ -353,7 +208,7 @@ def _painted(name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky
     )
 
 
-def _scene(
+def placed(
     name: str,
     room: Room,
     *,
@@ -389,3 +244,48 @@ def _apart(rng: np.random.Generator, count: int, spread: NDArray[np.float64]) ->
         if min(float(np.linalg.norm(candidate - other)) for other in chosen) > least:
             chosen.append(candidate)
     return np.array(chosen[:count])
+
+
+def _buildings() -> list[Surface]:
+    """Return the pavement, and buildings with bays and with gaps through which the sky is seen."""
+    bays = [Cuboid((-12, -5, z), (-11.2, -2, z + 2.5), STONE) for z in range(-12, 20, 6)]
+    oriels = [Cuboid((11.3, -7, z), (12, -3, z + 2.5), BRICK) for z in range(-9, 23, 6)]
+    return [
+        Quad((-20, 1.6, -24), (40, 0, 0), (0, 0, 84), STONE),
+        Cuboid((-16, -9, -16), (-12, 1.6, 22), BRICK),
+        Cuboid((-16, -6, 26), (-12, 1.6, 58), STONE),
+        Cuboid((12, -11, -16), (16, 1.6, 30), STONE),
+        Cuboid((12, -7, 33), (16, 1.6, 58), BRICK),
+        Cuboid((-10, -13, 56), (9, 1.6, 60), BRICK),
+        Cuboid((-14, -7, -20), (14, 1.6, -17), STONE),
+        *bays,
+        *oriels,
+    ]
+
+
+def _arcade() -> list[Surface]:
+    """Return columns 0.5 thick with a beam on top, 5 away from the first camera."""
+    columns = [Rod((-5, 1.6, z), (-5, -2.2, z), 0.25, STONE) for z in range(-8, 17, 3)]
+    return [*columns, Cuboid((-5.4, -2.9, -8.5), (-4.6, -2.2, 16.5), STONE)]
+
+
+def _trees() -> list[Surface]:
+    surfaces: list[Surface] = []
+    for x, z, height in ((4.0, 5.0, 3.2), (5.5, -6.0, 4.0), (-1.5, 16.0, 5.0), (3.0, 30.0, 6.0), (7.0, 16.0, 4.5)):
+        crown = 0.38 * height
+        surfaces.append(Rod((x, 1.6, z), (x + 0.15, 1.6 - height, z), 0.05 * height, OAK))
+        for dx, dy, dz in ((0.0, 0.0, 0.0), (0.5, 0.45, 0.35), (-0.55, 0.3, -0.3)):
+            center = (x + dx * crown, 1.6 - height + dy * crown, z + dz * crown)
+            surfaces.append(Ball(center, 0.75 * crown, LEAVES))
+    return surfaces
+
+
+def _street_furniture() -> list[Surface]:
+    return [
+        Cuboid((1.8, 0.1, -5.5), (3.6, 1.6, -3.0), BLUE),
+        Cuboid((-2.6, 1.1, 2.6), (-0.8, 1.2, 3.1), OAK),
+        Cuboid((-2.5, 1.2, 2.7), (-2.3, 1.6, 3.0), STEEL),
+        Cuboid((-1.1, 1.2, 2.7), (-0.9, 1.6, 3.0), STEEL),
+        Rod((2.2, 1.6, 2.4), (2.2, -3.4, 2.4), 0.05, STEEL),
+        Rod((-3.2, 1.6, 8.0), (-3.2, -3.4, 8.0), 0.06, STEEL),
+    ]

@@ -31,13 +31,7 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class Cuboid:
-    """An axis-aligned box, seen from outside (furniture) or from inside (the room itself).
-
-    Attributes:
-        low: its corner with the smallest coordinates.
-        high: the opposite corner.
-        colors_rgb: the two colours between which its texture varies.
-    """
+    """An axis-aligned box, seen from outside (furniture) or from inside (the room itself)."""
 
     low: Vector
     high: Vector
@@ -61,13 +55,7 @@ class Cuboid:
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere, seen from outside or from inside.
-
-    Attributes:
-        center: of the sphere.
-        radius: of the sphere.
-        colors_rgb: the two colours between which its texture varies.
-    """
+    """A sphere, seen from outside or from inside."""
 
     center: Vector
     radius: float
@@ -89,14 +77,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Quad:
-    """A flat parallelogram, seen from either side.
-
-    Attributes:
-        corner: one of its corners.
-        edge_u: vector from that corner to the next.
-        edge_v: vector from that corner to the previous one.
-        colors_rgb: the two colours between which its texture varies.
-    """
+    """A flat parallelogram, seen from either side."""
 
     corner: Vector
     edge_u: Vector
@@ -122,14 +103,7 @@ class Quad:
 
 @dataclass(frozen=True)
 class Rod:
-    """The surface of a round rod between two points, seen from outside or from inside; its ends are open.
-
-    Attributes:
-        foot: centre of one end.
-        head: centre of the other end.
-        radius: radius of the rod.
-        colors_rgb: the two colours between which its texture varies.
-    """
+    """The surface of a round rod between two points, seen from outside or from inside; its ends are open."""
 
     foot: Vector
     head: Vector
@@ -160,13 +134,7 @@ class Rod:
 
 @dataclass(frozen=True)
 class Bounded:
-    """A surface within a bounding sphere, so that only rays towards the sphere are tested.
-
-    Attributes:
-        surface: any surface.
-        center: centre of the sphere.
-        radius: radius of the sphere.
-    """
+    """A surface within a bounding sphere, so that only rays towards the sphere are tested."""
 
     surface: Surface
     center: Vector

@@ -116,13 +116,7 @@ def agreement(number: int, backend: str, *, device: str = "auto") -> float:
 
 
 def share_alike(one: RangeMap, other: RangeMap, ranges: NDArray[np.float64]) -> float:
-    """Return the share of pixels within half a level of each other, or without a range in both.
-
-    Args:
-        one: a range map.
-        other: another one of the same size.
-        ranges: the depth hypotheses, (D,).
-    """
+    """Return the share of pixels within half a level of each other, or without a range in both."""
     with np.errstate(invalid="ignore"):
         close = np.abs(plane_position(one.range, ranges) - plane_position(other.range, ranges)) < 0.5
     return float((close | (np.isnan(one.range) & np.isnan(other.range))).mean())

@@ -32,13 +32,11 @@ from pano_mvs.scene import (
     Views,
     WeakImage,
 )
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.files import FaceFiles
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.panorama import StaticMasks, camera_of
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.static_masks import StaticMasks, camera_of
-from pano_mvs.scene.structure import Structure
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 
 Frozen = TypeVar("Frozen", bound=Record)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.clouds.ply_reader import PlyPoints
+from pano_mvs.io.ply import PlyPoints
 
 POINT_BUDGET = 2_000_000
 COLORINGS = ("rgb", "confidence", "views", "normals", "height")
@@ -21,14 +21,7 @@ _NEEDED = {"rgb": (), "confidence": ("confidence",), "views": ("views",), "norma
 
 @dataclass(frozen=True, eq=False)
 class DrawnCloud:
-    """The points that are drawn.
-
-    Attributes:
-        points: (N, 3) float32 in the world.
-        normals: (N, 3) float32, or None if the file has none.
-        vertices: (N,) all properties in the file.
-        total: number of points in the file.
-    """
+    """The points that are drawn."""
 
     points: NDArray[np.float32]
     normals: NDArray[np.float32] | None
@@ -44,12 +37,7 @@ class DrawnCloud:
 
 @dataclass(frozen=True, eq=False)
 class Coloring:
-    """The colours of points.
-
-    Attributes:
-        colors_rgb: (N, 3) uint8.
-        legend: description of the colours.
-    """
+    """The colours of points."""
 
     colors_rgb: NDArray[np.uint8]
     legend: str
@@ -79,12 +67,6 @@ def drawn_cloud(cloud: PlyPoints, *, budget: int = POINT_BUDGET) -> DrawnCloud:
 
 def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: str) -> Coloring:
     """Return the colours of a cloud.
-
-    Args:
-        cloud: the points.
-        by: one of `COLORINGS`.
-        up: (3,) direction in which heights grow.
-        unit: of lengths.
 
     Raises:
         UsageError: if the file lacks the required properties.

@@ -12,13 +12,11 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
+from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
 from pano_mvs.scene.range_map import confidence_name
 from pano_mvs.viewer.cloud_colors import DrawnCloud
-from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.shown_scene import ShownCamera, ShownScene
-from pano_mvs.viewer.sizes import length_text, outer_box, sphere_radius
-from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
+from pano_mvs.viewer.viewpoint import Viewpoint, length_text, looking_along, outer_box, outside_view, sphere_radius
 
 
 def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], unit: str) -> str:
@@ -302,3 +300,67 @@ class Tour:
 def _place_text(point: FloatArray) -> str:
     """Return coordinates as `pano-mvs scale` takes them."""
     return ",".join(f"{value:z.4g}" for value in point)
+
+
+# A ray hits a point within this angle: half the width of a click at a usual field of view.
+_REACH_RAD = np.deg2rad(0.4)
+
+
+def camera_under(start: FloatArray, direction: FloatArray, centers: FloatArray, *, radius: float) -> int | None:
+    """Return the nearest camera whose sphere a ray intersects, or None.
+
+    Args:
+        start: (3,) origin of the ray.
+        direction: (3,) unit.
+        centers: (N, 3) of the spheres.
+        radius: of each of them.
+    """
+    along, aside = _along_and_aside(start, direction, centers)
+    met = (aside <= radius) & (along > radius)
+    if not met.any():
+        return None
+    candidates = np.flatnonzero(met)
+    return int(candidates[np.argmin(along[candidates])])
+
+
+def point_under(
+    start: FloatArray,
+    direction: FloatArray,
+    points: NDArray[np.float32],
+    *,
+    normals: NDArray[np.float32] | None = None,
+    parallel_reach: float = 0.0,
+) -> int | None:
+    """Return the nearest point close to a ray, or None.
+
+    Args:
+        start: (3,) origin of the ray.
+        direction: (3,) unit.
+        points: (N, 3).
+        normals: (N, 3); points that face away are ignored, since they are not drawn. None: use all points.
+        parallel_reach: maximum distance from the ray, scene units; 0: it grows with the distance from the viewer.
+    """
+    if not len(points):
+        return None
+    along, aside = _along_and_aside(start, direction, points)
+    near = (along > 0) & (aside < (parallel_reach or np.tan(_REACH_RAD) * along))
+    candidates = np.flatnonzero(near)
+    if normals is not None:
+        seen_along = direction if parallel_reach else points[candidates] - start
+        candidates = candidates[np.sum(normals[candidates] * seen_along, axis=-1) <= 0]
+    if not len(candidates):
+        return None
+    first = float(along[candidates].min())
+    # Of the foremost surface, the point closest to the ray.
+    foremost = candidates[along[candidates] <= first * (1 + 4 * np.tan(_REACH_RAD))]
+    return int(foremost[np.argmin(aside[foremost])])
+
+
+def _along_and_aside(
+    start: FloatArray, direction: FloatArray, points: NDArray[np.floating]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the distance of each point along a ray and from it, (N,) each."""
+    offsets = np.asarray(points, np.float64) - start
+    along = offsets @ direction
+    aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", offsets, offsets) - along**2, 0))
+    return along, aside

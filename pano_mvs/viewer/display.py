@@ -14,12 +14,7 @@ _REMEDY = "Use --screenshot FILE to write an image without a window"
 
 
 def require_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> None:
-    """Raise UsageError if no window can be opened.
-
-    Args:
-        environment: the process's.
-        platform: of Python.
-    """
+    """Raise UsageError if no window can be opened."""
     if platform.startswith("linux") and not environment.get("DISPLAY"):
         raise UsageError(
             f"there is no display (DISPLAY is not set), so no window can be opened. {_REMEDY}, or run "
@@ -39,13 +34,7 @@ def require_drawing(
     *,
     loads: Callable[[str], bool] | None = None,
 ) -> None:
-    """Raise UsageError if there is neither a display nor a library for off-screen rendering; VTK would crash.
-
-    Args:
-        environment: the process's.
-        platform: of Python.
-        loads: returns whether a library can be loaded; None: try to load it.
-    """
+    """Raise UsageError if there is neither a display nor a library for off-screen rendering; VTK would crash."""
     if not platform.startswith("linux") or environment.get("DISPLAY"):
         return
     if not any((loads or _loads)(name) for name in _DRAWING_LIBRARIES):

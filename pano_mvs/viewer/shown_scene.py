@@ -15,13 +15,12 @@ from pano_mvs.core.file_names import file_inside
 from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_reader import PlyPoints, open_ply_points
+from pano_mvs.io.ply import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
-from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
-from pano_mvs.scene.upright import states_y_down
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -9,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.viewer.cloud_actor import CloudActor
+from pano_mvs.io.ply import open_ply_points
+from pano_mvs.viewer.actors import (
+    LARGE_WIDTH,
+    SMALL_WIDTH,
+    CloudActor,
+    Overlay,
+    range_panorama,
+    rims_actor,
+    sphere_actor,
+    sphere_picture,
+)
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour, TourState
-from pano_mvs.viewer.input_events import Hands
-from pano_mvs.viewer.overlay import Overlay
-from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
-from pano_mvs.viewer.range_sphere import range_panorama
-from pano_mvs.viewer.sizes import bar_length, bar_text, length_text
-from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
-from pano_mvs.viewer.viewpoint import Viewpoint
+from pano_mvs.viewer.viewpoint import Viewpoint, bar_length, bar_text, length_text
 
 TEXTURED = 64
 """Maximum number of cameras, the nearest ones, that are spheres with pictures; all others are dots."""
@@ -35,12 +39,7 @@ _TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 
 class SceneWindow:
-    """A plotter with the scene of a tour.
-
-    Attributes:
-        plotter: PyVista's.
-        tour: what is shown.
-    """
+    """A plotter with the scene of a tour."""
 
     def __init__(self, tour: Tour, *, size_wh: tuple[int, int], off_screen: bool, budget: int = POINT_BUDGET) -> None:
         import pyvista
@@ -320,3 +319,104 @@ def _looks_elsewhere(before: TourState, state: TourState) -> bool:
     """Return whether only the viewpoint has changed."""
     names = (field.name for field in fields(TourState) if field.name != "viewpoint")
     return all(getattr(before, name) is getattr(state, name) for name in names)
+
+
+# A press and a release within this distance are a click.
+_CLICK_PX = 4
+_LEFT, _RIGHT = "LeftButton", "RightButton"
+
+
+class Hands:
+    """Handles the events of one interactor.
+
+    Outside, VTK's trackball rotates and moves the camera; inside a panorama, dragging changes the direction of view.
+    """
+
+    def __init__(self, tour: Tour, *, seen_from: Callable[[], Viewpoint], update: Callable[[], None]) -> None:
+        """Make a handler."""
+        self._tour, self._seen_from, self._update = tour, seen_from, update
+        self._pressed: dict[str, tuple[int, int]] = {}
+        self._last = (0, 0)
+        self._interactor: Any = None
+        self._style: Any = None
+
+    def attach(self, interactor: Any) -> Any:
+        """Handle the events of a VTK interactor, and return its new style."""
+        from vtkmodules.vtkInteractionStyle import vtkInteractorStyleTrackballCamera
+
+        self._interactor, self._style = interactor, vtkInteractorStyleTrackballCamera()
+        for button in (_LEFT, _RIGHT):
+            self._style.AddObserver(f"{button}PressEvent", self._press)
+            self._style.AddObserver(f"{button}ReleaseEvent", self._release)
+        self._style.AddObserver("MouseMoveEvent", self._move)
+        self._style.AddObserver("MouseWheelForwardEvent", self._wheel)
+        self._style.AddObserver("MouseWheelBackwardEvent", self._wheel)
+        self._style.AddObserver("KeyPressEvent", self._key)
+        self._style.AddObserver("CharEvent", lambda _style, _event: None)  # VTK's own keys
+        interactor.SetInteractorStyle(self._style)
+        return self._style
+
+    @property
+    def _inside(self) -> bool:
+        return self._tour.state.inside is not None
+
+    @property
+    def _size_wh(self) -> tuple[int, int]:
+        width, height = self._interactor.GetRenderWindow().GetSize()
+        return max(1, width), max(1, height)
+
+    def _place(self) -> tuple[int, int]:
+        """Return the position of the pointer from the upper left corner; VTK counts from the lower left."""
+        x, y = self._interactor.GetEventPosition()
+        return x, self._size_wh[1] - 1 - y
+
+    def _press(self, _style: Any, event: str) -> None:
+        button = event.removesuffix("PressEvent")
+        self._pressed[button] = self._last = self._place()
+        if not self._inside:
+            (self._style.OnLeftButtonDown if button == _LEFT else self._style.OnRightButtonDown)()
+
+    def _release(self, _style: Any, event: str) -> None:
+        button = event.removesuffix("ReleaseEvent")
+        start, here = self._pressed.pop(button, None), self._place()
+        if not self._inside:
+            (self._style.OnLeftButtonUp if button == _LEFT else self._style.OnRightButtonUp)()
+            self._tour.moved_to(self._seen_from())
+        if start is not None and max(abs(start[0] - here[0]), abs(start[1] - here[1])) < _CLICK_PX:
+            if button == _LEFT:
+                self._tour.click(here[0] + 0.5, here[1] + 0.5, self._size_wh)
+            else:
+                self._tour.step_out()
+        self._update()
+
+    def _move(self, _style: Any, _event: str) -> None:
+        here = self._place()
+        before, self._last = self._last, here
+        if not self._pressed:
+            if not self._inside:
+                self._tour.moved_to(self._seen_from())
+            if self._tour.hover(here[0] + 0.5, here[1] + 0.5, self._size_wh):
+                self._update()
+        elif self._inside:
+            self._tour.drag(here[0] - before[0], here[1] - before[1], window_height=self._size_wh[1])
+            self._update()
+        else:
+            self._style.OnMouseMove()
+
+    def _wheel(self, _style: Any, event: str) -> None:
+        forward = event == "MouseWheelForwardEvent"
+        if self._inside:
+            self._tour.zoom(1 if forward else -1)
+            self._update()
+        else:
+            (self._style.OnMouseWheelForward if forward else self._style.OnMouseWheelBackward)()
+
+    def _key(self, _style: Any, _event: str) -> None:
+        key = self._interactor.GetKeySym()
+        if key == "q":
+            self._interactor.TerminateApp()
+            return
+        if not self._inside:
+            self._tour.moved_to(self._seen_from())
+        if self._tour.key(key):
+            self._update()

@@ -22,7 +22,7 @@ from pano_mvs.algorithms.faces.render import (
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.face_files import FaceLayout
+from pano_mvs.scene.files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.faces import z_depth as slow_z_depth
 

@@ -18,8 +18,8 @@ from pano_mvs.algorithms.masks.static_content import (
 )
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_from_pixel, ray_grid, roll_panorama
-from pano_mvs.testing.rig import RIGS, with_rig
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.rig import RIGS, with_rig
 
 SMALL_HW = (128, 256)
 RAYS = ray_grid(SMALL_HW)

@@ -15,9 +15,9 @@ from pano_mvs.algorithms.masks.moving import Moving, moving_pixels
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.persons import Drawn, draw_people, person
 from pano_mvs.testing.room import Room, default_room, render
 from pano_mvs.testing.surfaces import Cuboid
+from tests.synthetic.persons import Drawn, draw_people, person
 
 SIZE_HW = (128, 256)
 CENTERS = ((0.0, 0.0, 0.0), (0.7, 0.05, 0.3), (-0.5, -0.05, 0.6), (0.1, 0.0, -0.7))

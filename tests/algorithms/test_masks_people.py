@@ -25,8 +25,8 @@ from pano_mvs.algorithms.masks.person_views import (
 )
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
-from pano_mvs.testing.persons import Drawn, draw_people, person
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.persons import Drawn, draw_people, person
 
 SIZE_HW = (512, 1024)
 SAMPLE = Path(__file__).parents[2] / "workflows" / "samples" / "classroom" / "images" / "003.png"

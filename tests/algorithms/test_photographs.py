@@ -13,8 +13,8 @@ from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSet
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import PointCloud
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW, FOCAL_PX = (240, 320), 300.0
 CAMERA = PhotographCamera(Rigid3.identity(), FOCAL_PX, 0.0)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.stitching import lens_weights, stitch_lenses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import LensRig, pixel_solid_angle, ray_grid
-from pano_mvs.testing.fisheye_rig import example_rig, render_rig
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
+from tests.synthetic.fisheye_rig import example_rig, render_rig
 
 SIZE_HW = (96, 192)
 POSE = capture_poses(2)[1]

@@ -15,7 +15,7 @@ from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap
-from pano_mvs.scene.structure import Structure
+from pano_mvs.scene.surfaces import Structure
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 
 SIZE = (128, 256)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.testing.scenes import SCENES, Scene

@@ -23,11 +23,11 @@ from scipy.spatial import cKDTree
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_reader import read_ply_points
+from pano_mvs.io.ply import read_ply_points
 from pano_mvs.scene import Files, Panorama, Poses, RangeMap
 from pano_mvs.scene.files import item_stems
 from pano_mvs.stages.exports.colmap import DenseParams, FacesParams, colmap_dense, colmap_faces
-from pano_mvs.stages.points import SurfaceParams, TrackedParams, surface, tracked
+from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along
 from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, scene_capture

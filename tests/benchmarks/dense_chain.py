@@ -23,7 +23,7 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
-from pano_mvs.scene.structure import Structure
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.session.session import open_session
 from tests.benchmarks.captures import Capture
 from tests.benchmarks.depth_metrics import DepthMetrics, depth_metrics

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.evaluation.ranges.pixels import has_range
-from pano_mvs.evaluation.ranges.view_scores import ScoreSettings, score_view
+from pano_mvs.evaluation.ranges.view_scores import ScoreSettings, has_range, score_view
 
 
 @dataclass(frozen=True, slots=True)

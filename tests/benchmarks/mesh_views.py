@@ -22,13 +22,12 @@ from scipy.spatial import cKDTree
 from pano_mvs.algorithms.mesh.surface import Mesh, decimated
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.evaluation.meshes.held_out import HeldOutScores, held_out_scores
 from pano_mvs.scene import PointCloud, RangeMap
-from pano_mvs.stages.exports.mesh import MeshParams, solved_mesh
-from pano_mvs.stages.exports.mesh_textured import TexturedParams, textured_mesh
+from pano_mvs.stages.exports.mesh import MeshParams, TexturedParams, solved_mesh, textured_mesh
 from pano_mvs.stages.fusion import FusionParams, vote
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, given_records, true_poses
+from tests.evaluation.held_out_meshes import HeldOutScores, held_out_scores
 
 
 def without(capture: Capture, left_out: str) -> Capture:

@@ -30,9 +30,9 @@ from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.static_content import static_content
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.persons import OUTFITS, Person, draw_people, person
 from pano_mvs.testing.scenes import courtyard
 from pano_mvs.testing.texture import noise
+from tests.synthetic.persons import OUTFITS, Person, draw_people, person
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]

@@ -37,12 +37,12 @@ import pano_mvs
 from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.algorithms.rendering import draw_cloud, inside_camera, viewpoints
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.residuals import reprojection_residuals
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Poses
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
 from tests.benchmarks.poses.captures_with_truth import MAPPERS, SEED, native_features, native_matches
 

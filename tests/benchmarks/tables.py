@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
-from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.scene import Poses
 from pano_mvs.session.session import presets_folder
 from tests.benchmarks.captures import Capture, read_capture

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.geometry import ray_from_pixel
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.cli.conftest import Outcome
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import ray_grid, similarity_from_points
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.room import capture_poses, default_room, range_along, write_capture

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.geometry import ray_from_pixel
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from tests.cli.conftest import Outcome
 from tests.viewer.scenes import turned_poses, world_color, write_output
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.testing.conformance import stage_contract_tests
 from tests.cli.conftest import Command, capture, pano_mvs, rendered  # noqa: F401  # fixtures
 from tests.stored import read_picture

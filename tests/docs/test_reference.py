@@ -13,6 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pano_mvs import api
+from pano_mvs.cli.plugins.new import rendered
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 
 ROOT = Path(__file__).parents[2]
@@ -145,3 +146,8 @@ def test_every_page_is_in_the_navigation() -> None:
     assert written <= listed
     made = {f"reference/{name}.md" for name in ("stages", "presets", "commands", "api", "conventions")}
     assert listed - written == made | hook("repository_pages").PAGES.keys()
+
+
+def test_the_site_shows_the_plugins_that_are_written() -> None:
+    page = hook("markdown_text").with_plugins("Text:\n\n<!-- plugin: filter cut -->\nMore.\n")
+    assert page == f"Text:\n\n```python\n{rendered('filter', 'cut')[0]}```\nMore.\n"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.io.rigs.calibration_file import MODELS, read_rig
+from pano_mvs.io.rig_calibration import MODELS, read_rig
 from pano_mvs.scene import FilePart
-from pano_mvs.stages.rigs.dual_fisheye import DualFisheyeParams
+from pano_mvs.stages.rigs import DualFisheyeParams
 
 PAGE = (Path(__file__).parents[2] / "docs" / "rigs.md").read_text(encoding="utf-8")
 

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.clouds import points as point_source
-from pano_mvs.evaluation.clouds.distances import CloudDistances, cloud_distances, score_cloud
-from pano_mvs.evaluation.clouds.points import PointsInMemory
+from pano_mvs.evaluation.clouds import distances as measured_distances
+from pano_mvs.evaluation.clouds.distances import CloudDistances, PointsInMemory, cloud_distances, score_cloud
 from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.geometry import Rigid3, ray_grid
 from tests.algorithms.range_scenes import box_range
@@ -126,7 +125,7 @@ class TestScores:
         points = np.random.default_rng(3).normal(size=(900, 3)).astype(np.float32)
         surface, pieces = surface_of_views(VIEWS), [view_points(view) for view in VIEWS]
         whole = cloud_distances(PointsInMemory(points), pieces, surface, limit=9)
-        monkeypatch.setattr(point_source, "CHUNK_POINTS", 100)
+        monkeypatch.setattr(measured_distances, "CHUNK_POINTS", 100)
 
         class Uneven(PointsInMemory):
             def chunks(self) -> Iterator[NDArray[np.float32]]:

@@ -13,7 +13,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.clouds.pictures import _top_view, distance_colors, write_error_cloud
 from pano_mvs.evaluation.drawing import WIDTH
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
-from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.ply import open_ply_points
 from tests.stored import read_picture
 
 GREY, BLACK = (128, 128, 128), (25, 25, 25)
@@ -94,13 +94,3 @@ def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path: Path) ->
     np.testing.assert_array_equal(colors, distance_colors(distances, (0.02, 0.05)))
     with pytest.raises(UsageError, match="9 points, but 8 distances"):
         write_error_cloud(path, [points], distances[:8], limits=(0.02,), farthest=1.0)
-
-
-def test_pyvista_reads_the_scalar(tmp_path: Path) -> None:
-    import pyvista
-
-    points = np.eye(3, dtype=np.float32)
-    write_error_cloud(tmp_path / "a.ply", [points], np.array([0, 0.5, 2], np.float32), limits=(1,), farthest=1.5)
-    mesh = pyvista.read(tmp_path / "a.ply")
-    np.testing.assert_array_equal(mesh.points, points)
-    assert mesh.n_points == 3

@@ -11,12 +11,11 @@ from pano_mvs.algorithms.mesh.surface import Mesh
 from pano_mvs.algorithms.mesh.texture import balanced_views, textured
 from pano_mvs.algorithms.mesh.view_quality import PaintView
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.meshes.held_out import held_out_scores, rendered_panorama
-from pano_mvs.evaluation.meshes.picture_scores import picture_scores
 from pano_mvs.geometry import Rigid3, pixel_from_ray, roll_panorama, sample_panorama
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Cuboid
 from tests.algorithms.mesh.box import HALF, WALL_COLORS, box, poses
+from tests.evaluation.held_out_meshes import held_out_scores, picture_scores, rendered_panorama
 
 
 def noisy(picture: NDArray[np.uint8], sigma: float) -> NDArray[np.uint8]:

@@ -102,18 +102,6 @@ def test_groups_are_aligned_each_by_itself() -> None:
     assert judge_placements(poses_of(estimated), truth).right.sum() < 5
 
 
-def test_noise_within_the_limits_is_right_though_pairs_are_short() -> None:
-    """The scale that a pair proposes is as unsure as the pair is short; the fit to all right cameras mends that."""
-    rng = np.random.default_rng(8)
-    truth = random_poses(rng, 12)
-    extent = extent_of(truth)
-    noisy = {
-        name: displaced(pose, by=rng.normal(0, 0.004 * extent, 3), turn_deg=rng.normal(0, 0.2))
-        for name, pose in truth.items()
-    }
-    assert judge_placements(poses_of(moved(noisy, rng)), truth).right.all()
-
-
 def test_two_cameras_are_right_though_the_direction_between_them_is_not_exact() -> None:
     """A fit to centres alone once turned two close cameras by the error of their direction, and both were wrong."""
     rng = np.random.default_rng(10)
@@ -124,23 +112,3 @@ def test_two_cameras_are_right_though_the_direction_between_them_is_not_exact() 
     truth[names[1]] = displaced(first, by=near)
     estimated = {names[0]: first, names[1]: displaced(first, by=near + np.array([0, 0.1 * near[0], 0]))}  # 6° off
     assert judge_placements(poses_of(moved(estimated, rng)), truth).right.all()
-
-
-def test_cameras_that_have_nothing_in_common_with_the_truth_are_wrong_by_finite_errors() -> None:
-    rng = np.random.default_rng(11)
-    truth = random_poses(rng, 5)
-    placed = judge_placements(poses_of(dict(zip(truth, random_poses(rng, 5).values(), strict=True))), truth)
-    assert placed.right.sum() <= 2
-    assert np.isfinite(placed.rotation_deg).all()
-    assert np.isfinite(placed.center_shares).all()
-    assert placed.center_shares.max() > 0.1
-
-
-def test_nothing_registered_and_cameras_in_one_place_are_judged_without_complaint() -> None:
-    truth = random_poses(np.random.default_rng(9), 3)
-    none = judge_placements(poses_of({}), truth)
-    assert (none.names, none.expected, none.unreported) == ((), 3, ())
-    pose = next(iter(truth.values()))
-    assert not judge_placements(poses_of(dict.fromkeys(truth, pose)), truth).right.any()
-    strange = judge_placements(poses_of({"other.jpg": pose}), truth)
-    assert strange.names == strange.alone == ()

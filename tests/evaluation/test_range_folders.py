@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.inputs.range_files import RangeFile, find_ranges
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
-from pano_mvs.io.images.names import pair_image_names, without_extension
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.evaluation.inputs import RangeFile, find_ranges, find_true_ranges
+from pano_mvs.io.images.names import without_extension
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from tests.stored import write_npz
 
 RANGES = np.random.default_rng(0).uniform(0.5, 60, (4, 8)).astype(np.float32)
@@ -101,25 +99,6 @@ def test_truth_is_found_with_poses_and_without(tmp_path: Path) -> None:
         find_true_ranges(tmp_path)
     (tmp_path / "poses.json").unlink()
     assert list(find_true_ranges(tmp_path)) == ["nothing"]
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs", "expected"),
-    [
-        (["000", "001"], ["rgb/001.png", "rgb/000.png"], {"000": "rgb/000.png", "001": "rgb/001.png"}),
-        (["a/1", "b/1"], ["images/b/1.jpg", "images/a/1.jpg"], {"a/1": "images/a/1.jpg", "b/1": "images/b/1.jpg"}),
-        (["a/1", "b/1"], ["q/b/1"], {"b/1": "q/b/1"}),
-        (["a/1", "b/1"], ["1"], {}),
-        (["a.jpg", "a.png"], ["a.png", "a.jpg"], {"a.jpg": "a.jpg", "a.png": "a.png"}),
-        (["IMG_1.5"], ["img_1.5.JPG", "img_1.6.JPG"], {"IMG_1.5": "img_1.5.JPG"}),
-        (["./x", "y"], ["x.tif"], {"./x": "x.tif"}),
-        ([], ["x"], {}),
-    ],
-)
-def test_pictures_are_matched_by_their_paths_without_extension(
-    ours: Sequence[str], theirs: Sequence[str], expected: dict[str, str]
-) -> None:
-    assert pair_image_names(ours, theirs) == expected
 
 
 def test_only_extensions_of_pictures_are_dropped() -> None:

@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.errors import BadLimit, range_errors
-from pano_mvs.evaluation.ranges.pixels import aligning_scale, scored_pixels, weighted_median, weighted_quantile
 from pano_mvs.evaluation.ranges.view_scores import (
     PROTOCOLS,
+    BadLimit,
     ScoreSettings,
     ViewScores,
+    aligning_scale,
     best_constant_errors,
     best_constant_median,
     mean_scores,
+    range_errors,
     score_view,
+    scored_pixels,
+    weighted_median,
+    weighted_quantile,
 )
 from pano_mvs.geometry import pixel_solid_angle
 from tests.oracles import range_scores as oracle

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.evaluation.ranges.pairs import resized_labels, resized_range
 from tests.algorithms.range_scenes import box_range
-
-
-def test_the_same_size_is_the_same_map() -> None:
-    ranges, _ = box_range((16, 32))
-    assert resized_range(ranges, (16, 32)) is ranges
 
 
 @pytest.mark.parametrize(("old", "new"), [((64, 128), (128, 256)), ((128, 256), (64, 128)), ((48, 96), (64, 128))])

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.capture import score_capture
-from pano_mvs.evaluation.ranges.pixels import scored_pixels
-from pano_mvs.evaluation.ranges.sparsification import Sparsification
-from pano_mvs.evaluation.ranges.sparsification import sparsify as sparsify_pixels
+from pano_mvs.evaluation.ranges.view_scores import Sparsification, scored_pixels
+from pano_mvs.evaluation.ranges.view_scores import sparsify as sparsify_pixels
 from pano_mvs.geometry import Rigid3
 
 SIZE = (16, 32)
@@ -45,14 +43,6 @@ def test_confidence_in_the_order_of_the_errors_is_as_good_as_can_be() -> None:
     assert worst.ause > 2 * sparsify(estimated, np.zeros(SIZE, np.uint8), truth).ause > 0
 
 
-def test_no_confidence_at_all_keeps_the_mean_error_whatever_is_kept() -> None:
-    truth, estimated, rng = noisy()
-    flat = sparsify(estimated, np.full(SIZE, 9), truth)
-    assert flat.area == pytest.approx(flat.error[-1])
-    shuffled = sparsify(estimated, rng.permutation(SIZE[0] * SIZE[1]).reshape(SIZE), truth)
-    assert shuffled.area == pytest.approx(flat.area, rel=0.15)
-
-
 def test_coarse_confidence_has_the_area_of_a_random_order_within_each_level() -> None:
     truth, estimated, rng = noisy()
     coarse = ranks(-np.abs(estimated - truth) / truth) // 100
@@ -73,12 +63,6 @@ def test_pixels_without_truth_or_estimate_do_not_count_and_scale_does() -> None:
     nothing = sparsify(np.full(SIZE, np.nan), confidence, truth)
     assert np.isnan(nothing.ause)
     assert len(nothing.kept) == 0
-
-
-def test_shapes_that_differ_are_refused() -> None:
-    truth, estimated, _ = noisy()
-    with pytest.raises(UsageError, match="one size"):
-        sparsify(estimated, np.zeros((3, 3), np.uint8), truth)
 
 
 def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing.room import Room, capture_poses, default_room, render, write_capture

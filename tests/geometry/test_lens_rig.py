@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec, spiral_rays
@@ -91,3 +95,77 @@ def test_values_survive_json_exactly() -> None:
 def test_a_stitching_distance_inside_of_the_rig_is_refused() -> None:
     with pytest.raises(UsageError, match=r"stitching distance of 0\.03 m is not outside of the rig"):
         rig(0.03)
+
+
+# Neither square nor centred, with different focal lengths: a mix-up of x and y shows.
+LENS = FisheyeLens((900, 1000), (271.0, 268.0), (489.5, 457.25), (0.04, -0.012, 0.003, -0.0004), np.radians(100))
+ANGLES = st.one_of(st.floats(0, np.radians(100)), st.sampled_from([0.0, 1e-12, 1e-6, np.pi / 2, np.radians(100)]))
+AZIMUTHS = st.floats(-np.pi, np.pi)
+
+
+def ray(angle: float, azimuth: float) -> tuple[float, float, float]:
+    return np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)
+
+
+@given(ANGLES, AZIMUTHS, st.floats(0.01, 100))
+def test_rays_of_any_length_survive_the_round_trip_also_beyond_90_degrees(
+    angle: float, azimuth: float, length: float
+) -> None:
+    pixel = LENS.pixel_from_ray(length * np.array(ray(angle, azimuth)))
+    assert LENS.ray_from_pixel(pixel) == pytest.approx(ray(angle, azimuth), abs=1e-11)
+
+
+@given(ANGLES)
+def test_the_slope_is_the_derivative_of_the_radius(angle: float) -> None:
+    h = 1e-6
+    numeric = (LENS.radius_from_angle(angle + h) - LENS.radius_from_angle(angle - h)) / (2 * h)
+    assert LENS.radius_slope(angle) == pytest.approx(numeric, abs=1e-8)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1.0, 30.0, 60.0, 85.0])
+def test_pixels_are_those_of_colmap_and_half_a_pixel_from_those_of_opencv(angle_deg: float) -> None:
+    rays = np.array([ray(np.radians(angle_deg), azimuth) for azimuth in (0.3, 2.0, -1.1)])
+    params = [*LENS.focal_xy, *LENS.principal_xy, *LENS.distortion]
+    colmap = pycolmap.Camera(model="OPENCV_FISHEYE", width=1000, height=900, params=params)
+    pixels = LENS.pixel_from_ray(rays)
+    assert pixels == pytest.approx(colmap.img_from_cam(rays), abs=1e-9)
+    # OpenCV counts from the centre of the first pixel, so that its principal point is half a pixel less.
+    (fx, fy), (cx, cy) = LENS.focal_xy, LENS.principal_xy
+    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    opencv, _ = cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(LENS.distortion))
+    assert pixels - 0.5 == pytest.approx(opencv[:, 0], abs=1e-9)
+
+
+def test_nothing_beyond_the_field_of_view_has_a_pixel_or_a_ray() -> None:
+    assert np.isnan(LENS.pixel_from_ray(ray(np.radians(100.01), 0.5))).all()
+    outermost = 271.0 * float(LENS.radius_from_angle(np.radians(100)))
+    assert np.isfinite(LENS.ray_from_pixel((489.5 + outermost - 0.01, 457.25))).all()
+    assert np.isnan(LENS.ray_from_pixel((489.5 + outermost + 0.01, 457.25))).all()
+    assert LENS.contains([(0, 0), (1000, 900), (1000.1, 5), (np.nan, 3), (-0.1, 3)]).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_newton_finds_angles_where_the_radius_hardly_grows_any_more() -> None:
+    """The slope is nearly zero at the edge, so that plain Newton steps leave the field of view."""
+    lens = FisheyeLens((100, 100), (20.0, 20.0), (50.0, 50.0), (-0.1, 0.0, 0.0, 0.0), 1.82)
+    assert lens.monotonic_limit_rad == pytest.approx(np.sqrt(1 / 0.3))
+    angles = np.linspace(0, 1.82, 2000)
+    assert lens.angle_from_radius(lens.radius_from_angle(angles)) == pytest.approx(angles, abs=1e-9)
+
+
+def test_a_distortion_that_folds_back_within_the_field_of_view_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"stops growing 104\.6° from the axis, but the field of view reaches 105\.0°"):
+        FisheyeLens((100, 100), (20.0, 20.0), (50.0, 50.0), (-0.1, 0.0, 0.0, 0.0), np.radians(105))
+
+
+@pytest.mark.parametrize(
+    ("focal", "angle", "message"), [((0.0, 20.0), 1.0, "must be positive"), ((20.0, 20.0), 3.2, "at most 360°")]
+)
+def test_impossible_lenses_are_refused(focal: tuple[float, float], angle: float, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        FisheyeLens((100, 100), focal, (50.0, 50.0), (0.0, 0.0, 0.0, 0.0), angle)

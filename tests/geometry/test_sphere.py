@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs import geometry
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import angle_between, pixel_from_ray, pixel_solid_angle, ray_from_pixel, ray_grid
+from pano_mvs.geometry import angle_between, pixel_from_ray, pixel_solid_angle, ray_from_pixel, ray_grid, spiral_rays
 from tests.geometry.strategies import ANGLES, SIZES, UNITS
 
 SHARES = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.5, 1.0, 1e-12, 1 - 1e-12]))
@@ -138,3 +138,27 @@ def test_the_public_names_are_those_that_exist() -> None:
     public = {name for name, value in vars(geometry).items() if callable(value) and not name.startswith("_")}
     assert public == set(geometry.__all__)
     assert list(geometry.__all__) == sorted(geometry.__all__)
+
+
+@pytest.mark.parametrize("count", [1, 2, 100, 1000])
+def test_rays_are_of_unit_length(count: int) -> None:
+    rays = spiral_rays(count)
+    assert rays.shape == (count, 3)
+    assert np.linalg.norm(rays, axis=1) == pytest.approx(np.ones(count))
+
+
+def test_every_band_between_two_heights_has_its_share() -> None:
+    heights = spiral_rays(1000)[:, 1]
+    shares, _ = np.histogram(heights, 10, (-1, 1))
+    assert shares.tolist() == [100] * 10
+    assert heights[0] == pytest.approx(0.999)
+
+
+def test_neighbours_are_about_as_far_apart_as_on_a_lattice_of_triangles() -> None:
+    rays = spiral_rays(500)
+    cosines = rays @ rays.T
+    np.fill_diagonal(cosines, -1)
+    nearest = np.arccos(cosines.max(axis=1))
+    on_a_lattice = np.sqrt(8 * np.pi / (np.sqrt(3) * 500))
+    assert nearest.min() > 0.7 * on_a_lattice
+    assert nearest.max() < 1.1 * on_a_lattice

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import pixel_from_ray, ray_grid
 from pano_mvs.io.images.captures import describe_picture, list_pictures
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from pano_mvs.api import Context, PointCloud
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.clouds import thinning
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.io import thinning
+from pano_mvs.io.ply import read_ply, write_ply
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.stages.exports.files import PlyParams, ply
 
 
@@ -150,8 +150,8 @@ import sys
 import tracemalloc
 import numpy as np
 from pathlib import Path
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene import PointCloud
 
 folder, count = Path(sys.argv[1]), int(sys.argv[2])

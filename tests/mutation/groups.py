@@ -34,8 +34,8 @@ _TESTS_OF_RUNS = _engine(
 GROUPS = {
     "geometry": Group(("pano_mvs/geometry/*.py",), ("tests/geometry",)),
     "scene": Group(
-        ("pano_mvs/scene/*.py", "pano_mvs/scene/image_files/*.py"),
-        ("tests/scene", "tests/io/images/test_exif.py", "tests/io/images/test_containers.py"),
+        ("pano_mvs/scene/*.py",),
+        ("tests/scene", "tests/io/images/test_metadata.py", "tests/io/images/test_containers.py"),
     ),
     "keys": Group(
         (

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from pano_mvs.geometry import pixel_from_ray
-from pano_mvs.io.images.tour_players import (
+from pano_mvs.io.tour_players import (
     Link,
     Scene,
     marzipano_data,

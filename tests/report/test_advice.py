@@ -58,5 +58,5 @@ def test_the_next_page_does_not_read_the_ranges_again(
     results: StoredValues, tiny: TinyCapture, out_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reported(out_dir, summary_of(tiny), results)
-    monkeypatch.setattr("pano_mvs.report.advice.coverage", lambda *_: pytest.fail("read again"))
+    monkeypatch.setattr("pano_mvs.report.content.coverage", lambda *_: pytest.fail("read again"))
     reported(out_dir, summary_of(tiny), results)

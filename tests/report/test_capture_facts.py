@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pano_mvs.report.capture_facts import capture_facts, capture_name, date_in_words
+from pano_mvs.report.content import capture_facts, capture_name, date_in_words
 from pano_mvs.report.page import write_report
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary

@@ -16,7 +16,7 @@ from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama, RangeMap
-from pano_mvs.scene.static_masks import StaticMasks
+from pano_mvs.scene.panorama import StaticMasks
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.report.html_page import Page
 from tests.report.test_results import decoded

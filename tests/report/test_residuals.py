@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
+from pano_mvs.report.view_cards import Shares, fact_of, shares_from_fact, shares_of
 from pano_mvs.results.residuals import Histogram, histogram, reprojection_residuals
 from pano_mvs.scene import Poses
 from pano_mvs.testing.tiny_capture import TinyCapture

@@ -9,7 +9,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary

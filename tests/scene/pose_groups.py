@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.geometry.rotation import rotation_from_rotvec
+from pano_mvs.geometry.transforms import rotation_from_rotvec
 from pano_mvs.scene import Poses
 
 

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_files import decoding
-from pano_mvs.scene.image_files.decoding import check_stated_size, decode_picture
-from pano_mvs.scene.image_files.header import stated_size, stated_size_of_file
-from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.scene.masks.masking import decode_mask
+from pano_mvs.scene import image_file
+from pano_mvs.scene.image_file import check_stated_size, decode_image, decode_picture
+from pano_mvs.scene.masking import decode_mask
 from tests.io.images.pictures import png_chunk
 
 NOISE = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
@@ -30,21 +28,6 @@ def png_of(width: int, height: int, *, more: bytes = b"") -> bytes:
     data = bytes(cv2.imencode(".png", PICTURE[:4, :8])[1])
     header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     return data[:8] + header + data[33:] + more
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".webp", ".avif"])
-def test_the_header_of_every_kind_states_the_size(tmp_path: Path, suffix: str) -> None:
-    data = encoded(suffix)
-    (tmp_path / "a").write_bytes(data)
-    assert stated_size(data) == stated_size_of_file(tmp_path / "a") == (128, 256)
-    assert stated_size(data[:10]) is None
-
-
-def test_a_header_behind_megabytes_of_metadata_is_found(tmp_path: Path) -> None:
-    data = encoded(".jpg")
-    (tmp_path / "a.jpg").write_bytes(data[:2] + (b"\xff\xe2\xff\xff" + bytes(65_533)) * 40 + data[2:])
-    assert stated_size_of_file(tmp_path / "a.jpg") == (128, 256)
-    assert stated_size_of_file(tmp_path / "none") is None
 
 
 def test_pictures_beyond_the_limit_are_refused_by_name_with_the_figure(tmp_path: Path) -> None:
@@ -126,11 +109,6 @@ def test_a_header_is_believed_up_to_64_megapixels_or_10000_pixels_for_a_byte(
             check_stated_size(data, tmp_path / "a.png")
 
 
-def test_nothing_is_no_picture(tmp_path: Path) -> None:
-    assert decode_picture(b"", tmp_path / "a", cv2.IMREAD_COLOR) is None
-    assert decode_picture(b"something else", tmp_path / "a", cv2.IMREAD_COLOR) is None
-
-
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.995])
 @pytest.mark.parametrize(
     "options", [(), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 4)], ids=str
@@ -154,7 +132,7 @@ def test_padding_in_front_of_the_end_marker_does_no_harm(tmp_path: Path) -> None
 
 def test_what_others_write_while_a_jpeg_is_decoded_is_passed_on(capfd: pytest.CaptureFixture[str]) -> None:
     said: list[str] = []
-    with decoding._warnings_of_libjpeg(said):
+    with image_file._warnings_of_libjpeg(said):
         os.write(2, b"somebody else\nCorrupt JPEG data: premature end of data segment\n")
     os.write(2, b"behind\n")
     assert said == ["Corrupt JPEG data: premature end of data segment"]

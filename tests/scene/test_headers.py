@@ -11,11 +11,17 @@ import pytest
 
 from pano_mvs.core.errors import ContractError
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.decoding import decoding_bytes_per_pixel
-from pano_mvs.scene.image_files.header import riff_chunks, stated_size, stated_size_of_file
-from pano_mvs.scene.image_files.jpeg import Segment, is_cut_short, jpeg_segments
-from pano_mvs.scene.image_files.tiff_directory import Entry, open_tiff
-from pano_mvs.scene.masks.cropping import inside_crop, same_shape
+from pano_mvs.scene.image_header import (
+    Entry,
+    Segment,
+    is_cut_short,
+    jpeg_segments,
+    open_tiff,
+    riff_chunks,
+    stated_size,
+    stated_size_of_file,
+)
+from pano_mvs.scene.masking import inside_crop, same_shape
 
 
 def segment(marker: int, body: bytes) -> bytes:
@@ -250,11 +256,6 @@ def test_what_is_no_tiff_is_none(data: bytes) -> None:
     assert open_tiff(data) is None
 
 
-@pytest.mark.parametrize(("name", "size"), [("a.tif", 18), ("a.TIFF", 18), ("a.png", 8), ("a.tiff.jpg", 8), ("tif", 8)])
-def test_decoding_takes_most_for_tiff(name: str, size: int) -> None:
-    assert decoding_bytes_per_pixel(Path(name)) == size
-
-
 @pytest.mark.parametrize(
     ("one", "other", "same"),
     [
@@ -315,24 +316,3 @@ def test_the_working_size_is_that_of_a_full_sphere(size: tuple[int, int], fits: 
         with pytest.raises(ContractError, match="is not that of a full sphere"):
             panorama.check()
     assert np.prod(panorama.covers_ltwh[2:]) == 20_000
-
-
-# TIFF 6.0, section 2, with IFD (13) of its supplement and the three types of BigTIFF.
-SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-
-
-@pytest.mark.parametrize(("kind", "size"), SIZES.items())
-def test_fields_take_what_the_standard_says(kind: int, size: int) -> None:
-    at = 8 + 2 + 12
-    tiff = open_tiff(tiff_of((1, kind, 9, struct.pack("<I", at)), tail=bytes(100)))
-    assert tiff is not None
-    assert tiff.directory(8) == {1: Entry(kind, at, at + 9 * size)}
-    reads = kind in {1, 3, 4, 13, 16, 18}
-    assert tiff.integer(tiff.directory(8)[1]) == (0 if reads else None)
-
-
-@pytest.mark.parametrize(("kind", "value"), [(1, 0x12), (3, 0x3412), (4, 0x78563412), (13, 0x78563412)])
-def test_whole_numbers_have_as_many_bytes_as_their_type(kind: int, value: int) -> None:
-    tiff = open_tiff(tiff_of((1, kind, 1, b"\x12\x34\x56\x78"), tail=bytes(4)))
-    assert tiff is not None
-    assert tiff.integer(tiff.directory(8)[1]) == value

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from tests.io.images.pictures import app1, by_pillow, exif
 
 SIZE = (32, 64)

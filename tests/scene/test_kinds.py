@@ -15,7 +15,6 @@ from pano_mvs.scene import (
     Files,
     GlobalDescriptor,
     Pairs,
-    Panorama,
     PointCloud,
     Pose,
     Poses,
@@ -23,14 +22,10 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.files import group_file, item_stems
+from pano_mvs.scene.files import FaceFiles, group_file, item_stems
 from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
-from pano_mvs.scene.scores import Scores
-from pano_mvs.scene.structure import Structure
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 from tests.scene.pose_groups import drawn_group
 
 RNG = np.random.default_rng(5)
@@ -259,11 +254,6 @@ def test_pairs_and_views_name_their_units() -> None:
             wrong.check()
 
 
-def test_scores_come_back_from_their_parts() -> None:
-    scores = Scores({"ate": 0.5}, {"a": {"rmse": 1.0}}, ("a note",))
-    assert_same(Scores.from_parts(scores.to_parts()), scores)
-
-
 @pytest.mark.parametrize("group", [0, 2])
 def test_a_pose_keeps_all_its_digits(group: int) -> None:
     pose = Pose(Rigid3(rotation_from_rotvec((0.1, 0.2, 0.3)), np.array([1 / 3, -2, 1e-17])), group)
@@ -380,41 +370,3 @@ def test_the_first_group_s_file_has_the_plain_name() -> None:
 )
 def test_images_have_names_without_extension_where_these_are_unique(names: list[str], stems: list[str]) -> None:
     assert list(item_stems(names).values()) == stems
-
-
-def test_a_group_may_be_of_one_camera() -> None:
-    poses = drawn_group(("a", "b", "c"), seed=3, points=0)
-    replace(poses, group_idx=np.array([0, 1, 0], np.int32), other_worlds=poses.worlds).check()
-
-
-def test_what_nobody_states_is_not_known() -> None:
-    """The values of a field that is left out."""
-    pair = TwoView(GENERAL.matches_idx, np.eye(3), UNITS[0], FLOATS, "general")
-    assert (pair.reason, pair.candidates, pair.parallax_deg) == ("", 0, 0.0)
-    assert (pair.rotation_std_deg, pair.direction_std_deg, pair.alternatives) == (0.0, 0.0, ())
-    faces = FaceFiles({})
-    assert (faces.layout, faces.fov_deg, faces.suffix) == ("cube", 96.0, ".jpg")
-    image = Panorama(FilePart(Path("a")), (2, 4), (2, 4))
-    assert (image.crop_ltwh, image.mask_file, image.nadir_deg, image.zenith_deg) == (None, None, 0.0, 0.0)
-    assert (image.up_in_cam, image.heading_deg, image.position_lla) == (None, None, None)
-    assert FilePart(Path("a")) == FilePart(Path("a"), external=False, digest="")
-    assert Pose(Rigid3.identity()).group == 0
-    poses = drawn_group(("a",), seed=1)
-    plain = Poses(*(getattr(poses, field.name) for field in fields(Poses)[:10]))
-    assert plain.frame == "the first registered camera"
-    assert (plain.metric, plain.doubts, plain.other_worlds) == (False, {}, ())
-
-
-def test_kinds_have_the_axes_that_users_read_of() -> None:
-    assert [str(axis) for axis in Axis] == ["one", "image", "pair", "view"]
-    kinds = {
-        Axis.IMAGE: (Panorama, Features, GlobalDescriptor, Pose),
-        Axis.PAIR: (TwoView,),
-        Axis.VIEW: (RangeMap, SurfaceSamples, FaceFiles),
-        None: (Files,),
-        Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, Structure, TrackedPoints),
-    }
-    for axis, those in kinds.items():
-        assert {kind.axis for kind in those} == {axis}
-    assert Poses.explodes_into is Pose
-    assert {kind.kind_name() for kind in kinds[Axis.IMAGE]} == {"Panorama", "Features", "GlobalDescriptor", "Pose"}

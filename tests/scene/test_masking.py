@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.masks.masking import decode_mask, painted_over, placed_mask
+from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from tests.stored import read_picture
 
 VALID = np.array([[True, True, False, True], [False, True, True, True]])

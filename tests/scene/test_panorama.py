@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, ray_grid
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.scene.masks.cropping import Crop
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.masking import Crop
 from pano_mvs.scene.record import Record
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene import panorama as module
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
-from pano_mvs.scene.image_files.recent_pictures import RecentPictures
+from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.scene.panorama import RecentPictures
 
 
 def picture(level: int, rows: int = 4) -> np.ndarray:

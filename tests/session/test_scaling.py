@@ -35,7 +35,7 @@ from pano_mvs.stages.frame import ScaleParams, scale
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.algorithms.floor_plan_rooms import room_cloud
-from tests.io.test_ply_frame import vertices
+from tests.io.test_ply import vertices
 from tests.stages.test_floor_plan import the_cloud, the_poses
 
 WORKFLOW = """

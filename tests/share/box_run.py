@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, ray_grid
-from pano_mvs.io.clouds.mesh_writer import MeshArrays, write_ply_mesh
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.ranges.files import write_range_tiff
+from pano_mvs.io.ply import MeshArrays, write_ply, write_ply_mesh
+from pano_mvs.io.ranges import write_range_tiff
 from pano_mvs.results.run_output import RunOutput, load
-from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.share.frame import page_from_world
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.share.share import page_from_world
 from tests.viewer.scenes import HALF, box_cloud, turned_poses, write_output
 
 NAMES = ("lobby/000.png", "lobby/001.png", "lobby/002.png")

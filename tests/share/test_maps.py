@@ -12,11 +12,10 @@ import pytest
 
 from pano_mvs.results.run_output import load
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.share import share_run
-from pano_mvs.share.plan_file import run_plans
-from pano_mvs.share.top_view import MapPlace, closed, coverage_colors, cut_height, place_around, top_view
+from pano_mvs.share.maps import MapPlace, closed, coverage_colors, cut_height, place_around, run_plans, top_view
 from tests.share.box_run import box_run, frame_of_page
 from tests.share.test_share import value_of
 

@@ -15,9 +15,9 @@ import pytest
 from pano_mvs.core.errors import InputError
 from pano_mvs.results.run_output import load
 from pano_mvs.share import share_run
+from pano_mvs.share.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
 from pano_mvs.share.glb_file import read_glb
 from pano_mvs.share.mesh_file import SharedMesh, run_mesh, thinned
-from pano_mvs.share.mesh_pieces import PIECE_FACES, VertexFacts, mesh_pieces, z_order
 from tests.share.box_run import POINT_SIGMA, box_mesh, box_run, frame_of_page, wall_color
 from tests.share.test_share import value_of
 
@@ -143,7 +143,7 @@ def decoded(described: dict[str, Any], text: str, *, textured: bool) -> dict[str
 
 @pytest.mark.parametrize("textured", [True, False])
 def test_pieces_hold_all_triangles_once(textured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pano_mvs.share.mesh_pieces.PIECE_FACES", 300)
+    monkeypatch.setattr("pano_mvs.share.encoding.PIECE_FACES", 300)
     vertices, colors, faces = box_mesh()
     mesh = textured_box() if textured else SharedMesh(vertices, faces, colors_rgb=colors)
     steps, views = (np.arange(len(vertices)) % 251).astype(np.uint8), (np.arange(len(vertices)) % 9).astype(np.uint8)

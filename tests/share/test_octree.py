@@ -7,8 +7,7 @@ import base64
 import numpy as np
 
 from pano_mvs.scene import PointCloud
-from pano_mvs.share.encoding import encode_points
-from pano_mvs.share.octree import octree
+from pano_mvs.share.encoding import encode_points, octree
 
 
 def cloud(count: int) -> PointCloud:

@@ -21,10 +21,9 @@ from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.share import ShareOptions, share_run
-from pano_mvs.share.encoding import encode_ranges
-from pano_mvs.share.frame import page_from_world
+from pano_mvs.share.encoding import encode_ranges, level_count, panorama_tiles
 from pano_mvs.share.page_folder import SCRIPTS
-from pano_mvs.share.tiles import level_count, panorama_tiles
+from pano_mvs.share.share import page_from_world
 from tests.share.box_run import NAMES, box_ranges, box_run
 from tests.viewer.scenes import turned_poses, world_color
 

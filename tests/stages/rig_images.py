@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 from pano_mvs.algorithms.stitching import stitch_lenses
 from pano_mvs.geometry import LensRig
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
-from pano_mvs.testing.fisheye_rig import Layout, example_rig, write_rig_capture
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.testing.room import capture_poses, default_room
+from tests.synthetic.fisheye_rig import Layout, example_rig, write_rig_capture
 
 _folders: list[TemporaryDirectory[str]] = []
 

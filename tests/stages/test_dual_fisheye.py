@@ -15,21 +15,22 @@ import pytest
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.stages.exports.colmap import ModelParams, colmap
 from pano_mvs.stages.poses import RefineParams, refine
-from pano_mvs.stages.rigs.dual_fisheye import (
+from pano_mvs.stages.rigs import (
     DualFisheyeParams,
+    colmap_lenses,
     dual_fisheye,
+    lens_mask,
     list_captures,
     stitching_memory_bytes,
 )
-from pano_mvs.stages.rigs.exports import colmap_lenses, lens_mask
-from pano_mvs.testing.fisheye_rig import Layout, calibration_text, example_rig, write_rig_capture
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.poses.rig_capture import rig_capture
 from tests.cli.conftest import Command, pano_mvs
 from tests.stages.rig_images import tiny_rig, tiny_rig_capture, tiny_rig_panorama
+from tests.synthetic.fisheye_rig import Layout, calibration_text, example_rig, write_rig_capture
 
 __all__ = ["pano_mvs"]  # a fixture
 

@@ -13,10 +13,10 @@ import pytest
 
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import angle_between, ray_grid
-from pano_mvs.io.colmap.maps import read_colmap_map
-from pano_mvs.scene import FilePart, Files, Panorama, Poses, RangeMap
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.io.colmap.workspace import read_colmap_map
+from pano_mvs.scene import FilePart, Panorama, Poses, RangeMap
+from pano_mvs.scene.files import FaceFiles
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
     DenseParams,
@@ -28,9 +28,8 @@ from pano_mvs.stages.exports.colmap import (
     colmap_dense_init,
     colmap_faces,
     colmap_masks,
-    faces_memory_bytes,
 )
-from pano_mvs.stages.points import SurfaceParams, TrackedParams, surface, tracked
+from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.benchmarks.colmap_dense import context, deliver, fused_points, wall_distances, write_workspace
 from tests.stored import read_picture
@@ -185,15 +184,6 @@ def test_faces_follow_their_settings_and_the_model_follows_the_faces(capture: Ca
         assert read_picture(tmp_path / "colmap_dense/images" / image.name).shape == (40, 40, 3)
 
 
-def test_memory_goes_with_the_panorama_and_the_face(capture: Capture) -> None:
-    """Measured: 2.5 GB for 8192×4096 with faces as fine as that."""
-    large = dataclasses.replace(capture.images[NAMES[0]], size_hw=(4096, 8192))
-    assert 2.5e9 < faces_memory_bytes(FacesParams(), {"image": large}) < 3.5e9
-    assert (
-        faces_memory_bytes(FacesParams.model_validate({"size_px": 300}), {"image": capture.images[NAMES[0]]}) < 0.25e9
-    )
-
-
 def test_pictures_that_differ_in_their_extension_alone_stay_apart(capture: Capture, tmp_path: Path) -> None:
     poses = Poses.without_points(
         dict(zip(("1.jpg", "1.png"), capture_poses(2), strict=True)), frame="", scale="", metric=False
@@ -203,14 +193,6 @@ def test_pictures_that_differ_in_their_extension_alone_stay_apart(capture: Captu
     colmap_dense(poses=poses, faces=cuts, images=Names(poses.names), points=None, params=DenseParams(), ctx=ctx)
     model = pycolmap.Reconstruction(tmp_path / "scratch/sparse")
     assert {"1.jpg_front.jpg", "1.png_front.jpg"} < {image.name for image in model.images.values()}
-
-
-def test_the_cut_is_stored_with_the_files(tmp_path: Path) -> None:
-    (tmp_path / "x").write_bytes(b"x")
-    cut = FaceFiles({"a/{item}.jpg": tmp_path / "x"}, "octagon", 75.0, 12, ".png")
-    again = FaceFiles.from_parts(cut.to_parts())
-    assert isinstance(again, Files)
-    assert vars(again) == vars(cut)
 
 
 def test_seeds_are_points_with_tracks_in_the_panoramas(capture: Capture, tmp_path: Path) -> None:

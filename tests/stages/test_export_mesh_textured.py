@@ -16,9 +16,9 @@ from pano_mvs.algorithms.fusion.fuse import fuse_stream
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
 from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.geometry import Rigid3
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.pose_groups import join_groups
-from pano_mvs.stages.exports.mesh_textured import TexturedParams, mesh_textured
+from pano_mvs.stages.exports.mesh import TexturedParams, mesh_textured
 from tests.algorithms.mesh.box import HALF, WALL_COLORS, capture, poses
 from tests.stored import read_picture
 

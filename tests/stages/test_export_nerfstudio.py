@@ -16,15 +16,13 @@ from scipy.spatial import cKDTree
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
+from pano_mvs.io.ply import open_ply_points, read_ply
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import (
     NerfstudioFramesParams,
     NerfstudioParams,
-    frames_memory_bytes,
     nerfstudio,
     nerfstudio_frames,
 )
@@ -129,15 +127,6 @@ def test_depths_are_on_the_walls(plain: Path, variant: str) -> None:
     else:
         assert np.median(found) < 0.001  # interpolated between range pixels 0.9° apart …
         assert np.quantile(found, 0.9) < 0.02  # … but at the edges of the furniture
-
-
-def test_both_variants_are_one_cloud(plain: Path) -> None:
-    clouds = []
-    for variant in ("equirectangular", "faces"):
-        document = json.loads((plain / variant / "transforms.json").read_text())
-        clouds.append(np.concatenate([world_points(plain / variant, document, f)[0] for f in document["frames"]]))
-    distances, _ = cKDTree(clouds[0]).query(clouds[1])
-    assert np.median(distances) < 0.02  # pixels of 0.9° at 2 to 3 units
 
 
 def test_poses_are_read_back_by_our_own_reader(plain: Path) -> None:
@@ -352,9 +341,3 @@ def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:
         params = NerfstudioFramesParams(variants=("equirectangular",))
         made = nerfstudio_frames(given, None, params, Context(np.random.default_rng(0), scratch))
         assert list(made.files) == ["nerfstudio/equirectangular/images/{name}.jpg"]
-
-
-def test_what_a_panorama_takes_goes_with_its_pixels() -> None:
-    image = replace(tiny_capture(PLAIN).images["000.png"], size_hw=(4096, 8192), source_size_hw=(4096, 8192))
-    assert 1.2e9 < frames_memory_bytes(NerfstudioFramesParams(), {"image": image}) < 1.5e9
-    assert frames_memory_bytes(NerfstudioFramesParams.model_validate({"size_px": 8192}), {"image": image}) > 3e9

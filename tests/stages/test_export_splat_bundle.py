@@ -28,24 +28,22 @@ from pano_mvs.api import (
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import SplatFrames
-from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_confidence_png, read_normals
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.ranges import read_confidence_png, read_normals
+from pano_mvs.io.splats import SplatFrames
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import TrackedPoints
 from pano_mvs.stages.exports.splat_bundle import (
     SplatBundleParams,
     SplatFramesParams,
     splat_bundle,
     splat_frames,
-    splat_frames_memory_bytes,
 )
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points
 from tests.stored import read_picture
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW = (128, 256)
 STEP = 0.001
@@ -318,13 +316,6 @@ def test_the_code_of_the_documentation_gives_points_on_the_walls(room: Path) -> 
     np.testing.assert_allclose(names["in_world"], expected[np.isfinite(expected).all(axis=-1)], atol=1e-9)
 
 
-def test_poses_are_read_back_by_our_own_reader(room: Path) -> None:
-    capture = tiny_capture(Variant(SIZE_HW))
-    poses = read_poses(room / "equirectangular" / "transforms.json")
-    assert poses.names == capture.names
-    np.testing.assert_allclose(poses.rotations, [pose.rotation for pose in capture.poses], atol=1e-12)
-
-
 PHOTO_HW = (60, 80)
 
 
@@ -507,11 +498,3 @@ def test_without_frames_there_is_no_bundle(tmp_path: Path) -> None:
     poses = tiny_capture(Variant((64, 128))).whole(Poses)
     with pytest.raises(InputError, match="no panorama has both a pose and frames"):
         splat_bundle({}, poses, None, None, None, SplatBundleParams(), Context(np.random.default_rng(0), tmp_path))
-
-
-def test_the_memory_grows_with_panorama_and_face() -> None:
-    small, large = (tiny_capture(Variant(size)).images["000.png"] for size in ((64, 128), (128, 256)))
-    params = SplatFramesParams()
-    assert splat_frames_memory_bytes(params, {"image": large}) > splat_frames_memory_bytes(params, {"image": small})
-    wide = SplatFramesParams.model_validate({"size_px": 2048})
-    assert splat_frames_memory_bytes(wide, {"image": small}) > 300_000_000

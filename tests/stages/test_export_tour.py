@@ -16,9 +16,8 @@ import pytest
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import Context, Pose, Poses, RangeMap
 from pano_mvs.geometry import Rigid3, ray_from_pixel, ray_grid, rotate_panorama, rotation_from_rotvec
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import find_gpano
-from pano_mvs.scene.level_panorama import LevelPanorama
+from pano_mvs.io.images.metadata import find_gpano, read_container
+from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.stages.exports.tour import PanoramasParams, TourExportParams, panoramas, tour_of_panoramas
 from pano_mvs.testing.room import default_room, range_along, render
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture

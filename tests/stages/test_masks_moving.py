@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama, Pose, RangeMap
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.masks import MovingParams, moving
-from pano_mvs.testing.persons import draw_people, person
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.persons import draw_people, person
 
 SIZE_HW = (128, 256)
 CENTERS = {"a.png": (0.0, 0.0, 0.0), "b.png": (0.7, 0.05, 0.3), "c.png": (-0.5, -0.05, 0.6), "d.png": (0.1, 0.0, -0.7)}

@@ -12,11 +12,11 @@ from pano_mvs.core.errors import ContractError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3, roll_panorama
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.scene.static_masks import StaticMasks, camera_of
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.panorama import StaticMasks, camera_of
 from pano_mvs.stages.masks import StaticParams, apply, static
-from pano_mvs.testing.rig import helmet, with_rig
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.rig import helmet, with_rig
 
 SIZE_HW = (128, 256)
 

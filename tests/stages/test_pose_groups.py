@@ -17,14 +17,13 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
-from pano_mvs.scene.face_files import FaceFiles
+from pano_mvs.scene.files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
-from pano_mvs.stages.depth import SweepParams, sweep
+from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
+from pano_mvs.stages.depth import ExchangeParams, PatchMatchParams, SweepParams, exchange, patchmatch, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
@@ -40,9 +39,7 @@ from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
-from pano_mvs.stages.fusion import FusionParams, vote
-from pano_mvs.stages.patchmatch import ExchangeParams, PatchMatchParams, exchange, patchmatch
-from pano_mvs.stages.points import TrackedParams, tracked
+from pano_mvs.stages.fusion import FusionParams, TrackedParams, tracked, vote
 from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 from tests.stored import write_npz

@@ -11,8 +11,8 @@ from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid
-from pano_mvs.io.images.tours import list_scenes
-from pano_mvs.stages.source_tour import TourParams, list_tour, tour
+from pano_mvs.io.images.captures import list_scenes
+from pano_mvs.stages.source import TourParams, list_tour, tour
 from tests.io.images.tours import LAYOUTS, NAMES, color_of, face_of, write, write_tour
 
 

@@ -15,7 +15,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.io.images.video import describe_video, frames_between
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.stages.source_video import VideoParams, list_frames, video
 from tests.algorithms.keyframes.walked_room import grey_from
 from tests.io.images.videos import Picture, counted, number_of, retimed, write_video

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 
 FULL_VARIABLE = "PANO_MVS_TEST_FULL_DISK"

@@ -15,20 +15,16 @@ import numpy as np
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
-from pano_mvs.evaluation.inputs.range_files import find_ranges
-from pano_mvs.evaluation.inputs.truth import read_truth
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
-from pano_mvs.io.colmap.maps import read_colmap_map, write_depth_map
-from pano_mvs.io.colmap.model_writer import write_colmap_model
+from pano_mvs.evaluation.inputs import find_ranges, read_truth
+from pano_mvs.io.colmap.workspace import read_colmap_map, write_depth_map
+from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.exr import has_exr, write_exr
+from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_mesh, write_ply, write_ply_mesh
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
-from pano_mvs.io.ranges.files import read_normals
+from pano_mvs.io.ranges import has_exr, read_normals, write_exr
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.image_files.image_file import decode_image
-from pano_mvs.scene.masks.masking import decode_mask
+from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.masking import decode_mask
 from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.room import capture_poses
 from pano_mvs.viewer.shown_scene import has_faces

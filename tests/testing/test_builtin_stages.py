@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, SplatFrames
-from pano_mvs.scene.level_panorama import LevelPanorama
+from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
+from pano_mvs.scene.files import LevelPanorama
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.io.images.tours import tiny_tour

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_quat_wxyz
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.colmap.model_writer import write_colmap_model
+from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.ply import write_ply
 from pano_mvs.scene import PointCloud, Poses
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.upright import z_up_from_world
 
 SIZE_HW = (64, 128)

@@ -10,13 +10,12 @@ from numpy.lib.recfunctions import drop_fields
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.images.preview import write_preview
+from pano_mvs.io.ply import open_ply_points, write_ply
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
+from pano_mvs.viewer.actors import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.cloud_colors import DrawnCloud, color_cloud, drawn_cloud
-from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.shown_scene import has_faces, is_to_see, open_scene
 from tests.viewer.scenes import turned_poses, write_output
 

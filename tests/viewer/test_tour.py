@@ -13,13 +13,20 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.cloud_colors import drawn_cloud
-from pano_mvs.viewer.controller import Tour, pixel_readout
-from pano_mvs.viewer.picking import camera_under, point_under
+from pano_mvs.viewer.controller import Tour, camera_under, pixel_readout, point_under
 from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
-from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, outer_box, sphere_radius
-from pano_mvs.viewer.viewpoint import Viewpoint, looking_along
+from pano_mvs.viewer.viewpoint import (
+    Viewpoint,
+    bar_length,
+    bar_text,
+    box_of,
+    length_text,
+    looking_along,
+    outer_box,
+    sphere_radius,
+)
 from tests.viewer.scenes import HALF, turned_poses, write_output
 
 SIZE = (900, 600)

@@ -19,7 +19,7 @@ import numpy as np
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, spiral_rays
-from pano_mvs.scene.face_files import FaceLayout
+from pano_mvs.scene.files import FaceLayout
 
 _MARGIN = 0.17  # in units of the focal length; required by detectors and descriptors beyond the face
 _MIN_MARGIN_PX = 24

@@ -24,7 +24,7 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
-from pano_mvs.scene.structure import Structure
+from pano_mvs.scene.surfaces import Structure
 
 # What a pixel without a plane costs, where 1 is a range that is not on the plane.
 _NO_PLANE = 0.6

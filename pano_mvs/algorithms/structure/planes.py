@@ -20,7 +20,7 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
-from pano_mvs.scene.structure import Structure
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
 
 _DRAWN_POINTS, _LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 6000, 64, 200, 5

@@ -30,7 +30,7 @@ from pano_mvs.algorithms.sweep.winner import range_map_from_winners
 from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.scene.masks.masking import placed_mask
+from pano_mvs.scene.masking import placed_mask
 from pano_mvs.scene.range_map import RangeMap
 
 __all__ = ["SweepSettings", "sweep_range"]

@@ -17,14 +17,13 @@ from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.commands import run_command
 from pano_mvs.session.session import Session
 from pano_mvs.stages.depth import SweepParams
-from pano_mvs.viewer.inspect.inspection import Inspection
-from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
+from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
 
 _SHOWN = 6
 
@@ -147,7 +146,7 @@ def _truth_of(session: Session, image: str) -> Path | None:
 
 
 def _write_plot(path: Path, found: Inspection) -> None:
-    from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
+    from pano_mvs.viewer.curves import write_curve_picture
 
     if path.suffix.lower() != ".png":
         raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")

@@ -11,8 +11,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.scene.range_map import confidence_name
-from pano_mvs.viewer.inspect.curve_text import curve_text
-from pano_mvs.viewer.inspect.inspection import Inspection
+from pano_mvs.viewer.curves import curve_text
+from pano_mvs.viewer.inspection import Inspection
 
 _BLOCKS = "▁█△"
 

@@ -16,7 +16,7 @@ from statistics import median
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.files import read_regular, write_text
 from pano_mvs.core.paths import stat_of
-from pano_mvs.scene.image_files.header import image_kind, stated_size_of_file
+from pano_mvs.scene.image_header import image_kind, stated_size_of_file
 
 FILE_NAME = "unit-times.json"
 _MAX_SAMPLES = 8

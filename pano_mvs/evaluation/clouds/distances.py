@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.clouds import points as point_source
-from pano_mvs.evaluation.clouds.points import PointSource
 from pano_mvs.evaluation.clouds.true_surface import TrueSurface
-from pano_mvs.evaluation.ranges.pixels import weighted_quantile
+from pano_mvs.evaluation.ranges.view_scores import weighted_quantile
+from pano_mvs.geometry import Similarity3
 
 DEFAULT_THRESHOLDS = 0.05, 0.02
 
@@ -76,9 +76,6 @@ def cloud_distances(
         true_points: the whole true surface in pieces (K, 3): everything that any view sees.
         surface: the part to be covered.
         limit: larger distances count as infinite.
-
-    Raises:
-        UsageError: if the limit is not positive.
     """
     if not limit > 0:
         raise UsageError(f"the largest distance to measure must be positive, got {limit}")
@@ -96,13 +93,7 @@ def cloud_distances(
 def score_cloud(
     distances: CloudDistances, surface: TrueSurface, thresholds: Sequence[float] = DEFAULT_THRESHOLDS
 ) -> tuple[CloudScore, ...]:
-    """Return the scores at each tolerance; an empty cloud scores 0.
-
-    Args:
-        distances: measured up to the largest tolerance at least.
-        surface: the part to be covered.
-        thresholds: tolerances, in the truth's unit.
-    """
+    """Return the scores at each tolerance; an empty cloud scores 0."""
     area = float(surface.area.sum())
     scores = []
     for threshold in thresholds:
@@ -117,7 +108,7 @@ def score_cloud(
 
 def _parts(cloud: PointSource) -> Iterator[tuple[slice, NDArray[np.float32]]]:
     """Return the points in chunks of at most `CHUNK_POINTS`, with their positions in the cloud."""
-    start, size = 0, point_source.CHUNK_POINTS
+    start, size = 0, CHUNK_POINTS
     for chunk in cloud.chunks():
         for first in range(0, len(chunk), size):
             part = chunk[first : first + size]
@@ -137,3 +128,68 @@ def _nearest(points: NDArray[np.float32], others: cKDTree | None, limit: float) 
         return np.full(len(points), np.inf, np.float32)
     distance, _ = others.query(points, distance_upper_bound=np.nextafter(limit, np.inf))
     return np.asarray(distance, np.float32)
+
+
+CHUNK_POINTS = 2_000_000
+"""Largest number of points that are in memory, and in a search tree, at a time."""
+
+Points = NDArray[np.float32]
+
+
+class PointSource(Protocol):
+    """Points on disk or in memory; `PlyPoints` is one too."""
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+
+    def chunks(self) -> Iterator[Points]:
+        """Return the positions in chunks (K, 3), in order."""
+
+    def some(self, step: int) -> tuple[Points, Points]:
+        """Return positions and normals, both (K, 3), of every step-th point; unknown normals are 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointsInMemory:
+    """Positions (N, 3) and normals (N, 3), None if unknown."""
+
+    positions: Points
+    normals: Points | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self.positions)
+
+    def chunks(self) -> Iterator[Points]:
+        """Return the positions in chunks (K, 3)."""
+        return (self.positions[at : at + CHUNK_POINTS] for at in range(0, self.count, CHUNK_POINTS))
+
+    def some(self, step: int) -> tuple[Points, Points]:
+        """Return positions and normals of every step-th point; unknown normals are 0."""
+        positions = self.positions[::step]
+        return positions, np.zeros_like(positions) if self.normals is None else self.normals[::step]
+
+
+@dataclass(frozen=True, eq=False)
+class MovedPoints:
+    """Points brought into another frame by a similarity transform."""
+
+    source: PointSource
+    target_from_source: Similarity3
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return self.source.count
+
+    def chunks(self) -> Iterator[Points]:
+        """Return the positions in chunks (K, 3), in the target's frame."""
+        return (self.target_from_source.apply(chunk).astype(np.float32) for chunk in self.source.chunks())
+
+    def some(self, step: int) -> tuple[Points, Points]:
+        """Return positions and normals of every step-th point, in the target's frame."""
+        positions, normals = self.source.some(step)
+        moved = self.target_from_source
+        return moved.apply(positions).astype(np.float32), (normals @ moved.rotation.T).astype(np.float32)

@@ -16,10 +16,13 @@ from pano_mvs.evaluation.clouds.distances import (
     DEFAULT_THRESHOLDS,
     CloudDistances,
     CloudScore,
+    MovedPoints,
+    Points,
+    PointsInMemory,
+    PointSource,
     cloud_distances,
     score_cloud,
 )
-from pano_mvs.evaluation.clouds.points import MovedPoints, Points, PointsInMemory, PointSource
 from pano_mvs.evaluation.clouds.true_surface import (
     TrueSurface,
     TrueView,
@@ -27,16 +30,22 @@ from pano_mvs.evaluation.clouds.true_surface import (
     surface_of_views,
     view_points,
 )
-from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras
-from pano_mvs.evaluation.inputs.sources import as_path, source_name
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
-from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.inputs import (
+    Cameras,
+    as_path,
+    camera_groups,
+    find_true_ranges,
+    length_unit,
+    read_cameras,
+    source_name,
+)
+from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.io.images.names import pair_image_names
+from pano_mvs.io.ply import open_ply_points
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 
 CLOUD_FILE, MODEL_FOLDER = "cloud.ply", "colmap/sparse/0"
 # Distances are measured up to this multiple of the largest tolerance, for quantiles and files.

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.rendering import draw_cloud, viewpoints
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds.distances import Points, PointsInMemory
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation
-from pano_mvs.evaluation.clouds.points import Points, PointsInMemory
 from pano_mvs.evaluation.drawing import WIDTH, put_text, strip, write_stack
+from pano_mvs.io.ply import RGB, ply_header
 
-_COLORS = ("red", "green", "blue")
-_VERTEX = np.dtype([*((name, "<f4") for name in "xyz"), *((name, "u1") for name in _COLORS), ("distance", "<f4")])
-_PLY_TYPES = {"f": "float", "u": "uchar"}
+_VERTEX = np.dtype([*((name, "<f4") for name in "xyz"), *((name, "u1") for name in RGB), ("distance", "<f4")])
 # From correct to wrong, distinguishable for colour-blind readers.
 _NEAREST, _FARTHEST, _BEYOND = np.array([38, 130, 142]), np.array([240, 190, 60]), (190, 30, 45)
 _NOT_COUNTED = (205, 205, 205)
@@ -53,22 +52,17 @@ def write_error_cloud(
         distances: (N,) of each; larger ones than `farthest` are written as `farthest`.
         limits: tolerances in rising order, for the colours (see `distance_colors`).
         farthest: the largest distance that was measured.
-
-    Raises:
-        UsageError: if there are not N points.
     """
-    properties = "".join(f"property {_PLY_TYPES[_VERTEX[name].kind]} {name}\n" for name in _VERTEX.names or ())
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(distances)}\n{properties}end_header\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     start = 0
     with path.open("wb") as stream:
-        stream.write(head.encode())
+        stream.write(ply_header(len(distances), _VERTEX))
         for chunk in points:
             part = distances[start : start + len(chunk)]
             start += len(chunk)
             vertices = np.zeros(len(part), _VERTEX)
             columns = (*chunk[: len(part)].T, *distance_colors(part, limits).T)
-            for name, column in zip((*"xyz", *_COLORS), columns, strict=True):
+            for name, column in zip((*"xyz", *RGB), columns, strict=True):
                 vertices[name] = column
             vertices["distance"] = np.minimum(part, np.float32(farthest))
             stream.write(vertices.tobytes())
@@ -133,15 +127,7 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
 
 
 def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str, evaluation: CloudEvaluation) -> None:
-    """Write a PNG of points coloured by their distances, seen from three places, with a legend.
-
-    Args:
-        path: the file to write.
-        cloud: points (N, 3) in the truth's frame, their normals (N, 3) towards the visible side, or 0, and their
-            distances (N,); points seen from behind are left out.
-        title: what is shown.
-        evaluation: whose limits and cameras are used.
-    """
+    """Write a PNG of points coloured by their distances, seen from three places, with a legend."""
     points, normals, distances = cloud
     parts = [_legend(evaluation)]
     if len(points):

@@ -80,12 +80,7 @@ def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_sampl
 
 
 def surface_of_cloud(points_in_world: NDArray[np.float32], *, voxel_size: float) -> TrueSurface:
-    """Return a reference cloud as a surface: the points of a voxel share the weight 1.
-
-    Args:
-        points_in_world: (N, 3).
-        voxel_size: edge of a voxel, about the smallest tolerance.
-    """
+    """Return a reference cloud as a surface: the points of a voxel share the weight 1."""
     voxels = np.floor(points_in_world.astype(np.float64) / voxel_size).astype(np.int64)
     _, group, count = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
     idx = np.arange(len(points_in_world))

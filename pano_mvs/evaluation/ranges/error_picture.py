@@ -42,18 +42,7 @@ _SIGNED = np.array(
 def write_depth_pictures(
     folder: Path, evaluation: DepthEvaluation, *, images: Path | None = None, limit: float = 0.1
 ) -> None:
-    """Write a picture of the errors of each view, `<image name>.jpg` (see `write_error_picture`).
-
-    Args:
-        folder: where to write.
-        evaluation: the scored views.
-        images: folder of the panoramas; None: where the truth's poses.json says.
-        limit: relative error at which the colours end.
-
-    Raises:
-        InputError: if a file can no longer be read.
-        UsageError: if the limit is not positive.
-    """
+    """Write a picture of the errors of each view, `<image name>.jpg` (see `write_error_picture`)."""
     if not 0 < limit < float("inf"):
         raise UsageError(f"the error limit must be a positive number, got {limit}")
     panoramas = _panoramas(images, evaluation.pairs)
@@ -117,13 +106,7 @@ def signed_error(estimated: NDArray[np.floating], truth: NDArray[np.floating]) -
 
 
 def error_colored(error: NDArray[np.float64], limit: float, *, counted: NDArray[np.bool_] | None = None) -> Picture:
-    """Return signed errors as colours, (..., 3) RGB: black where NaN, grey where not counted.
-
-    Args:
-        error: (...,) from −limit, blue, over 0, white, to limit, red.
-        limit: where the scale ends.
-        counted: (...,), False is grey; None counts all.
-    """
+    """Return signed errors as colours, (..., 3) RGB: black where NaN, grey where not counted."""
     place = (np.clip(np.nan_to_num(error / limit), -1, 1) + 1) / 2 * (len(_SIGNED) - 1)
     at = np.minimum(place.astype(np.intp), len(_SIGNED) - 2)
     share = (place - at)[..., None]

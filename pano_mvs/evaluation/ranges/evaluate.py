@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.range_files import RangeMaps
-from pano_mvs.evaluation.inputs.sources import as_path, source_name
-from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.inputs import Cameras, RangeMaps, as_path, camera_groups, read_cameras, source_name
+from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges
 from pano_mvs.evaluation.ranges.view_scores import BASELINES, ScoreSettings, ViewScores, mean_scores, score_view
 from pano_mvs.evaluation.tables import finite_values
@@ -116,17 +114,7 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class DepthEvaluation:
-    """Scores of range maps.
-
-    Attributes:
-        source: name of the estimates' source.
-        truth: name of the truth's source.
-        settings: how the range maps were scored.
-        scale: factor from the estimates' unit to the truth's, before any fit.
-        views: scores by image name.
-        pairs: the range maps that were compared.
-        sizes: number of views by (height, width) of the estimate and of the truth.
-    """
+    """Scores of range maps."""
 
     source: str
     truth: str
@@ -157,11 +145,7 @@ class DepthEvaluation:
         return self.pairs.masks.missing(list(self.views))
 
     def read_maps(self, name: str) -> ViewMaps:
-        """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied.
-
-        Raises:
-            InputError: if a file can no longer be read.
-        """
+        """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied."""
         maps = self.pairs.read(name)
         estimated: NDArray[np.float32] = maps.estimated
         if self.settings.min_confidence and maps.confidence is not None:

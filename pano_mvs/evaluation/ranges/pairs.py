@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,10 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import shortened_list
-from pano_mvs.evaluation.inputs.range_files import RangeMaps, StoredRange, find_ranges
-from pano_mvs.evaluation.inputs.sources import source_name
-from pano_mvs.evaluation.inputs.truth import find_true_ranges
-from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
-from pano_mvs.io.images.mask_files import find_mask
-from pano_mvs.io.images.names import pair_image_names, without_extension
-from pano_mvs.scene.masks.masking import decode_mask, placed_mask
+from pano_mvs.evaluation.inputs import RangeMaps, StoredRange, find_ranges, find_true_ranges, source_name
+from pano_mvs.geometry import pad_panorama
+from pano_mvs.io.images.names import find_mask, pair_image_names, without_extension
+from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +67,7 @@ class ViewMasks:
         return () if self.folder is None else tuple(name for name in names if find_mask(self.folder, name) is None)
 
     def read(self, name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """Return the pixels (H, W) of a view that count, None for all.
-
-        Raises:
-            InputError: if a mask cannot be read.
-        """
+        """Return the pixels (H, W) of a view that count, None for all."""
         own = None if self.folder is None else find_mask(self.folder, name)
         sphere = (0, 0, size_hw[1], size_hw[0])
         counted = [
@@ -86,17 +80,7 @@ class ViewMasks:
 
 @dataclass(frozen=True)
 class RangePairs:
-    """Range maps and their ground truth.
-
-    Attributes:
-        estimates: the estimates with ground truth, by image name.
-        truths: their true range maps.
-        true_names: the truth's names of the images.
-        masks: which pixels count.
-        truth_path: folder or file with the truth, or None.
-        without_truth: names of the estimates without truth.
-        without_estimate: the truth's names of images without an estimate.
-    """
+    """Range maps and their ground truth."""
 
     estimates: Mapping[str, StoredRange]
     truths: Mapping[str, StoredRange]
@@ -149,3 +133,52 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
         tuple(name for name in estimates if name not in names),
         tuple(name for name in truths if name not in set(names.values())),
     )
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+# Largest relative difference of four neighbouring ranges on one surface.
+_ONE_SURFACE = 0.1
+
+
+def resized_range(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
+    """Return a range map at the pixel centres of another size.
+
+    If the four pixels around a place lie on one surface (all have a range, within 10 % of each other), 1 / range is
+    interpolated bilinearly: on a plane it is nearly linear. Elsewhere, at edges of objects and holes, the pixel that
+    contains the place is used, so that no range between two surfaces arises and no hole shrinks.
+
+    Args:
+        ranges: (H, W) float32 of a full sphere, NaN invalid, even W.
+        size_hw: (height, width) of the result, of the same aspect ratio.
+
+    Returns:
+        (height, width) float32; the map itself if it has that size.
+    """
+    if ranges.shape == size_hw:
+        return ranges
+    nearest = resized_labels(ranges, size_hw)
+    y, x = ((np.arange(new) + 0.5) * old / new + 0.5 for new, old in zip(size_hw, ranges.shape, strict=True))
+    row, column = np.floor(y).astype(np.intp), np.floor(x).astype(np.intp)
+    down, right = (y - row)[:, None], (x - column)[None, :]
+    padded = pad_panorama(ranges.astype(np.float64), 1)
+    corners = [padded[np.ix_(row + below, column + beside)] for below in (0, 1) for beside in (0, 1)]
+    near, far = np.minimum.reduce(corners), np.maximum.reduce(corners)  # NaN where any of the four is
+    shares = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
+    one_surface = far <= near * (1 + _ONE_SURFACE)
+    inverse = sum(share / np.where(one_surface, corner, 1.0) for share, corner in zip(shares, corners, strict=True))
+    return np.where(one_surface, 1 / inverse, nearest).astype(np.float32)
+
+
+def resized_labels(labels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray[Scalar]:
+    """Return a map of labels at the pixel centres of another size: the pixel that contains each centre."""
+    height, width = labels.shape
+    if height * size_hw[1] != width * size_hw[0]:
+        raise UsageError(
+            f"a map of {width}×{height} px cannot be compared with one of {size_hw[1]}×{size_hw[0]}: "
+            "both must be full panoramas, twice as wide as high"
+        )
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(np.intp) for new, old in zip(size_hw, labels.shape, strict=True)
+    )
+    return labels[np.ix_(rows, columns)]

@@ -13,9 +13,8 @@ import numpy as np
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.core.text import plural, shortened_list
-from pano_mvs.evaluation.ranges.errors import DELTAS
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
-from pano_mvs.evaluation.ranges.view_scores import BASELINES, PROTOCOLS, ViewScores
+from pano_mvs.evaluation.ranges.view_scores import BASELINES, DELTAS, PROTOCOLS, ViewScores
 from pano_mvs.evaluation.tables import Summary, TextTable
 
 _PROTOCOL_HEADINGS = ("every pixel", "… on sphere", "estimated", "… on sphere")
@@ -34,15 +33,7 @@ _BASELINE_WORDS = {
 
 
 def depth_summary(evaluation: DepthEvaluation, *, baseline: str = "best") -> Summary:
-    """Return how range maps were scored, the mean of all scores, and the main scores of each view, as text.
-
-    Args:
-        evaluation: the scores.
-        baseline: which constant is shown beside each score: "best", "median" or "mean".
-
-    Raises:
-        UsageError: if the baseline is unknown.
-    """
+    """Return how range maps were scored, the mean of all scores, and the main scores of each view, as text."""
     if baseline not in BASELINES:
         raise UsageError(f"'{baseline}' is not a baseline: choose one of {', '.join(BASELINES)}")
     views = evaluation.views

@@ -4,21 +4,274 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores, range_errors
-from pano_mvs.evaluation.ranges.pixels import (
-    Align,
-    ScoredPixels,
-    aligning_scale,
-    scored_pixels,
-    weighted_mean,
-    weighted_median,
-)
-from pano_mvs.evaluation.ranges.sparsification import sparsify
+from pano_mvs.geometry import pixel_solid_angle
+
+DELTAS = {"delta_105": 1.05, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
+"""Name of a score to the largest ratio of estimate and truth, either way round, of a correct pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class BadLimit:
+    """An error above which a pixel is bad."""
+
+    value: float
+    relative: bool = True
+
+    @property
+    def name(self) -> str:
+        """`bad_5` for 5 % of the truth, `bad_abs_0.1` for a tenth of the truth's unit."""
+        return f"bad_{100 * self.value:g}" if self.relative else f"bad_abs_{self.value:g}"
+
+    @classmethod
+    def from_text(cls, text: str) -> BadLimit:
+        """Return the limit written as "5%" or, in the truth's unit, as "0.1"."""
+        relative = text.strip().endswith("%")
+        try:
+            value = float(text.strip().removesuffix("%")) / (100 if relative else 1)
+        except ValueError:
+            value = float("nan")
+        if not 0 < value < float("inf"):
+            raise UsageError(f"'{text}' is not a limit for bad pixels: write a share (5%) or a length (0.1)")
+        return cls(value, relative)
+
+
+DEFAULT_BAD = (BadLimit(0.05),)
+
+
+def range_errors(
+    found: NDArray[np.float64],
+    true: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    *,
+    peak: float = 10.0,
+    bad: Sequence[BadLimit] = DEFAULT_BAD,
+) -> dict[str, float]:
+    """Return the weighted averages of the errors of pixels; NaN of no pixels.
+
+    With e = |found − true|: mse is the mean of (e / peak)², psnr_db −10 log10 of it, rmse its root times the peak, mae
+    the mean of e, and abs_rel the mean of e / true. A delta is the share of pixels with max(found / true, true / found)
+    below its limit, a bad the share with e / true (or e) above its limit.
+
+    Args:
+        found: (N,) estimates; where NaN, e is the truth itself, and the pixel is bad and fails every delta.
+        true: (N,) true ranges, positive.
+        weight: (N,) weight of each pixel.
+        peak: the range that counts as 1 in mse, in the truth's unit.
+        bad: limits of bad pixels.
+    """
+    valid = np.isfinite(found)
+    error = np.where(valid, np.abs(found - true), true)
+    relative = error / true
+    ratio = np.full_like(true, np.inf)
+    np.divide(np.maximum(found, true), np.minimum(found, true), out=ratio, where=valid & (found > 0))
+    averages = mse_scores(weighted_mean((error / peak) ** 2, weight), peak)
+    averages |= {"mae": weighted_mean(error, weight), "abs_rel": weighted_mean(relative, weight)}
+    averages |= {name: weighted_mean(ratio < limit, weight) for name, limit in DELTAS.items()}
+    for limit in bad:
+        beyond = (relative if limit.relative else error) > limit.value
+        averages[limit.name] = weighted_mean(beyond | ~valid, weight)
+    return averages
+
+
+def mse_scores(mse: float, peak: float) -> dict[str, float]:
+    """Return a mean of squared errors, in units of the squared peak, as mse, psnr_db and rmse."""
+    with np.errstate(divide="ignore"):
+        return {"mse": mse, "psnr_db": float(-10 * np.log10(mse)), "rmse": float(peak * np.sqrt(mse))}
+
+
+Align = Literal["none", "median", "lsq"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredPixels:
+    """The pixels of one view with ground truth, in any order.
+
+    Attributes:
+        found: (N,) estimated ranges in the truth's unit, NaN where there is no estimate.
+        true: (N,) true ranges, positive and finite.
+        weight: (N,) solid angles in steradians.
+        confidence: (N,) the larger the more confident, or None.
+    """
+
+    found: FloatArray
+    true: FloatArray
+    weight: FloatArray
+    confidence: NDArray[np.integer] | None = None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """The pixels, (N,), with an estimate."""
+        return np.isfinite(self.found)
+
+    def at(self, chosen: NDArray[Any]) -> ScoredPixels:
+        """Return the pixels at an index array or mask."""
+        confidence = None if self.confidence is None else self.confidence[chosen]
+        return ScoredPixels(self.found[chosen], self.true[chosen], self.weight[chosen], confidence)
+
+    def only_valid(self) -> ScoredPixels:
+        """Return the pixels with an estimate."""
+        valid = self.valid
+        return self if valid.all() else self.at(valid)
+
+    def scaled(self, scale: float) -> ScoredPixels:
+        """Return the pixels with all estimates multiplied by a factor."""
+        return self if scale == 1 else replace(self, found=scale * self.found)
+
+
+def has_range(ranges: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return the pixels, of the same shape, that hold a finite range above zero."""
+    held: NDArray[np.bool_] = np.isfinite(ranges) & (ranges > 0)
+    return held
+
+
+def scored_pixels(
+    estimated: NDArray[np.floating],
+    truth: NDArray[np.floating],
+    *,
+    confidence: NDArray[np.integer] | None = None,
+    scale: float = 1.0,
+    mask: NDArray[np.bool_] | None = None,
+) -> ScoredPixels:
+    """Return the pixels with ground truth and their estimates.
+
+    Args:
+        estimated: (H, W) ranges in scene units; values that are not positive and finite count as missing.
+        truth: (H, W) true ranges; pixels with anything but a positive finite one are ignored.
+        confidence: (H, W), the larger the more confident.
+        scale: factor from scene units to the truth's unit.
+        mask: (H, W), False excludes a pixel.
+
+    Raises:
+        UsageError: if the shapes differ or the scale is not positive.
+    """
+    others = [array.shape for array in (truth, confidence, mask) if array is not None]
+    if truth.ndim != 2 or any(shape != estimated.shape for shape in others):
+        raise UsageError(
+            f"estimated {estimated.shape}, truth {truth.shape}, confidence and mask must be (H, W) of one size"
+        )
+    if not scale > 0:
+        raise UsageError(f"the scale from scene units to the truth's must be positive, got {scale}")
+    counted = has_range(truth)
+    if mask is not None:
+        counted &= mask
+    found = estimated[counted].astype(np.float64)
+    found[~has_range(found)] = np.nan
+    weight = np.broadcast_to(pixel_solid_angle((truth.shape[0], truth.shape[1]))[:, None], truth.shape)[counted]
+    of_pixels = None if confidence is None else confidence[counted]
+    return ScoredPixels(found * scale, truth[counted].astype(np.float64), weight, of_pixels)
+
+
+def aligning_scale(pixels: ScoredPixels, align: Align) -> float:
+    """Return the factor that fits the estimates to the truth; 1 for "none", and without estimates.
+
+    "median" is the weighted median of the truth over that of the estimates. "lsq" is the factor s with the least sum of
+    squares Σ Ω (s d − t)², s = Σ Ω d t / Σ Ω d². Both use the pixels with an estimate d of their truth t, weighted by
+    their solid angle Ω. Fitted scores do not follow the paper's protocol, which never uses the true ranges.
+    """
+    both = pixels.only_valid()
+    if align == "none" or not len(both.true):
+        return 1.0
+    if align == "median":
+        return weighted_median(both.true, both.weight) / weighted_median(both.found, both.weight)
+    return float(np.sum(both.weight * both.found * both.true) / np.sum(both.weight * both.found**2))
+
+
+def weighted_mean(values: FloatArray | NDArray[np.bool_], weight: FloatArray) -> float:
+    """Return the weighted mean; NaN of no values."""
+    total = float(weight.sum())
+    return float((values * weight).sum()) / total if total > 0 else float("nan")
+
+
+def weighted_median(values: NDArray[np.floating], weight: FloatArray) -> float:
+    """Return the smallest value at which half the weight is reached; NaN of no values."""
+    return weighted_quantile(values, weight, 0.5)
+
+
+def weighted_quantile(values: NDArray[np.floating], weight: FloatArray, share: float) -> float:
+    """Return the smallest of the values (N,) at which a share of the weight (N,) is reached; NaN of no values."""
+    if not len(values):
+        return float("nan")
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(reached, reached[-1] * share)]])
+
+
+# Larger relative errors count as this one; otherwise a few far pixels would decide the area.
+_MAX_ERROR = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sparsification:
+    """Mean error of the most confident pixels against the share of pixels that is kept.
+
+    Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
+    order. Errors are |error| / truth, at most 1.
+
+    Attributes:
+        kept: (N,) share of the pixels with truth and estimate that is kept, growing to 1.
+        error: (N,) mean relative error of those.
+        oracle_error: (N,) mean relative error if the pixels were ordered by their true errors.
+        area: under the curve, the mean over all shares.
+        oracle_area: under the oracle's.
+    """
+
+    kept: NDArray[np.float64]
+    error: NDArray[np.float64]
+    oracle_error: NDArray[np.float64]
+    area: float
+    oracle_area: float
+
+    @property
+    def ause(self) -> float:
+        """Area between the two curves: 0 if confidence orders the pixels like their errors; less is better."""
+        return self.area - self.oracle_area
+
+    @property
+    def unranked_area(self) -> float:
+        """The area if all pixels had the same confidence: the mean error."""
+        return float(self.error[-1]) if len(self.error) else float("nan")
+
+
+def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsification:
+    """Return the sparsification curve of a range map; an empty curve with NaN areas if no pixel has an estimate.
+
+    E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018, section 5.1.
+    """
+    both = pixels.only_valid()
+    if both.confidence is None:
+        raise UsageError("sparsification needs the confidence of the pixels")
+    weight = both.weight if by_solid_angle else np.ones_like(both.weight)
+    if len(weight) == 0:
+        nothing = np.zeros(0)
+        return Sparsification(nothing, nothing, nothing, float("nan"), float("nan"))
+    error = np.minimum(np.abs(both.found - both.true) / both.true, _MAX_ERROR)
+    kept, mean, area = _curve(both.confidence.astype(np.float64), error, weight)
+    oracle_kept, oracle_mean, oracle_area = _curve(-error, error, weight)
+    return Sparsification(kept, mean, np.interp(kept, oracle_kept, oracle_mean), area, oracle_area)
+
+
+def _curve(
+    sureness: NDArray[np.float64], error: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the shares kept, their mean errors, and the area under the curve."""
+    levels, level = np.unique(-sureness, return_inverse=True)
+    added = np.bincount(level, weight, len(levels)) / weight.sum()
+    lost = np.bincount(level, weight * error, len(levels)) / weight.sum()
+    kept, total = np.cumsum(added), np.cumsum(lost)
+    before, total_before = kept - added, total - lost
+    # Within a level of mean error m the curve is (E + m x) / (k + x), whose integral over x from 0 to a is
+    # m a + (E − m k) ln(1 + a / k).
+    mean = lost / added
+    growth = np.log1p(np.divide(added, before, out=np.zeros_like(added), where=before > 0))
+    area = float(np.sum(mean * added + (total_before - mean * before) * growth))
+    return kept, total / kept, area
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +300,6 @@ def best_constant_errors(
     abs_rel its median weighted by weight / truth; for a delta t the c with the most weight in c / t < true < c t, the
     best window of ratio t² in the sorted truth; for a bad b likewise with true in [c / (1 + b), c / (1 − b)], or in
     [c − b, c + b] for a length.
-
-    Args:
-        true: (N,) true ranges, positive.
-        weight: (N,) weight of each pixel.
-        peak: as in `range_errors`.
-        bad: limits of bad pixels.
     """
     names = [*mse_scores(1.0, peak), "mae", "abs_rel", *DELTAS, *(limit.name for limit in bad)]
     if not len(true):

@@ -9,15 +9,17 @@ stereo/patch-match.cfg, stereo/fusion.cfg           the list of images
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.io.colmap.image_copies import write_picture
-from pano_mvs.io.colmap.maps import write_depth_map, write_normal_map
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene import FilePart
+from pano_mvs.scene.image_file import write_png
 
 WORKSPACE = "colmap_dense"
 _SOURCES = 20  # as COLMAP's image_undistorter writes
@@ -87,3 +89,69 @@ def write_stereo_configs(scratch: Path, image_names: Iterable[str]) -> dict[str,
     match_file.write_text("".join(f"{name}\n__auto__, {_SOURCES}\n" for name in names), encoding="utf-8")
     fusion_file.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     return targets
+
+
+_HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
+
+
+def write_depth_map(path: Path, z_depth: NDArray[np.float32]) -> None:
+    """Write z-depths (H, W) float32; NaN becomes COLMAP's 0."""
+    if z_depth.ndim != 2 or z_depth.dtype != np.float32:
+        raise UsageError(f"a depth map is (H, W) float32, got {z_depth.shape} {z_depth.dtype}")
+    _write(path, z_depth[..., None])
+
+
+def write_normal_map(path: Path, normals_in_cam: NDArray[np.float32]) -> None:
+    """Write normals (H, W, 3) float32 in the picture's camera frame; NaN becomes (0, 0, 0)."""
+    if normals_in_cam.ndim != 3 or normals_in_cam.shape[2] != 3 or normals_in_cam.dtype != np.float32:
+        raise UsageError(f"a normal map is (H, W, 3) float32, got {normals_in_cam.shape} {normals_in_cam.dtype}")
+    _write(path, normals_in_cam)
+
+
+def read_colmap_map(path: Path) -> NDArray[np.float32]:
+    """Return a depth map (H, W) or a normal map (H, W, 3) as stored in the file: 0 where unknown.
+
+    Raises:
+        InputError: if the file cannot be read or is not such a map.
+    """
+    data = FilePart(path).read_bytes()
+    header = _HEADER.match(data)
+    width, height, channels = (int(number) for number in header.groups()) if header else (0, 0, 0)
+    if header is None or len(data) != header.end() + 4 * width * height * channels:
+        raise InputError(f"{path}: not a complete depth or normal map of COLMAP. Write it again")
+    planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(channels, height, width)
+    return np.ascontiguousarray(planes[0] if channels == 1 else np.moveaxis(planes, 0, -1), np.float32)
+
+
+def _write(path: Path, values: NDArray[np.float32]) -> None:
+    """Write (H, W, C) as planes."""
+    height, width, channels = values.shape
+    planes = np.ascontiguousarray(np.moveaxis(np.nan_to_num(values, nan=0.0), -1, 0), "<f4")
+    path.write_bytes(f"{width}&{height}&{channels}&".encode() + planes.tobytes())
+
+
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+_WRITABLE = (".bmp", ".tif", ".tiff", ".webp")
+
+
+def write_picture(path: Path, picture: NDArray[np.uint8], size_hw: tuple[int, int] | None = None) -> None:
+    """Write an image (H, W, 3) uint8 RGB in the format of the path's suffix; other formats become JPEG (quality 95)."""
+    if size_hw is not None and picture.shape[:2] != size_hw:
+        enlarged = size_hw[1] > picture.shape[1]
+        way = cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA
+        picture = np.asarray(cv2.resize(picture, size_hw[::-1], interpolation=way), np.uint8)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        write_png(path, picture)
+        return
+    kind, options = (suffix, []) if suffix in _WRITABLE else (".jpg", _JPEG)
+    path.write_bytes(cv2.imencode(kind, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)[1].tobytes())
+
+
+def resized_mask(mask: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask (H, W) resized with nearest-neighbour sampling at the centres of the new pixels."""
+    rows, columns = (
+        np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.intp), old - 1)
+        for new, old in zip(size_hw, mask.shape, strict=True)
+    )
+    return np.asarray(mask[rows[:, None], columns])

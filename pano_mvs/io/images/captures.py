@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Literal
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import OUTPUT_MARK, is_cache
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.core.text import shortened_list
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.exif import orientation_from_exif, position_from_exif
-from pano_mvs.io.images.gpano import GPano, find_gpano
+from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif, position_from_exif, read_container
 from pano_mvs.scene import FilePart
-from pano_mvs.scene.image_files.decoding import MAX_PIXELS, check_stated_size
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
@@ -64,10 +62,6 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
 
     Hidden files, hidden folders, folders called `masks`, output folders of runs and caches are ignored.
 
-    Args:
-        folder: the folder.
-        notes: see `files_below`.
-
     Raises:
         InputError: if the folder does not exist, cannot be listed, or contains no image.
     """
@@ -109,11 +103,6 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
 
     An image is a panorama if its GPano metadata describe a whole or cropped one, or, with a warning, if it is exactly
     twice as wide as high.
-
-    Args:
-        path: the file.
-        data: its bytes, if they have been read already.
-        max_pixels: the limit of pixels.
 
     Raises:
         InputError: if the file cannot be read, is not an image, is larger than the limit, or is not an equirectangular
@@ -228,3 +217,172 @@ def _placed(
             "the width must be twice the height. Correct the metadata, or remove them"
         )
     return (full_height, full_width), None if whole else crop_ltwh, warnings
+
+
+FACES = "frblud"
+_NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top": "u", "down": "d", "bottom": "d"}
+_FACE = "|".join([*_NAMES, *FACES])
+# Scene, level, face, row and column in the path of a tile without its extension.
+_LAYOUTS = (
+    re.compile(r"(?P<scene>.*?)/?(?P<level>\d+)/(?P<face>[frblud])/(?P<row>\d+)/(?P<column>\d+)"),  # Marzipano
+    re.compile(r"(?P<scene>.*?)/?(?P<level>\d+)/(?P<face>[frblud])(?P<row>\d+)_(?P<column>\d+)"),  # Pannellum
+    re.compile(r"(?P<scene>.*?)(?:/[frblud]|/mres_[frblud])?/l(?P<level>\d+)(?:/[frblud])?/(?:\d+/)?"
+               r"l\d+_(?P<face>[frblud])_(?P<row>\d+)_(?P<column>\d+)"),  # krpano
+    re.compile(rf"(?P<scene>.*?)[/_.-]?(?P<face>{_FACE})", re.IGNORECASE),  # six files
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TourScene:
+    """One scene.
+
+    Attributes:
+        name: of its folder or the common part of its files, below the folder that all scenes share.
+        tiles: file of each tile of the finest complete resolution, by face, row and column, which count from 0.
+    """
+
+    name: str
+    tiles: Mapping[tuple[str, int, int], Path]
+
+
+def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
+    """Return the scenes of a tour in natural order.
+
+    Known are tiles of Marzipano (`2/f/0/1.jpg`), Pannellum (`2/f0_1.jpg`) and krpano (`l2/f/01/l2_f_01_02.jpg`), and
+    six files (`hall_f.jpg`, `hall/front.jpg`).
+
+    Raises:
+        InputError: if there is no complete scene.
+    """
+    found: dict[str, dict[int, dict[tuple[str, int, int], Path]]] = {}
+    for path in files_below(folder, notes):
+        place = path.relative_to(folder).with_suffix("").as_posix()
+        match = next((match for layout in _LAYOUTS if (match := layout.fullmatch(place))), None)
+        if match is None or path.suffix.lower() not in PICTURE_SUFFIXES:
+            continue
+        groups = match.groupdict()
+        face = _NAMES.get(groups["face"].lower(), groups["face"].lower())
+        tile = face, int(groups.get("row") or 0), int(groups.get("column") or 0)
+        found.setdefault(groups["scene"], {}).setdefault(int(groups.get("level") or 0), {})[tile] = path
+    scenes = {name: tiles for name, levels in found.items() if (tiles := _finest(levels))}
+    if incomplete := [name or folder.name for name in found if name not in scenes]:
+        notes.append(f"{len(incomplete)} scenes have no complete cube and are skipped: {shortened_list(incomplete)}")
+    if not scenes:
+        raise InputError(
+            f"{folder}: no tour here. Six faces of a cube are needed for each scene: tiles of Marzipano, Pannellum or "
+            "krpano, or files such as hall_f.jpg, hall_r.jpg, hall_b.jpg, hall_l.jpg, hall_u.jpg and hall_d.jpg"
+        )
+    shared = os.path.commonpath([str(PurePosixPath(name).parent) for name in scenes]) if scenes else ""
+    named = {_below(name, shared) or folder.name: tiles for name, tiles in scenes.items()}
+    return [TourScene(name, named[name]) for name in sorted(named, key=natural_key)]
+
+
+def _below(name: str, shared: str) -> str:
+    return PurePosixPath(name).relative_to(shared).as_posix() if name else ""
+
+
+def _finest(levels: Mapping[int, Mapping[tuple[str, int, int], Path]]) -> dict[tuple[str, int, int], Path]:
+    """Return the tiles of the finest level in which all faces have the same rows and columns without a gap."""
+    for level in sorted(levels, reverse=True):
+        tiles = levels[level]
+        rows, columns = sorted({row for _, row, _ in tiles}), sorted({column for _, _, column in tiles})
+        expected = {(face, row, column) for face in FACES for row in rows for column in columns}
+        gapless = all(places == list(range(places[0], places[-1] + 1)) and places[0] <= 1 for places in (rows, columns))
+        if gapless and len(rows) == len(columns) and expected == set(tiles):
+            return {(face, row - rows[0], column - columns[0]): path for (face, row, column), path in tiles.items()}
+    return {}
+
+
+Layout = Literal["auto", "side_by_side", "folders", "suffixes"]
+
+
+@dataclass(frozen=True, slots=True)
+class RigPictures:
+    """The pictures of one capture of a rig.
+
+    Attributes:
+        name: path relative to the folder, without the lens and with the extension .png.
+        files: the file that contains both pictures side by side, or the file of each lens.
+        problem: why the capture is incomplete; empty if it is complete.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    problem: str = ""
+
+
+def list_rig_pictures(
+    folder: Path, lens_names: Sequence[str], layout: Layout, *, notes: list[str] | None = None
+) -> list[RigPictures]:
+    """Return the captures in a folder and its subfolders, in natural order.
+
+    Args:
+        folder: the folder.
+        lens_names: names of the two lenses.
+        layout: "side_by_side": each file shows both lenses, the first on the left; "folders": one of the folders in
+            the path of a file has the name of its lens, as in front/000.jpg; "suffixes": file names end with a
+            separator and the name of the lens, as in 000_front.jpg. "auto": folders if a folder has the name of a lens,
+            suffixes if a file does, otherwise side_by_side.
+        notes: see `list_pictures`.
+
+    Raises:
+        InputError: if the folder contains no images, or none that fit the layout.
+    """
+    paths = list_pictures(folder, notes)
+    names = [PurePosixPath(path.relative_to(folder).as_posix()) for path in paths]
+    if layout == "auto":
+        layout = _layout(names, lens_names)
+    if layout == "side_by_side":
+        return [RigPictures(str(name.with_suffix(".png")), (path,)) for name, path in zip(names, paths, strict=True)]
+    found = list(_pairs(paths, names, lens_names=lens_names, layout=layout))
+    if not found:
+        example = f"{lens_names[0]}/000.jpg" if layout == "folders" else f"000_{lens_names[0]}.jpg"
+        raise InputError(
+            f"{folder}: no image belongs to a lens of the calibration ({' or '.join(lens_names)}). Call files like "
+            f"{example}, or set layout: side_by_side"
+        )
+    return found
+
+
+def _layout(names: Sequence[PurePosixPath], lens_names: Sequence[str]) -> Layout:
+    for layout in ("folders", "suffixes"):
+        if any(_lens_of(name, lens_names, layout) is not None for name in names):
+            return layout
+    return "side_by_side"
+
+
+def _pairs(
+    paths: Sequence[Path], names: Sequence[PurePosixPath], *, lens_names: Sequence[str], layout: Layout
+) -> Iterator[RigPictures]:
+    captures: dict[str, dict[int, Path]] = {}
+    for path, name in zip(paths, names, strict=True):
+        found = _lens_of(name, lens_names, layout)
+        if found is None:
+            captures.setdefault(str(name), {})
+            continue
+        lens_idx, shared = found
+        captures.setdefault(shared, {}).setdefault(lens_idx, path)
+    if not any(captures.values()):
+        return
+    for shared, files in captures.items():
+        if not files:
+            yield RigPictures(shared, (), f"does not belong to a lens: no {layout} {' or '.join(lens_names)}")
+            continue
+        missing = [name for idx, name in enumerate(lens_names) if idx not in files]
+        problem = f"the picture of the lens {missing[0]} is missing" if missing else ""
+        if len({file.suffix for file in files.values()}) > 1:
+            problem = "the pictures of its lenses have different formats; save both in the same"
+        yield RigPictures(f"{shared}.png", tuple(files[idx] for idx in sorted(files)), problem)
+
+
+def _lens_of(name: PurePosixPath, lens_names: Sequence[str], layout: Layout) -> tuple[int, str] | None:
+    """Return the lens of a file, and its path without the lens and without extension; None if it has no lens."""
+    for idx, lens in enumerate(lens_names):
+        if layout == "folders":
+            folders = name.parts[:-1]
+            if lens in folders:
+                kept = [part for position, part in enumerate(name.parts) if position != folders.index(lens)]
+                return idx, str(PurePosixPath(*kept).with_suffix(""))
+        elif (stem := name.stem).endswith(lens) and len(stem) > len(lens) + 1 and stem[-len(lens) - 1] in "_-. ":
+            return idx, str(name.with_name(stem[: -len(lens) - 1]))
+    return None

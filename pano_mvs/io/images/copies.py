@@ -18,8 +18,8 @@ from pano_mvs.core.errors import InputError, StoreError
 from pano_mvs.core.files import replacing
 from pano_mvs.io.images.keyframe_file import file_of_state
 from pano_mvs.scene import FilePart
-from pano_mvs.scene.image_files.decoding import MAX_PIXELS, decode_picture
-from pano_mvs.scene.image_files.header import stated_size
+from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
+from pano_mvs.scene.image_header import stated_size
 
 _SIZE_HW = (128, 256)
 _BLUR_PX = 2.0  # coarser structure is alike in all pictures of a place
@@ -46,10 +46,6 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS) -> d
     """Return, for each picture that is a copy of an earlier one, which one.
 
     Pictures that OpenCV does not read are compared with none.
-
-    Args:
-        paths: the files, by name.
-        max_pixels: larger pictures are not decoded.
     """
     known = {name: picture for name, path in paths.items() if (picture := _reduced(path, max_pixels)) is not None}
     return copies_among(known)

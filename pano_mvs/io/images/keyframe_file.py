@@ -18,12 +18,7 @@ from pano_mvs.core.paths import resolved
 
 
 def keyframe_file(video: Path, settings: object) -> Path | None:
-    """Return the file for the keyframes of a video as it is now; None if the user has no writable folder for caches.
-
-    Args:
-        video: the video; its path, size, time stamps and inode are part of the file's name.
-        settings: plain values that the choice depends on.
-    """
+    """Return the file for the keyframes of a video as it is now; None if the user has no writable folder for caches."""
     return file_of_state(video, "keyframes", settings, suffix=".json")
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import below, children, is_file, is_folder
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES
 
 _SEPARATOR = "|"  # between the two names of a pair
@@ -20,10 +23,6 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     one with the same extension. A name is left out if two are equally close. Several names may have one counterpart;
     see `pair_image_names`.
 
-    Args:
-        wanted: names relative to a capture, such as "a/001.jpg".
-        available: names in another file, such as "images/a/001.jpg" or "./001.png".
-
     Returns:
         Wanted name to available name.
     """
@@ -35,10 +34,6 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
 
 def pair_image_names(names: Iterable[str], available: Iterable[str]) -> dict[str, str]:
     """Pair image names one to one: those that are the closest to each other, as in `match_image_names`.
-
-    Args:
-        names: image names, such as "a/001".
-        available: names of the other side, such as "images/a/001.jpg".
 
     Returns:
         Name to available name.
@@ -101,3 +96,41 @@ def _closeness(name: str, other: str) -> tuple[bool, int, bool, bool]:
 
 def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".") or ("",)
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """Return the mask file of an image, or None if it has none.
+
+    The mask of `a/b.jpg` is `a/b.jpg.png`, as COLMAP names it, else `a/b.png`. The mask of `a/b`, whose extension is
+    not known, is `a/b.png` with any image extension before the last (`a/b.JPG.png`), else `a/b.png`.
+    """
+    plain = without_extension(name)
+    if plain == name:
+        stem = PurePosixPath(plain).name
+        full_names = [
+            path
+            for path in children((folder / plain).parent, f"{glob.escape(stem)}.*.png")
+            if without_extension(path.stem) == stem
+        ]
+    else:
+        full_names = [folder / f"{name}.png"]
+    return next((path for path in (*full_names, folder / f"{plain}.png") if is_file(path)), None)
+
+
+def require_masks(folder: Path, names: Sequence[str]) -> None:
+    """Check that a folder holds a mask of at least one image.
+
+    Raises:
+        InputError: if it does not, or if it is not a folder.
+    """
+    if not is_folder(folder):
+        raise InputError(f"{folder}: masks must be a folder. Set one mask for all images with `mask`")
+    if any(find_mask(folder, name) for name in names):
+        return
+    files = [path.relative_to(folder).as_posix() for path in below(folder) if is_file(path)]
+    others = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    content = f"it holds {files[0]}{others}" if files else "it is empty"
+    raise InputError(
+        f"{folder}: no mask in it belongs to an image of the capture ({content}). The mask of {names[0]} must be "
+        f"called {names[0]}.png, or {without_extension(names[0])}.png"
+    )

@@ -90,12 +90,7 @@ def unconfirmed_classes(confidence: NDArray[np.uint8]) -> list[Literal["weak", "
 
 
 def mark_unconfirmed(colors: NDArray[np.uint8], confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours of a range map with weak ranges pale and filled ones pale with stripes.
-
-    Args:
-        colors: (H, W, 3) RGB.
-        confidence: (H, W) uint8 as of range maps. If it confirms no range, weak ones keep their colours.
-    """
+    """Return the colours of a range map with weak ranges pale and filled ones pale with stripes."""
     filled, weak = _unconfirmed(confidence)
     height, width = confidence.shape
     period, thickness = _STRIPES_PX

@@ -46,10 +46,6 @@ class VideoInfo:
 def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
     """Return a video, or all videos in a folder and its subfolders in natural order.
 
-    Args:
-        path: the video, or the folder.
-        notes: see `files_below`.
-
     Raises:
         InputError: if there is no video, or only recordings that must be stitched first.
     """

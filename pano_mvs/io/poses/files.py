@@ -11,8 +11,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.io.colmap.model_writer import is_colmap_model, read_colmap_model
-from pano_mvs.io.poses.alicevision import alicevision_poses, is_alicevision
+from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
     read_json_value,
     read_posed_views,
@@ -22,8 +21,14 @@ from pano_mvs.io.poses.json_files import (
     rigid_from_arrays,
 )
 from pano_mvs.io.poses.metashape import read_metashape
-from pano_mvs.io.poses.openmvg import is_openmvg, openmvg_poses
-from pano_mvs.io.poses.opensfm import is_opensfm, opensfm_poses
+from pano_mvs.io.poses.other_json import (
+    alicevision_poses,
+    is_alicevision,
+    is_openmvg,
+    is_opensfm,
+    openmvg_poses,
+    opensfm_poses,
+)
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
@@ -96,9 +101,6 @@ def read_groups(path: Path) -> list[Poses]:
 
     Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given. Each has its
     own world. Images of an earlier group are omitted.
-
-    Raises:
-        InputError: as `read_poses`.
     """
     groups = [read_poses(path)]
     model = _file_or_model(path)
@@ -112,11 +114,7 @@ def read_groups(path: Path) -> list[Poses]:
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of the images of poses by name, if the file states them (poses.json).
-
-    Raises:
-        InputError: as `read_poses`.
-    """
+    """Return the SHA-256 of the images of poses by name, if the file states them (poses.json)."""
     path = _file_or_model(path)
     value = read_json_value(path) if path.suffix.lower() in _JSON else None
     if not isinstance(value, dict) or "views" not in value or is_openmvg(value) or is_alicevision(value):

@@ -21,14 +21,7 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class PosedView:
-    """One view of a poses.json.
-
-    Attributes:
-        name: the image's name with forward slashes.
-        cam_from_world: its pose.
-        number: its id, or None.
-        sha256: hex digest of the image file, or None.
-    """
+    """One view of a poses.json."""
 
     name: str
     cam_from_world: Rigid3
@@ -37,11 +30,7 @@ class PosedView:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Raises:
-        InputError: if the file cannot be read or does not contain a JSON object.
-    """
+    """Return the object in a JSON file."""
     return require_object(read_json_value(path), path)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import resolved
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.thinning import chunks
-from pano_mvs.io.colmap.model_reader import model_files, read_cameras, read_images
+from pano_mvs.io.colmap.reader import model_files, read_cameras, read_images
+from pano_mvs.io.ply import open_ply_points
+from pano_mvs.io.thinning import chunks
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.scene import PointCloud, Poses

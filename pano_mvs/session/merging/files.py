@@ -16,11 +16,10 @@ from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.core.files import copy_file, replacing, write_text
 from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Similarity3
-from pano_mvs.io.clouds.ply_writer import write_ply_parts
-from pano_mvs.io.colmap.model_writer import write_colmap_model
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame
-from pano_mvs.io.nerfstudio.transforms import transforms_document
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.ply import write_ply_parts
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
+from pano_mvs.io.splats import NerfstudioFrame, transforms_document
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.run_output import RunView
 from pano_mvs.results.summary import RunSummary

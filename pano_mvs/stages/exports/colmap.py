@@ -30,18 +30,22 @@ from pano_mvs.api import (
 from pano_mvs.core.paths import children
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView
-from pano_mvs.io.colmap.image_copies import resized_mask, write_picture
-from pano_mvs.io.colmap.model_writer import write_colmap_model
-from pano_mvs.io.colmap.points import ModelForm
-from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
-from pano_mvs.io.colmap.workspace import WORKSPACE, face_image_name, sparse_targets, write_face, write_stereo_configs
-from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.files import item_stems
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.io.colmap.workspace import (
+    WORKSPACE,
+    face_image_name,
+    resized_mask,
+    sparse_targets,
+    write_face,
+    write_picture,
+    write_stereo_configs,
+)
+from pano_mvs.io.colmap.writer import CutPanorama, ModelForm, write_colmap_model, write_rig_model
+from pano_mvs.scene.files import FaceFiles, item_stems
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.tracked_points import TrackedPoints
-from pano_mvs.stages.rigs.exports import lens_rig_files
+from pano_mvs.scene.surfaces import TrackedPoints
+from pano_mvs.stages.rigs import lens_rig_files
 
 
 class ModelParams(Params):

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.api import (
+    All,
     Context,
     Each,
     Files,
@@ -25,19 +26,76 @@ from pano_mvs.api import (
     settings_from,
     stage,
 )
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
-from pano_mvs.io.images import exr
 from pano_mvs.io.images.preview import write_preview
-from pano_mvs.io.ranges.files import (
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.poses.metashape import write_metashape
+from pano_mvs.io.poses.other_json import write_openmvg
+from pano_mvs.io.ranges import (
+    EXR_REMEDY,
+    has_exr,
     write_confidence_png,
+    write_exr,
     write_normals_png,
     write_normals_tiff,
     write_range_png,
     write_range_tiff,
 )
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
-from pano_mvs.stages.exports.axes import FrameParams, files_from_world
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.upright import world_up, z_up_from_world
+
+
+class FrameParams(Params):
+    """The frame of the coordinates in a file."""
+
+    frame: Literal["upright", "world"] = Field(
+        default="upright",
+        description="upright: turned so that z points up; world: as the poses and COLMAP models, usually y down",
+    )
+
+
+def files_from_world(params: FrameParams, poses: Poses | None, *, groups: int) -> list[NDArray[np.float64] | None]:
+    """Return the rotation (3, 3) into the axes of the file of each group; None for the world's own axes.
+
+    Without poses, −y of the world is up.
+    """
+    if params.frame == "world":
+        return [None] * groups
+    if poses is None:
+        return [z_up_from_world()] * groups
+    known = [z_up_from_world(world_up(group)) for group in split_groups(poses)]
+    return [known[number] if number < len(known) else z_up_from_world() for number in range(groups)]
+
+
+class PosesParams(Params):
+    """Settings of export.poses."""
+
+    programs: tuple[Literal["openmvg", "metashape"], ...] = Field(
+        default=("openmvg", "metashape"), description="programs whose files are written"
+    )
+
+
+@stage("export.poses")
+def poses_files(poses: One[Poses], images: All[Panorama], params: PosesParams, ctx: Context) -> Files:
+    """Write the poses as poses/sfm_data.json for openMVG, with points and tracks, and poses/cameras.xml for Metashape.
+
+    Cameras are spherical and have the size of the image files. Both files have the world of the poses; the component in
+    Metashape's file turns it so that z points up. Further groups of poses are sfm_data_1.json, cameras_1.xml …
+    """
+    files: dict[str, Path] = {}
+    sizes_hw = {name: image.source_size_hw for name, image in images.items()}
+    for number, group in enumerate(split_groups(poses)):
+        if "openmvg" in params.programs:
+            name = group_file("sfm_data.json", number)
+            files[f"poses/{name}"] = ctx.scratch / name
+            write_openmvg(ctx.scratch / name, group, sizes_hw)
+        if "metashape" in params.programs:
+            name = group_file("cameras.xml", number)
+            files[f"poses/{name}"] = ctx.scratch / name
+            turn = z_up_from_world(world_up(group))
+            write_metashape(ctx.scratch / name, group, sizes_hw, file_from_world=turn)
+    return Files(files)
 
 
 @params_from(Selection)
@@ -96,8 +154,8 @@ class RangesParams(Params):
     @field_validator("formats", "normals")
     @classmethod
     def _can_be_written(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
-        if "exr" in formats and not exr.has_exr():
-            raise ValueError(exr.REMEDY)
+        if "exr" in formats and not has_exr():
+            raise ValueError(EXR_REMEDY)
         return tuple(dict.fromkeys(formats))
 
 
@@ -144,7 +202,7 @@ def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams,
     elif suffix == "npy":
         np.save(path, values)
     elif suffix == "exr":
-        exr.write_exr(path, {"Z": values})
+        write_exr(path, {"Z": values})
     else:
         beyond = write_range_png(path, values, unit=params.png_unit)
         ctx.metric("beyond_png", beyond / values.size)
@@ -169,5 +227,5 @@ def _write_normals(normals: NDArray[np.float32], suffix: str, folder: Path) -> P
     elif suffix == "npy":
         np.save(path, normals)
     else:
-        exr.write_exr(path, {name: np.ascontiguousarray(normals[..., idx]) for idx, name in enumerate("RGB")})
+        write_exr(path, {name: np.ascontiguousarray(normals[..., idx]) for idx, name in enumerate("RGB")})
     return path

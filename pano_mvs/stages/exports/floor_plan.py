@@ -17,7 +17,7 @@ from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
 from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.paths import children
-from pano_mvs.io.plans.drawing_files import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
+from pano_mvs.io.plan_drawings import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
 from pano_mvs.scene.upright import world_up, z_up_from_world
 
 Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]

@@ -30,12 +30,18 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
-from pano_mvs.io.colmap.image_copies import write_picture
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, PanoramaFrames, Variant
-from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, transforms_document
-from pano_mvs.io.ranges.files import write_confidence_png, write_normals_png, write_range_png
+from pano_mvs.io.colmap.workspace import write_picture
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.ranges import write_confidence_png, write_normals_png, write_range_png
+from pano_mvs.io.splats import (
+    NerfstudioFrame,
+    PanoramaFrames,
+    Variant,
+    is_common_picture,
+    open_mask,
+    transforms_document,
+)
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
 
@@ -93,13 +99,7 @@ class Layers:
 
 
 class FrameFiles:
-    """The files of one panorama below a folder of the output.
-
-    Args:
-        root: the folder; each variant is a folder below it.
-        params: settings of the stage.
-        ctx: of the stage.
-    """
+    """The files of one panorama below a folder of the output."""
 
     def __init__(self, root: str, params: FramesParams, ctx: Context) -> None:
         """Start without files."""
@@ -195,11 +195,7 @@ def _seen_by(face: Face, layers: Layers, *, threads: int) -> Layers:
 
 
 def frames_with_poses(poses: Poses, frames: Mapping[str, PanoramaFrames], ctx: Context) -> Mapping[str, PanoramaFrames]:
-    """Return the frames of all registered panoramas, and report those that have no frames.
-
-    Raises:
-        InputError: if there is no such panorama.
-    """
+    """Return the frames of all registered panoramas, and report those that have no frames."""
     loaded = {name: frames[name] for name in poses.names if name in frames}
     if not loaded:
         raise InputError("no panorama has both a pose and frames: nothing can be listed in transforms.json")
@@ -214,13 +210,7 @@ def frames_with_poses(poses: Poses, frames: Mapping[str, PanoramaFrames], ctx: C
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedGroup:
-    """One group of poses with the frames of its panoramas.
-
-    Attributes:
-        number: of the group; 0 is the largest.
-        poses: of the group.
-        frames: of those of its panoramas that have frames; not empty.
-    """
+    """One group of poses with the frames of its panoramas."""
 
     number: int
     poses: Poses

@@ -2,27 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.mesh.atlas import unwrapped
 from pano_mvs.algorithms.mesh.surface import (
     MIN_POINTS,
+    FreeSpace,
     Mesh,
+    decimated,
     point_spacings,
     poisson_depth,
     solve_poisson,
     trimmed_mesh,
+    used_part,
     without_crumbs,
 )
-from pano_mvs.api import Context, Files, InputError, One, PointCloud, Poses, stage
+from pano_mvs.algorithms.mesh.texture import TexturedMesh, balanced_views, textured
+from pano_mvs.algorithms.mesh.view_quality import PaintView
+from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
-from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
-from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.io.meshes import (
+    SUFFIXES,
+    TexturedArrays,
+    TextureFormat,
+    encoded_texture,
+    write_glb,
+    write_mtl,
+    write_obj,
+    write_usdz,
+)
+from pano_mvs.io.ply import read_ply, read_ply_mesh, write_ply, write_ply_mesh
+from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
-from pano_mvs.stages.exports.axes import FrameParams, files_from_world
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.upright import world_up, y_up_from_world
+from pano_mvs.stages.exports.files import FrameParams, files_from_world
 
 
 class MeshParams(FrameParams):
@@ -105,3 +126,186 @@ def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest:
     if not len(solved.faces):
         raise InputError("the mesh has no faces: the points form no common surface. Raise `trim` or `max_points`")
     return solved, depth
+
+
+NAME = "mesh_textured"
+
+# Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
+_DEEPEST = 9
+
+# Measured: of each texel and of each pixel of a panorama while the texture is painted, of the mesh before it is
+# simplified, and of the solver.
+_BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _MESH_BYTES, _SOLVER_BYTES = 60, 120, 400_000_000, 1_000_000_000
+
+
+class TexturedParams(MeshParams):
+    """Settings of export.mesh_textured."""
+
+    depth: int = Field(
+        default=0,
+        ge=0,
+        le=14,
+        description="depth of the octree: cells are extent / 2^depth wide; 0: by point spacing, at most 9",
+    )
+    trim: float = Field(
+        default=12.0,
+        ge=0,
+        description="cut off parts farther from the points than this times their spacing; 0: keep all",
+    )
+    triangles: int = Field(default=100_000, ge=100, description="number of triangles after simplification")
+    texture_px: int = Field(default=4096, ge=64, le=16384, description="largest width and height of the texture")
+    detail: float = Field(
+        default=1.0, gt=0, le=4, description="texels per pixel of the panoramas, as they see most of the surface"
+    )
+    formats: tuple[Literal["glb", "obj", "usdz"], ...] = Field(
+        default=("glb", "obj"), description="file formats of the mesh"
+    )
+    texture_format: TextureFormat = Field(default="jpeg", description="file format of the texture")
+    jpeg_quality: int = Field(default=92, ge=1, le=100, description="quality of a JPEG texture")
+    frame: Literal["upright", "world"] = Field(
+        default="upright", description="upright: turned so that y points up, as glTF expects; world: as the poses"
+    )
+
+
+def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
+    assert isinstance(params, TexturedParams)
+    images = inputs["images"]
+    pixels = 0
+    for name in images:
+        height, width = images[name].size_hw
+        pixels = max(pixels, height * width)
+    painting = params.texture_px**2 * _BYTES_PER_TEXEL + pixels * _BYTES_PER_PIXEL + _MESH_BYTES
+    return max(_SOLVER_BYTES, painting)
+
+
+@stage(
+    "export.mesh_textured",
+    memory=_memory,
+    needs={"fast_simplification": "fast-simplification", "xatlas": "xatlas"},
+)
+def mesh_textured(
+    cloud: One[PointCloud],
+    ranges: All[RangeMap],
+    poses: One[Poses],
+    images: All[Panorama],
+    params: TexturedParams,
+    ctx: Context,
+) -> Files:
+    """Write the surface of the fused cloud with a texture from the panoramas, as mesh_textured.glb and .obj.
+
+    The surface of `export.mesh` is simplified and unwrapped. Each panorama gives its colours to the texels that it
+    sees; masked pixels never do. Texels that no panorama sees are filled with the colours around them, and are black in
+    mesh_textured_seen.png. Further groups of poses, each in its own frame, are mesh_textured_1.glb …
+    """
+    files: dict[str, Path] = {}
+    for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
+        folder = ctx.scratch / str(number)
+        folder.mkdir()
+        try:
+            made = textured_mesh(group, (own, images, ranges), params, folder=folder, ctx=ctx)
+        except InputError as error:
+            if not number:
+                raise
+            ctx.note(f"no {group_file(f'{NAME}.glb', number)}: {error}")
+            continue
+        rotation = y_up_from_world(world_up(own)) if params.frame == "upright" else np.eye(3)
+        files |= _write(made, rotation, params, folder=folder, number=number)
+        if not number:
+            ctx.metric("triangles", len(made.faces))
+            ctx.metric("texture_px", max(made.atlas.size_hw))
+            ctx.metric("seen", _seen_share(made))
+    return Files(files)
+
+
+def textured_mesh(
+    cloud: PointCloud,
+    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
+    params: TexturedParams,
+    *,
+    folder: Path,
+    ctx: Context,
+) -> TexturedMesh:
+    """Return the textured surface of the cloud of one group of panoramas."""
+    solved, _ = solved_mesh(cloud, params, folder, deepest=_DEEPEST)
+    names = [name for name in views[0].names if name in views[1]]
+
+    def load(idx: int) -> PaintView:
+        return _paint_view(names[idx], views)
+
+    solved = _without_free_space(solved, names, views, smallest_part=params.smallest_part)
+    vertices, faces = decimated(solved.vertices_in_world, solved.faces, triangles=params.triangles)
+
+    balance = balanced_views(vertices, faces, load, views=len(names), threads=ctx.threads)
+    if not balance.density > 0:
+        raise InputError(
+            "no panorama sees the mesh, so it has no texture. Check the masks and the poses, or lower `trim`"
+        )
+    atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
+    return textured(vertices, faces, atlas, load=load, balance=balance, threads=ctx.threads)
+
+
+def _without_free_space(
+    mesh: Mesh,
+    names: Sequence[str],
+    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
+    *,
+    smallest_part: float,
+) -> Mesh:
+    """Return a mesh without the parts through which panoramas look."""
+    space = FreeSpace(mesh.vertices_in_world)
+    for name in names:
+        if name in views[2]:
+            pose = views[0].cam_from_world(views[0].names.index(name))
+            space.add(views[2][name], pose, views[1][name].load_mask())
+    free = space.free()
+    kept = used_part(mesh, mesh.faces[~free[mesh.faces].any(axis=1)])
+    kept = without_crumbs(kept, smallest_share=smallest_part)
+    if not len(kept.faces):
+        raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
+    return kept
+
+
+def _paint_view(name: str, views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]]) -> PaintView:
+    poses, images, ranges = views
+    image, range_map = images[name], ranges.get(name)
+    if range_map is not None and range_map.range.shape != image.size_hw:
+        range_map = None
+    pose = poses.cam_from_world(poses.names.index(name))
+    return PaintView(pose, image.load(), image.load_mask(), range_map)
+
+
+def _write(
+    mesh: TexturedMesh, rotation: NDArray[np.float64], params: TexturedParams, *, folder: Path, number: int
+) -> dict[str, Path]:
+    """Write the files of one group, and return them by target."""
+    positions = (mesh.vertices_in_world[mesh.atlas.vertex] @ rotation.T).astype(np.float32)
+    arrays = TexturedArrays(positions, mesh.atlas.uv, mesh.atlas.faces)
+    picture = encoded_texture(mesh.texture, params.texture_format, quality=params.jpeg_quality)
+
+    def target(suffix: str) -> str:
+        return group_file(f"{NAME}{suffix}", number)
+
+    seen = group_file(f"{NAME}.png", number).replace(".png", "_seen.png")
+    files = {seen: folder / "seen.png"}
+    write_png(files[seen], np.where(mesh.seen, np.uint8(255), np.uint8(0)))
+    if "glb" in params.formats:
+        files[target(".glb")] = folder / "mesh.glb"
+        write_glb(files[target(".glb")], arrays, picture, form=params.texture_format)
+    if "usdz" in params.formats:
+        files[target(".usdz")] = folder / "mesh.usdz"
+        write_usdz(files[target(".usdz")], arrays, picture, form=params.texture_format)
+    if "obj" in params.formats:
+        texture = target(SUFFIXES[params.texture_format])
+        files |= {target(".obj"): folder / "mesh.obj", target(".mtl"): folder / "mesh.mtl", texture: folder / "texture"}
+        write_obj(files[target(".obj")], arrays, material_file=target(".mtl"))
+        write_mtl(files[target(".mtl")], texture_file=texture)
+        files[texture].write_bytes(picture)
+    return files
+
+
+def _seen_share(mesh: TexturedMesh) -> float:
+    """Return the share of the triangles' area that a panorama sees."""
+    corners = mesh.atlas.uv_px
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = float(np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum()) / 2
+    return min(1.0, float(mesh.seen.sum()) / max(area, 1.0))

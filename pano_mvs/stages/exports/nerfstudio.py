@@ -22,10 +22,10 @@ from pano_mvs.api import (
     arguments_from,
     stage,
 )
-from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
+from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.stages.exports.axes import FrameParams, files_from_world
+from pano_mvs.stages.exports.files import FrameParams, files_from_world
 from pano_mvs.stages.exports.frame_files import (
     FrameFiles,
     FramesParams,

@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.faces.sampling import Facing, level_from_world, turned_panorama
 from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, Pose, Poses, RangeMap, stage
-from pano_mvs.io.colmap.image_copies import write_picture
-from pano_mvs.io.images.gpano_writer import add_level_gpano
-from pano_mvs.io.images.tour_players import (
+from pano_mvs.io.colmap.workspace import write_picture
+from pano_mvs.io.images.metadata import add_level_gpano
+from pano_mvs.io.ranges import write_range_tiff
+from pano_mvs.io.tour_players import (
     Link,
     Scene,
     krpano_tour,
@@ -26,9 +27,7 @@ from pano_mvs.io.images.tour_players import (
     pannellum_page,
     pannellum_tour,
 )
-from pano_mvs.io.ranges.files import write_range_tiff
-from pano_mvs.scene.files import group_file, item_stems
-from pano_mvs.scene.level_panorama import LevelPanorama
+from pano_mvs.scene.files import LevelPanorama, group_file, item_stems
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import states_y_down, states_z_north
 

@@ -10,7 +10,7 @@ import numpy as np
 import pye57
 import pytest
 from pano_mvs.api import Context, InputError, Params, PointCloud, Poses, Rigid3, UsageError
-from pano_mvs.io.clouds import thinning
+from pano_mvs.io import thinning
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pyproj import CRS, Transformer
 

@@ -18,8 +18,7 @@ from pano_mvs.algorithms.mesh.surface import (
     without_crumbs,
 )
 from pano_mvs.api import Context, InputError, PointCloud
-from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
-from pano_mvs.io.clouds.ply_writer import write_ply
+from pano_mvs.io.ply import read_ply_mesh, write_ply, write_ply_mesh
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
 
 HALF_SIZE = np.array([2.0, 1.2, 1.6])

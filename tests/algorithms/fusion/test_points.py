@@ -15,8 +15,7 @@ from pano_mvs.algorithms.ranges.kernels_agreement import see_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Poses, RangeMap
-from pano_mvs.scene.surface_samples import SurfaceSamples
-from pano_mvs.scene.tracked_points import TrackedPoints
+from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.points import sees
 

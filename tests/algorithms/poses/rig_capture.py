@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import LensRig, Rigid3, Similarity3, rotation_from_rotvec, similarity_from_points
 from pano_mvs.scene import Poses
-from pano_mvs.testing.fisheye_rig import example_rig
 from pano_mvs.testing.room import capture_poses, default_room, range_along
+from tests.synthetic.fisheye_rig import example_rig
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from pano_mvs.algorithms.poses.verification.aliases import (
     labellings,
     moved_cameras,
 )
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from tests.algorithms.poses.aliased_capture import TILE, AliasedCapture, aliased_capture, shifted_pose
 

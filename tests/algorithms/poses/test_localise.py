@@ -18,8 +18,8 @@ from pano_mvs.algorithms.poses.photograph_points import KnownPoints, has_sift, k
 from pano_mvs.algorithms.poses.photograph_surface import surface_points
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, render
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW = (256, 512)
 CENTERS = [(0.0, 0.0, 0.0), (0.5, 0.1, 0.2), (-0.3, 0.0, 0.6)]

@@ -26,8 +26,8 @@ from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.photograph import render_photograph
 from pano_mvs.testing.room import default_room, range_along, render
+from tests.synthetic.photograph import render_photograph
 
 SIZE_HW, PHOTO_HW, FOCAL_PX = (256, 512), (240, 320), 260.0
 POSE = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.1])), np.array([0.2, 0.1, 0.1]))

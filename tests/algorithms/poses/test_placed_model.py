@@ -14,7 +14,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import (
     pairs_of,
 )
 from pano_mvs.algorithms.poses.placement.resection import resection_errors
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture, shifted_pose
 

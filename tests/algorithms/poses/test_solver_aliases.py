@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, TwoView
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture

@@ -16,8 +16,8 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 from pano_mvs.scene import Features, FilePart, Panorama
-from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.scene.masks.cropping import Crop
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.masking import Crop
 from pano_mvs.testing.room import default_room, render
 
 SIZE_HW = (128, 256)

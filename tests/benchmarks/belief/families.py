@@ -19,6 +19,7 @@ from tests.benchmarks.poses.tours.plan import Style, build
 from tests.benchmarks.poses.tours.rendering import lit, panorama
 from tests.repeating.places import REPEATS, draw_sizes
 from tests.repeating.walks import LAYOUTS
+from tests.synthetic.places import large_plain_room
 
 WIDTH = 384
 SIZE_HW = (WIDTH // 2, WIDTH)
@@ -79,7 +80,7 @@ def _repeating(place: str) -> Callable[[int, np.random.Generator], Drawn]:
 
 
 def _plain(seed: int, rng: np.random.Generator) -> Drawn:
-    place = (scenes.white_room, scenes.weak_room, scenes.large_plain_room)[rng.integers(3)]
+    place = (scenes.white_room, scenes.weak_room, large_plain_room)[rng.integers(3)]
     return _of_scene(place(seed=seed, views=_views(rng), turned=bool(rng.random() < 0.3)))
 
 

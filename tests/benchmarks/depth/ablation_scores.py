@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.evaluation.clouds.distances import cloud_distances, score_cloud
-from pano_mvs.evaluation.clouds.points import PointsInMemory
+from pano_mvs.evaluation.clouds.distances import PointsInMemory, cloud_distances, score_cloud
 from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_views, view_points
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import PointCloud, Pose, RangeMap

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.testing.scenes import SCENES, large_plain_room
+from pano_mvs.testing.scenes import SCENES
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.repeating.places import REPEATS
+from tests.synthetic.places import large_plain_room
 
 SCENE_MAKERS = {**SCENES, **REPEATS, "large_plain_room": large_plain_room}
 

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import Record
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
-from pano_mvs.testing.scenes import courtyard, window_room, yard
+from pano_mvs.testing.scenes import courtyard
 from tests.benchmarks.captures import scene_capture
 from tests.benchmarks.depth.stored_chain import StoredChain
+from tests.synthetic.places import window_room, yard
 
 MAKERS = {maker.__name__: maker for maker in (courtyard, yard, window_room)}
 PLACES: tuple[tuple[str, dict[str, Any]], ...] = (

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.testing.scenes import Scene, poles
-from pano_mvs.testing.thin import THIN_KINDS, thin_pixels, thin_scene
 from tests.benchmarks.captures import scene_capture
 from tests.benchmarks.depth.stored_chain import StoredChain
+from tests.synthetic.thin import THIN_KINDS, thin_pixels, thin_scene
 
 KINDS = ("poles", *THIN_KINDS)
 _RIGHT, _BESIDE_PX = 0.05, 3

@@ -23,7 +23,7 @@ from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translatio
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.scene import Features, Poses, TwoView
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from tests.benchmarks.poses.house_walk import STEP, write_walk
 from tests.benchmarks.poses.suite_of_rooms import write_suite
 

@@ -33,9 +33,9 @@ from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
-from pano_mvs.evaluation.poses.errors import relative_pose_errors
+from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
 from tests.benchmarks.poses.captures_with_truth import (
     MAPPERS,

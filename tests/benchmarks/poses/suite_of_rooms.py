@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors, albedo_at
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Rod, Surface

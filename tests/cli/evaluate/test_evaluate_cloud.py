@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply_reader import open_ply_points
-from pano_mvs.io.clouds.ply_writer import write_ply
+from pano_mvs.io.ply import open_ply_points, write_ply
 from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command

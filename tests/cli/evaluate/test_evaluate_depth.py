@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
-from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.colmap.model_writer import write_colmap_model
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud, Poses
 from tests.cli.conftest import SIZE_HW, Command, Outcome
 from tests.stored import read_picture, write_npz

@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.ranges import read_range_tiff
 from tests.cli.conftest import SIZE_HW, SMALL, Command
 from tests.io.images.pictures import png_chunk, xmp
 from tests.stored import read_picture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import roll_panorama
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from tests.cli.conftest import SMALL, Command
 from tests.stored import read_picture
 

@@ -15,7 +15,7 @@ import pytest
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.geometry.geodesy import lla_from_local
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
 from tests.docs.test_frames import block

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_summary
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_groups, read_poses
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene
 from tests.cli.conftest import Command, run_json

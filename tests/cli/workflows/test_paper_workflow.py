@@ -11,7 +11,7 @@ import pytest
 
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.scene import Poses
 from tests.cli.conftest import SIZE_HW, Command, run_json
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.io.clouds.ply_writer import read_ply
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.session.session import open_session
 from tests.cli.conftest import SMALL, Command, run_json
 

@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
+from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
 from tests.cli.conftest import SMALL, Command
 from tests.stored import read_picture
 

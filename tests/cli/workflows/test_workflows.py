@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
 from tests.stored import read_picture

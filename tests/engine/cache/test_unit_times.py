@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.engine.cache.unit_times import FILE_NAME, CaptureSize, ExpectedUnit, Sample, UnitTimes
-from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.image_file import write_png
 
 SAMPLE = Sample("a", 1, images=10, pixels=1000.0, units=10, seconds=2.0, stored_bytes=100.0)
 SIZE = CaptureSize(10, 1000.0)

@@ -12,10 +12,10 @@ import pytest
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import LensRig
-from pano_mvs.io.colmap.lens_rig import LensPictures, rig_configuration, write_lens_rig_model
+from pano_mvs.io.colmap.writer import LensPictures, rig_configuration, write_lens_rig_model
 from pano_mvs.scene import Poses
-from pano_mvs.testing.fisheye_rig import example_rig
 from tests.algorithms.poses.rig_capture import RigCapture, rig_capture
+from tests.synthetic.fisheye_rig import example_rig
 
 
 def pictures(poses: Poses, rig: LensRig) -> dict[str, LensPictures]:

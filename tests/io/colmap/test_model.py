@@ -15,7 +15,8 @@ import pycolmap
 import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.io.colmap.model_writer import read_colmap_model, write_colmap_model
+from pano_mvs.io.colmap.reader import read_colmap_model
+from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import Poses
 from pano_mvs.scene.photographs import Photographs

@@ -16,11 +16,15 @@ import pytest
 
 from pano_mvs.algorithms.faces.layout import Face, FaceLayout, panorama_faces
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.io.colmap.image_copies import write_picture
-from pano_mvs.io.colmap.maps import read_colmap_map, write_depth_map, write_normal_map
-from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
-from pano_mvs.io.colmap.workspace import write_stereo_configs
-from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.io.colmap.workspace import (
+    read_colmap_map,
+    write_depth_map,
+    write_normal_map,
+    write_picture,
+    write_stereo_configs,
+)
+from pano_mvs.io.colmap.writer import CutPanorama, write_rig_model
+from pano_mvs.scene.image_file import decode_image
 from tests.io.colmap.test_model import NAMES, noisy_poses
 
 LAYOUTS: tuple[FaceLayout, ...] = ("cube", "icosahedron")

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import GPano, find_gpano
+from pano_mvs.io.images.metadata import GPano, find_gpano, read_container
 
 GPANO = "http://ns.google.com/photos/1.0/panorama/"
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"

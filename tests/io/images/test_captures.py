@@ -20,7 +20,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.io.images import captures
 from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_files.decoding import MAX_PIXELS
+from pano_mvs.scene.image_file import MAX_PIXELS
 from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
 from tests.permissions import permissions_hold
 
@@ -103,11 +103,6 @@ def test_a_folder_without_pictures_is_named(tmp_path: Path, folder: str, what: s
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=f"{folder}: {what}"):
         list_pictures(tmp_path / folder)
-
-
-def test_a_panorama_that_says_so_needs_no_warning(tmp_path: Path) -> None:
-    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(full_sphere(32, 64))))
-    assert (info.size_hw, info.file_size_hw, info.crop_ltwh, info.warnings) == ((32, 64), (32, 64), None, ())
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tiff", "webp"])
@@ -232,11 +227,6 @@ def test_what_is_not_a_picture_file_is_named(tmp_path: Path) -> None:
         "/d.jpg: this is not a regular file; it is skipped",
         ": images of unsupported formats (gif) are skipped: e.gif",
     ]
-
-
-def test_a_whole_panorama_made_smaller_is_whole(tmp_path: Path) -> None:
-    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (512, 1024), xmp(full_sphere(2688, 5376))))
-    assert (info.size_hw, info.crop_ltwh) == ((512, 1024), None)
 
 
 @pytest.mark.parametrize(

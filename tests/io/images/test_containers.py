@@ -16,8 +16,7 @@ import pytest
 from PIL import Image
 
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import GPano
+from pano_mvs.io.images.metadata import GPano, read_container
 from tests.io.images.pictures import (
     app1,
     by_pillow,

@@ -15,11 +15,15 @@ from PIL import Image
 from pxr import Ar, Usd, UsdGeom, UsdShade
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.meshes.glb_writer import write_glb
-from pano_mvs.io.meshes.obj_writer import write_mtl, write_obj
-from pano_mvs.io.meshes.picture_data import TextureFormat, encoded_texture
-from pano_mvs.io.meshes.textured_arrays import TexturedArrays
-from pano_mvs.io.meshes.usdz_writer import write_usdz
+from pano_mvs.io.meshes import (
+    TexturedArrays,
+    TextureFormat,
+    encoded_texture,
+    write_glb,
+    write_mtl,
+    write_obj,
+    write_usdz,
+)
 from tests.algorithms.mesh.box import box
 
 

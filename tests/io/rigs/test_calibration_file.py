@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.rigs.calibration_file import read_rig
+from pano_mvs.io.rig_calibration import read_rig
 from pano_mvs.scene import FilePart
-from pano_mvs.testing.fisheye_rig import calibration_text, example_rig
+from tests.synthetic.fisheye_rig import calibration_text, example_rig
 
 TEXT = """\
 model: opencv_fisheye

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.rigs.captures import Layout, list_rig_pictures
+from pano_mvs.io.images.captures import Layout, list_rig_pictures
 
 LENSES = ("front", "back")
 

@@ -16,7 +16,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
 from pano_mvs.evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
-from pano_mvs.io.colmap.model_writer import write_colmap_model
+from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.report.page import gather_report, write_page
 from pano_mvs.results.run_output import load
 from pano_mvs.results.stored_values import StoredValues

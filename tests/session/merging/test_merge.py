@@ -12,9 +12,9 @@ import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_writer import read_ply
+from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.clouds.ply_writer import write_ply
-from pano_mvs.io.colmap.model_writer import write_colmap_model
-from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
+from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.results.records import PairLink, PosesSummary, ViewSummary, WorkflowSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import PointCloud, Poses

@@ -1,1 +1,0 @@
-"""Estimates and ground truth in files of any program or in memory, paired by image name."""

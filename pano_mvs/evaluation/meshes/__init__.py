@@ -1,1 +1,0 @@
-"""Comparison of meshes with panoramas that were not used to make them."""

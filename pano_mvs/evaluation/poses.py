@@ -1,0 +1,387 @@
+"""Comparison of poses from any source with true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.text import plural, shortened_list
+from pano_mvs.evaluation.inputs import Cameras, as_path, camera_groups, length_unit, read_cameras, source_name
+from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
+from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle, nearest_rotation
+from pano_mvs.io.images.names import pair_image_names
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEvaluation:
+    """Errors of poses against the truth; image names are those of the truth.
+
+    Attributes:
+        model: name of the estimates' source.
+        truth: name of the truth's source.
+        unit: unit of lengths, for display.
+        pairs: errors over all pairs of the truth's images; a pair with an unregistered image is 180° off.
+        registered_pairs: errors over the pairs of registered images.
+        centers: errors of the camera centres after similarity alignment, or None if no alignment is possible.
+        no_centers: why there is no alignment; otherwise "".
+        without_truth: registered images without truth, by their own names.
+        other_groups: number of images in each further group of the model, which count as not registered.
+    """
+
+    model: str
+    truth: str
+    unit: str
+    pairs: PoseErrors
+    registered_pairs: PoseErrors
+    centers: CenterErrors | None
+    no_centers: str = ""
+    without_truth: tuple[str, ...] = ()
+    other_groups: tuple[int, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the main figures in a line."""
+        images = f"{self.pairs.registered} of {self.pairs.expected} images"
+        return f"PoseEvaluation({images} registered, median error of a pair {self.pairs.median_pair_deg:.3g}°)"
+
+    def to_json(self) -> dict[str, object]:
+        """Return all figures as JSON values; None stands for what cannot be determined."""
+        some, all_pairs = self.registered_pairs, self.pairs
+        return {
+            "registered": all_pairs.registered,
+            "of": all_pairs.expected,
+            "pairs": len(all_pairs.pairs),
+            "rotation_deg": _statistics(some.rotation_deg),
+            "direction_deg": _statistics(some.direction_deg),
+            "pair_deg": _statistics(some.pair_deg),
+            "pair_deg_all": _statistics(all_pairs.pair_deg),
+            "auc": {f"{limit:g}": value for limit, value in all_pairs.auc.items()},
+            "scale_ratio_error": {
+                "median": finite_or_none(some.scale_ratio_median),
+                "max": finite_or_none(some.scale_ratio_max),
+            },
+            "center": self._centers_json(),
+            "model": self.model,
+            "truth": self.truth,
+            "unit": self.unit,
+            "without_truth": list(self.without_truth),
+        }
+
+    def _centers_json(self) -> dict[str, object]:
+        if self.centers is None:
+            return {"reason": self.no_centers}
+        lengths, extent = self.centers.distances, self.centers.extent
+        return {
+            **_statistics(lengths),
+            "rms": float(np.sqrt(np.mean(lengths**2))),
+            "extent": extent,
+            "median_share_of_extent": float(np.median(lengths)) / extent,
+            "max_share_of_extent": float(lengths.max()) / extent,
+            "scale": self.centers.scale,
+            "images": dict(zip(self.centers.names, lengths.tolist(), strict=True)),
+        }
+
+    def summary(self) -> Summary:
+        """Return the main figures as text."""
+        pairs, some, centers = self.pairs, self.registered_pairs, self.centers
+        rows = [
+            _row("rotation °", some.rotation_deg, ".4f"),
+            _row("translation direction °", some.direction_deg, ".4f"),
+            _row("pair (the larger) °", some.pair_deg, ".4f"),
+        ]
+        if centers is not None:
+            rows.append(_row(f"camera centre, {self.unit}", centers.distances, ".5g"))
+            rows.append(_row("camera centre, % of extent", 100 * centers.distances / centers.extent, ".4f"))
+        auc = ", ".join(f"{100 * value:.1f} @ {limit:g}°" for limit, value in pairs.auc.items())
+        lines = [f"AUC over {plural(len(pairs.pairs), 'one pair', f'all {len(pairs.pairs)} pairs')}, %: {auc}"]
+        if np.isfinite(some.scale_ratio_max):
+            lines.append(
+                f"translation scale ratios: median {100 * some.scale_ratio_median:.3f} %, largest "
+                f"{100 * some.scale_ratio_max:.3f} % off"
+            )
+        if centers is not None:
+            scale = f"one unit of the model is {centers.scale:.6g} {self.unit}"
+            lines.append(f"extent {centers.extent:.5g} {self.unit}; {scale}")
+        else:
+            lines.append(f"camera centres are not compared: {self.no_centers}")
+        if self.other_groups:
+            lines.append(
+                f"{len(self.other_groups)} further {plural(len(self.other_groups), 'group')} of "
+                f"{sum(self.other_groups)} {plural(sum(self.other_groups), 'image')} in {self.model}, each "
+                "with a frame of its own, count as not registered"
+            )
+        if self.without_truth:
+            lines.append(f"no ground truth for {shortened_list(self.without_truth)}")
+        over = f"over {len(some.pairs)} {plural(len(some.pairs), 'pair')} of registered images"
+        registered = f"{pairs.registered} of {pairs.expected} {plural(pairs.expected, 'image')} registered"
+        return (registered, TextTable((over, "median", "mean", "max"), tuple(rows)), *lines)
+
+
+def evaluate_poses(model: Cameras | str, truth: Cameras | str) -> PoseEvaluation:
+    """Compare poses with the truth, whatever their world frames and units.
+
+    Args:
+        model: estimated poses: a file or folder that `read_poses` reads, `Poses`, or cam_from_world by image name. Of
+            several groups of cameras the largest is compared.
+        truth: the true poses, in any of these forms. Images are paired by name (see `pair_image_names`).
+
+    Raises:
+        InputError: if a file cannot be read, or the two have fewer than two images in common.
+
+    Example:
+        >>> import numpy as np
+        >>> from pano_mvs.geometry import Rigid3
+        >>> truth = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 2.0))}
+        >>> moved = {f"{name}.jpg": Rigid3(pose.rotation, 3 * pose.translation) for name, pose in truth.items()}
+        >>> evaluation = evaluate_poses(moved, truth)
+        >>> evaluation.pairs.registered, evaluation.pairs.median_pair_deg
+        (2, 0.0)
+    """
+    source: Cameras = as_path(model)
+    target: Cameras = as_path(truth)
+    estimated, *others = camera_groups(source)
+    known, metric = read_cameras(target)
+    ours = {name: match for match, name in pair_image_names(estimated, known).items()}
+    if len(ours) < 2:
+        raise InputError(
+            f"{source_name(source)} and {source_name(target)} have {len(ours) or 'no'} {plural(len(ours), 'image')} in "
+            f"common, two are needed to compare poses. The model has {shortened_list(estimated)}, the truth "
+            f"{shortened_list(known)}"
+        )
+    found: dict[str, Rigid3] = {name: estimated[ours[name]] for name in known if name in ours}
+    centers, reason = _centers(found, known)
+    return PoseEvaluation(
+        model=source_name(source),
+        truth=source_name(target),
+        unit=length_unit(metric=metric),
+        pairs=relative_pose_errors(found, known),
+        registered_pairs=relative_pose_errors(found, {name: known[name] for name in found}),
+        centers=centers,
+        no_centers=reason,
+        without_truth=tuple(name for name in estimated if name not in set(ours.values())),
+        other_groups=tuple(len(group) for group in others),
+    )
+
+
+def _centers(found: Mapping[str, Rigid3], known: Mapping[str, Rigid3]) -> tuple[CenterErrors | None, str]:
+    try:
+        return center_errors(found, known), ""
+    except UsageError as error:
+        return None, str(error)
+
+
+def _statistics(values: NDArray[np.float64]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "mean": float(values.mean()), "max": float(values.max())}
+
+
+def _row(label: str, values: NDArray[np.float64], form: str) -> tuple[str, ...]:
+    return (label, *(format(value, form) for value in _statistics(values).values()))
+
+
+AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
+# Centres closer than this share of the capture's extent coincide: an image that occurs twice.
+_COINCIDENT_SHARE = 1e-6
+_ROUNDING = 1e-12  # of a centre's coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of relative poses, over all pairs of images with ground truth.
+
+    Attributes:
+        pairs: (P) the pairs of image names.
+        rotation_deg: (P,) error of second_from_first's rotation; 180 if an image is not registered.
+        direction_deg: (P,) error of the direction of its translation; 180 if an image is not registered.
+        pair_deg: (P,) the larger of the two.
+        measured: (P,) False if an image is not registered, or the two are in different groups.
+        median_pair_deg: median of `pair_deg`.
+        auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
+        registered: number of images with an estimate.
+        in_one_frame: number of those in the largest group, which shares one world frame.
+        expected: number of images with ground truth.
+        scale_ratio_median: median of |baseline ratio − 1| after division by the median ratio; NaN below 3 images.
+        scale_ratio_max: largest of them.
+    """
+
+    pairs: tuple[tuple[str, str], ...]
+    rotation_deg: FloatArray
+    direction_deg: FloatArray
+    pair_deg: FloatArray
+    measured: NDArray[np.bool_]
+    median_pair_deg: float
+    auc: dict[float, float]
+    registered: int
+    in_one_frame: int
+    expected: int
+    scale_ratio_median: float
+    scale_ratio_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class CenterErrors:
+    """Distances of camera centres from the true ones after similarity alignment.
+
+    Attributes:
+        names: (N) images with both poses.
+        distances: (N,) in the truth's unit.
+        extent: largest distance between two true centres, in the truth's unit.
+        scale: truth's units per unit of the estimate.
+    """
+
+    names: tuple[str, ...]
+    distances: FloatArray
+    extent: float
+    scale: float
+
+
+class _RelativePoses(NamedTuple):
+    """Rotations (P, 3, 3), translations (P, 3), their lengths (P,), and whether the centres lie apart (P,)."""
+
+    rotations: FloatArray
+    translations: FloatArray
+    lengths: FloatArray
+    apart: NDArray[np.bool_]
+
+
+def relative_pose_errors(
+    estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], *, groups: Mapping[str, int] | None = None
+) -> PoseErrors:
+    """Return the errors of all pairs of the truth's images, which do not depend on the world frame or the scale.
+
+    Args:
+        estimated: cam_from_world by image name; names without truth are ignored.
+        truth: true cam_from_world of at least two images.
+        groups: group number of each estimate, if the groups have different worlds. A pair across groups cannot be
+            measured and counts as not registered. None: all share one world.
+
+    Raises:
+        UsageError: if the truth holds fewer than two images.
+    """
+    if len(truth) < 2:
+        raise UsageError(f"relative poses need the true poses of at least two images, got {len(truth)}")
+    position = {name: idx for idx, name in enumerate(truth)}
+    worlds: dict[int, list[str]] = {}
+    for name in truth:
+        if name in estimated:
+            worlds.setdefault(0 if groups is None else groups[name], []).append(name)
+    pairs, true_extent = tuple(combinations(truth, 2)), camera_extent(truth)
+    errors, measured = np.full((len(pairs), 2), 180.0), np.zeros(len(pairs), np.bool_)
+    deviations = [np.zeros(0)]
+    for _, names in sorted(worlds.items()):
+        first, second = np.array([position[name] for name in names])[np.stack(np.triu_indices(len(names), 1))]
+        place = first * (2 * len(truth) - first - 1) // 2 + second - first - 1  # in `pairs`
+        true, found = _relative(truth, names, true_extent), _relative(estimated, names)
+        measured[place] = True
+        errors[place], ratios = _world_errors(found, true)
+        if len(ratios) > 1:
+            deviations.append(np.abs(ratios / np.median(ratios) - 1))
+    pair_deg = errors.max(axis=1)
+    deviation = np.concatenate(deviations) if len(deviations) > 1 else np.array([np.nan])
+    return PoseErrors(
+        pairs=pairs,
+        rotation_deg=errors[:, 0],
+        direction_deg=errors[:, 1],
+        pair_deg=pair_deg,
+        measured=measured,
+        median_pair_deg=float(np.median(pair_deg)),
+        auc={limit: float(np.clip(1 - pair_deg / limit, 0, 1).mean()) for limit in AUC_LIMITS_DEG},
+        registered=sum(map(len, worlds.values())),
+        in_one_frame=max(map(len, worlds.values()), default=0),
+        expected=len(truth),
+        scale_ratio_median=float(np.median(deviation)),
+        scale_ratio_max=float(deviation.max()),
+    )
+
+
+def center_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> CenterErrors:
+    """Return the distances of the camera centres from the true ones after similarity alignment.
+
+    Raises:
+        UsageError: if the poses determine no alignment (see `align_centers`).
+    """
+    truth_from_estimated = align_centers(estimated, truth)
+    names = tuple(name for name in truth if name in estimated)
+    moved = truth_from_estimated.apply([estimated[name].center for name in names])
+    distances = np.linalg.norm(moved - [truth[name].center for name in names], axis=1)
+    extent = camera_extent({name: truth[name] for name in names})
+    return CenterErrors(names, distances, extent, truth_from_estimated.scale)
+
+
+def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float | None = None) -> _RelativePoses:
+    """Return second_from_first of all pairs of some images."""
+    rotations = np.array([poses[name].rotation for name in names])
+    centers = np.array([poses[name].center for name in names])
+    first, second = np.triu_indices(len(names), 1)
+    translations = np.einsum("pij,pj->pi", rotations[second], centers[first] - centers[second])
+    lengths = np.linalg.norm(translations, axis=1)
+    extent = float(lengths.max(initial=0)) if extent is None else extent
+    apart = lengths > max(_COINCIDENT_SHARE * extent, _ROUNDING * float(np.abs(centers).max()))
+    return _RelativePoses(rotations[second] @ rotations[first].swapaxes(1, 2), translations, lengths, apart)
+
+
+def _world_errors(found: _RelativePoses, true: _RelativePoses) -> tuple[FloatArray, FloatArray]:
+    """Return errors of rotation and direction in degrees (P, 2), and the ratios of baselines that are not 0 (Q,).
+
+    A pair that was truly taken from one place has no direction error.
+    """
+    both = found.apart & true.apart
+    direction_deg = np.where(true.apart, 180.0, 0.0)
+    direction_deg[both] = np.rad2deg(angle_between(found.translations[both], true.translations[both]))
+    rotation_deg = np.rad2deg(geodesic_angle(found.rotations, true.rotations))
+    return np.stack([rotation_deg, direction_deg], axis=1), found.lengths[both] / true.lengths[both]
+
+
+# Weight of the cameras' orientations against the spread of their centres. Enough to fix the turn about a line on which
+# all centres lie; negligible elsewhere.
+_ORIENTATION_SHARE = 1e-6
+
+
+def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> Similarity3:
+    """Return the similarity world_truth from world_estimated that best aligns the camera centres.
+
+    Umeyama 1991, with the cameras' orientations added to the covariance at a weight that matters only where the
+    centres leave a rotation open: two images, images on a line, an image that occurs twice.
+
+    Args:
+        estimated: cam_from_world by image name.
+        truth: true cam_from_world by image name; at least two common names, at different places.
+
+    Raises:
+        UsageError: if fewer than two images are common, or their centres coincide on either side.
+
+    Example:
+        >>> import numpy as np
+        >>> from pano_mvs.geometry import Rigid3
+        >>> truth = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 2.0))}
+        >>> half = {name: Rigid3(pose.rotation, pose.translation / 2) for name, pose in truth.items()}
+        >>> round(align_centers(half, truth).scale, 6)
+        2.0
+    """
+    names = [name for name in truth if name in estimated]
+    if len(names) < 2:
+        have = plural(len(names), "image has", "images have")
+        raise UsageError(f"only {len(names)} {have} both an estimate and truth; two are needed for a scale")
+    source = np.array([estimated[name].center for name in names])
+    target = np.array([truth[name].center for name in names])
+    middle, aim = source.mean(axis=0), target.mean(axis=0)
+    spread, true_spread = float(np.linalg.norm(source - middle)), float(np.linalg.norm(target - aim))
+    for what, length, centers in (("estimated", spread, source), ("true", true_spread, target)):
+        if length <= 1e-12 * max(1.0, float(np.abs(centers).max())):
+            raise UsageError(f"the {what} centres of all {len(names)} images coincide, so no scale can be estimated")
+    covariance = (target - aim).T @ (source - middle) / (spread * true_spread)
+    turns = [truth[name].rotation.T @ estimated[name].rotation for name in names]
+    rotation = nearest_rotation(covariance + _ORIENTATION_SHARE * np.mean(turns, axis=0))
+    scale = float(np.trace(rotation.T @ covariance)) * true_spread / spread
+    return Similarity3(scale, rotation, aim - scale * rotation @ middle)
+
+
+def camera_extent(poses: Mapping[str, Rigid3]) -> float:
+    """Return the largest distance between two camera centres; 0 with fewer than two."""
+    centers = np.array([pose.center for pose in poses.values()]).reshape(-1, 3)
+    return max((float(np.linalg.norm(centers - center, axis=1).max()) for center in centers), default=0.0)

@@ -1,0 +1,236 @@
+"""The arrays of a textured mesh, as writers take them."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+
+
+class TexturedArrays(NamedTuple):
+    """A mesh with positions in a texture.
+
+    Attributes:
+        positions: (N, 3) float32 in the axes of the file.
+        uv: (N, 2) float32, (0, 0) the upper-left corner of the texture.
+        faces: (F, 3) int32, counter-clockwise as seen from outside.
+    """
+
+    positions: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+TextureFormat = Literal["jpeg", "png"]
+
+SUFFIXES: Final[dict[TextureFormat, str]] = {"jpeg": ".jpg", "png": ".png"}
+MIME_TYPES: Final[dict[TextureFormat, str]] = {"jpeg": "image/jpeg", "png": "image/png"}
+
+
+def encoded_texture(texture: NDArray[np.uint8], form: TextureFormat, *, quality: int) -> bytes:
+    """Return a texture (H, W, 3) RGB as the bytes of an image file.
+
+    Raises:
+        UsageError: if OpenCV cannot write it, for example because it is larger than 65535 pixels.
+    """
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 6]
+    if form == "jpeg":
+        options = [
+            *(cv2.IMWRITE_JPEG_QUALITY, quality),
+            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+        ]
+    done, data = cv2.imencode(SUFFIXES[form], cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), options)
+    if not done:
+        raise UsageError(f"a texture of {texture.shape[1]}×{texture.shape[0]} px cannot be written as {form}")
+    return data.tobytes()
+
+
+_MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+_FLOAT, _UINT32, _ARRAY_BUFFER, _ELEMENT_BUFFER = 5126, 5125, 34962, 34963
+_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
+# The colours of a photograph already contain the light of the place.
+_UNLIT = "KHR_materials_unlit"
+
+
+def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: TextureFormat) -> None:
+    """Write a mesh, y up, with its texture as one GLB file, without lighting and visible from both sides."""
+    parts = [
+        np.ascontiguousarray(mesh.positions, "<f4").tobytes(),
+        np.ascontiguousarray(mesh.uv, "<f4").tobytes(),
+        np.ascontiguousarray(mesh.faces, "<u4").tobytes(),
+        picture,
+    ]
+    padded = [part + b"\0" * (-len(part) % 4) for part in parts]
+    starts = np.cumsum([0, *map(len, padded)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(part)} for start, part in zip(starts, parts, strict=False)
+    ]
+    for view, target in zip(views, (_ARRAY_BUFFER, _ARRAY_BUFFER, _ELEMENT_BUFFER), strict=False):
+        view["target"] = target
+    document = _document(mesh, MIME_TYPES[form]) | {"bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
+    head = json.dumps(document, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 4)
+    with path.open("wb") as stream:
+        stream.write(struct.pack("<III", _MAGIC, _VERSION, 12 + 8 + len(head) + 8 + starts[-1]))
+        stream.write(struct.pack("<II", len(head), _JSON) + head)
+        stream.write(struct.pack("<II", starts[-1], _BINARY))
+        stream.writelines(padded)
+
+
+def _document(mesh: TexturedArrays, mime_type: str) -> dict[str, Any]:
+    positions: NDArray[np.float32] = mesh.positions
+    return {
+        "asset": {"version": "2.0", "generator": "pano_mvs"},
+        "extensionsUsed": [_UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1},
+                "doubleSided": True,
+                "extensions": {_UNLIT: {}},
+            }
+        ],
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+        "images": [{"bufferView": 3, "mimeType": mime_type}],
+        "accessors": [
+            {
+                "bufferView": 0,
+                "componentType": _FLOAT,
+                "count": len(positions),
+                "type": "VEC3",
+                "min": positions.min(axis=0).tolist(),
+                "max": positions.max(axis=0).tolist(),
+            },
+            {"bufferView": 1, "componentType": _FLOAT, "count": len(mesh.uv), "type": "VEC2"},
+            {"bufferView": 2, "componentType": _UINT32, "count": mesh.faces.size, "type": "SCALAR"},
+        ],
+    }
+
+
+_LINES_AT_ONCE = 1 << 16
+_MATERIAL = "texture"
+
+
+def write_obj(path: Path, mesh: TexturedArrays, *, material_file: str) -> None:
+    """Write a mesh as OBJ: v, vt (with the origin in the lower-left corner, as OBJ has it) and f."""
+    flipped = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1)
+    corners = (mesh.faces + 1).repeat(2, axis=1)  # the texture coordinate has the number of the vertex
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write(f"mtllib {material_file}\nusemtl {_MATERIAL}\n")
+        stream.writelines(_lines("v %.7g %.7g %.7g\n", mesh.positions))
+        stream.writelines(_lines("vt %.7g %.7g\n", flipped))
+        stream.writelines(_lines("f %d/%d %d/%d %d/%d\n", corners))
+
+
+def write_mtl(path: Path, *, texture_file: str) -> None:
+    """Write the material of `write_obj`: an image without lighting."""
+    lines = [f"newmtl {_MATERIAL}", "Ka 1 1 1", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 0", f"map_Kd {texture_file}"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def _lines(form: str, values: NDArray[Any]) -> Iterator[str]:
+    for first in range(0, len(values), _LINES_AT_ONCE):
+        block = values[first : first + _LINES_AT_ONCE]
+        yield (form * len(block)) % tuple(block.ravel().tolist())
+
+
+_ALIGNMENT, _LOCAL_HEADER, _EXTRA_HEADER = 64, 30, 4
+_SCENE = """#usda 1.0
+(
+    defaultPrim = "mesh"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "mesh" (
+    kind = "component"
+)
+{{
+    def Mesh "surface" (
+        prepend apiSchemas = ["MaterialBindingAPI"]
+    )
+    {{
+        uniform bool doubleSided = 1
+        float3[] extent = [{extent}]
+        int[] faceVertexCounts = [{counts}]
+        int[] faceVertexIndices = [{indices}]
+        rel material:binding = </mesh/material>
+        point3f[] points = [{points}]
+        texCoord2f[] primvars:st = [{coordinates}] (
+            interpolation = "vertex"
+        )
+        uniform token subdivisionScheme = "none"
+    }}
+
+    def Material "material"
+    {{
+        token outputs:surface.connect = </mesh/material/shader.outputs:surface>
+
+        def Shader "shader"
+        {{
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor = (0, 0, 0)
+            color3f inputs:emissiveColor.connect = </mesh/material/texture.outputs:rgb>
+            float inputs:roughness = 1
+            token outputs:surface
+        }}
+
+        def Shader "texture"
+        {{
+            uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @{texture}@
+            token inputs:sourceColorSpace = "sRGB"
+            float2 inputs:st.connect = </mesh/material/coordinates.outputs:result>
+            token inputs:wrapS = "clamp"
+            token inputs:wrapT = "clamp"
+            float3 outputs:rgb
+        }}
+
+        def Shader "coordinates"
+        {{
+            uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "st"
+            float2 outputs:result
+        }}
+    }}
+}}
+"""
+
+
+def write_usdz(path: Path, mesh: TexturedArrays, picture: bytes, *, form: TextureFormat) -> None:
+    """Write a mesh with its texture as one USDZ file; its colours need no light (they are emitted)."""
+    texture = f"texture{SUFFIXES[form]}"
+    flipped = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1)
+    scene = _SCENE.format(
+        extent=_tuples(np.stack([mesh.positions.min(axis=0), mesh.positions.max(axis=0)])),
+        counts=", ".join(["3"] * len(mesh.faces)),
+        indices=", ".join(map(str, mesh.faces.ravel().tolist())),
+        points=_tuples(mesh.positions),
+        coordinates=_tuples(flipped),
+        texture=texture,
+    )
+    with path.open("wb") as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in (("mesh.usda", scene.encode()), (texture, picture)):
+            entry = zipfile.ZipInfo(name)  # of 1980: the same mesh gives the same bytes
+            data_at = stream.tell() + _LOCAL_HEADER + len(name) + _EXTRA_HEADER
+            padding = -data_at % _ALIGNMENT
+            entry.extra = b"\x86\x19" + padding.to_bytes(2, "little") + bytes(padding)
+            archive.writestr(entry, data)
+
+
+def _tuples(values: NDArray[np.float32]) -> str:
+    form = f"({', '.join(['%.9g'] * values.shape[1])})"
+    return ", ".join([form] * len(values)) % tuple(values.ravel().tolist())

@@ -1,1 +1,0 @@
-"""Write textured meshes."""

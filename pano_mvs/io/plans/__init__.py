@@ -1,1 +1,0 @@
-"""Files of floor plans: world files, SVG and DXF."""

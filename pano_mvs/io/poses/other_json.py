@@ -1,0 +1,256 @@
+"""Poses in openMVG's sfm_data.json.
+
+openMVG's spherical camera maps a bearing (cos lat sin lon, −sin lat, cos lat cos lon) to u = lon / 2π, v = −lat / 2π
+about the image centre in image widths, so that its camera frame is x right, y down, z forward, as ours. A pose holds
+the rotation of cam_from_world by rows, and the camera's centre: x_in_cam = R (x_in_world − c).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from posixpath import commonpath
+from typing import Any
+
+import numpy as np
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3, pixel_from_ray, rotation_from_rotvec
+from pano_mvs.io.poses.json_files import number_array, require_distinct, rigid_from_arrays
+from pano_mvs.scene.poses import Poses
+
+_SPHERICAL = "spherical"
+_NEW, _PLAIN = 1 << 31, 1 << 30  # of cereal: the first mention of a pointer or class; an object of the base class
+
+
+def is_openmvg(data: Any) -> bool:
+    """Return whether a JSON value looks like openMVG's description of a scene."""
+    return isinstance(data, dict) and {"views", "intrinsics", "extrinsics"} <= data.keys()
+
+
+def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
+    """Return the poses of all views that have one, by image name.
+
+    Raises:
+        InputError: if a value is invalid, or a camera is not spherical; it names the view or the pose.
+    """
+    cameras = _by_key(data, "intrinsics", path)
+    extrinsics = _by_key(data, "extrinsics", path)
+    names: list[str] = []
+    poses: dict[str, Rigid3] = {}
+    # Views that share a camera class name it once and refer to it by number afterwards.
+    kinds = {
+        one.get("polymorphic_id"): one["polymorphic_name"] for one in cameras.values() if "polymorphic_name" in one
+    }
+    for key, view in _by_key(data, "views", path).items():
+        where = f"{path}: view {key}"
+        about = _inner(view, where)
+        pose = extrinsics.get(about.get("id_pose"))
+        if pose is None:
+            continue
+        name = about.get("filename")
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{where}: key 'filename' must be the name of the image, got {name!r}")
+        camera = cameras.get(about.get("id_intrinsic"), {})
+        kind = camera.get("polymorphic_name", kinds.get(_class_of(camera)))
+        if kind != _SPHERICAL:
+            raise InputError(f"{where} ({name}): its camera is {kind}, expected spherical. Only panoramas can be used")
+        folder = str(about.get("local_path") or "").replace("\\", "/").strip("/")
+        names.append(f"{folder}/{name}" if folder else name)
+        poses[names[-1]] = _pose(pose, f"{path}: pose {about['id_pose']} ({name})")
+    require_distinct(names, path)
+    return poses
+
+
+def _by_key(data: dict[str, Any], section: str, path: Path) -> dict[Any, dict[str, Any]]:
+    """Return the values of a map that is stored as a list of keys and values."""
+    entries = data[section]
+    if not isinstance(entries, list) or not all(
+        isinstance(entry, dict) and isinstance(entry.get("key"), int) and isinstance(entry.get("value"), dict)
+        for entry in entries
+    ):
+        raise InputError(f"{path}: key {section!r} must be a list of keys and values, as openMVG writes it")
+    return {entry["key"]: entry["value"] for entry in entries}
+
+
+def _inner(view: dict[str, Any], where: str) -> dict[str, Any]:
+    wrapper = view.get("ptr_wrapper")
+    about = wrapper.get("data") if isinstance(wrapper, dict) else None
+    if not isinstance(about, dict):
+        raise InputError(f"{where}: key 'ptr_wrapper' must hold the data of the view")
+    # Views with a prior of the position hold those of an ordinary view inside.
+    inner = about.get("value0") if "filename" not in about else about
+    return inner if isinstance(inner, dict) else about
+
+
+def _class_of(camera: dict[str, Any]) -> int:
+    """Return the number of a camera's class; the highest bit marks its first mention."""
+    number = camera.get("polymorphic_id")
+    return number | _NEW if isinstance(number, int) else -1
+
+
+def _pose(value: dict[str, Any], where: str) -> Rigid3:
+    rotation, center = (
+        number_array(value, "rotation", (3, 3), where=where),
+        number_array(value, "center", (3,), where=where),
+    )
+    checked = rigid_from_arrays(rotation, center, where)
+    return Rigid3.from_center(checked.rotation, center)
+
+
+def write_openmvg(path: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
+    """Write poses of one group with their points and tracks, as openMVG's `Save` (cereal's JSON archive) does.
+
+    The world is that of the poses. Pixels follow openMVG's spherical camera: those of this package.
+    """
+    sizes = list(dict.fromkeys(sizes_hw[name] for name in poses.names))
+    views, extrinsics = [], []
+    for number, name in enumerate(poses.names):
+        folder, _, file = name.rpartition("/")
+        height, width = sizes_hw[name]
+        about = {"local_path": folder, "filename": file, "width": width, "height": height}
+        ids = {"id_view": number, "id_intrinsic": sizes.index((height, width)), "id_pose": number}
+        views.append(_entry(number, {"polymorphic_id": _PLAIN, **_pointer(number, about | ids)}))
+        pose = {"rotation": poses.rotations[number].tolist(), "center": poses.centers[number].tolist()}
+        extrinsics.append(_entry(number, pose))
+    intrinsics = []
+    for number, (height, width) in enumerate(sizes):
+        # The first object of a class states its name; later ones refer to it by number.
+        kind = {"polymorphic_id": 1} if number else {"polymorphic_id": _NEW | 1, "polymorphic_name": _SPHERICAL}
+        camera = {"value0": {"width": width, "height": height}}
+        intrinsics.append(_entry(number, {**kind, **_pointer(len(views) + number, camera)}))
+    document = {
+        "sfm_data_version": "0.3",
+        "root_path": "",
+        "views": views,
+        "intrinsics": intrinsics,
+        "extrinsics": extrinsics,
+        "structure": _structure(poses, sizes_hw),
+        "control_points": [],
+    }
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+
+def _structure(poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> list[dict[str, Any]]:
+    """Return the points with the pixels at which images see them."""
+    pixels = np.zeros((len(poses.track_image_idx), 2))
+    for number, name in enumerate(poses.names):
+        seen = poses.track_image_idx == number
+        pixels[seen] = pixel_from_ray(poses.track_bearings[seen], sizes_hw[name])
+    seen_by: list[list[dict[str, Any]]] = [[] for _ in poses.points_in_world]
+    for number in np.lexsort((poses.track_image_idx, poses.track_point_idx)):
+        at = {"id_feat": int(number), "x": pixels[number].tolist()}
+        seen_by[poses.track_point_idx[number]].append(_entry(int(poses.track_image_idx[number]), at))
+    return [
+        _entry(number, {"X": point.tolist(), "observations": seen})
+        for number, (point, seen) in enumerate(zip(poses.points_in_world, seen_by, strict=True))
+    ]
+
+
+def _entry(key: int, value: dict[str, Any]) -> dict[str, Any]:
+    return {"key": key, "value": value}
+
+
+def _pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
+    return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
+
+
+_EQUIRECTANGULAR = "equirectangular"
+
+
+def is_alicevision(data: Any) -> bool:
+    """Return whether a JSON value looks like AliceVision's description of a scene."""
+    return isinstance(data, dict) and {"version", "views", "intrinsics"} <= data.keys()
+
+
+def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
+    """Return the poses of all views that have one, by image path below the folder that all images share.
+
+    Raises:
+        InputError: if a value is invalid, or a camera is not equirectangular; it names the view or the pose.
+    """
+    cameras = {entry.get("intrinsicId"): entry for entry in _entries(data, "intrinsics", path)}
+    placed = {entry.get("poseId"): entry.get("pose") for entry in _entries(data, "poses", path)}
+    found: list[tuple[str, Rigid3]] = []
+    for view in _entries(data, "views", path):
+        if (pose := placed.get(view.get("poseId"))) is None:
+            continue
+        file = view.get("path")
+        where = f"{path}: view {view.get('viewId')}"
+        if not isinstance(file, str) or not PurePosixPath(file.replace("\\", "/")).name:
+            raise InputError(f"{where}: key 'path' must be the path of the image, got {file!r}")
+        kind = cameras.get(view.get("intrinsicId"), {}).get("type")
+        if kind != _EQUIRECTANGULAR or "rigId" in view:
+            camera = "part of a rig" if "rigId" in view else kind
+            raise InputError(f"{where} ({file}): its camera is {camera}, expected one equirectangular camera")
+        found.append((file.replace("\\", "/"), _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
+    require_distinct([name for name, _ in found], path)
+    shared = _shared_folder([PurePosixPath(name) for name, _ in found])
+    return {str(PurePosixPath(name).relative_to(shared)): pose for name, pose in found}
+
+
+def _shared_folder(files: list[PurePosixPath]) -> PurePosixPath:
+    if len({file.is_absolute() for file in files}) > 1:
+        return PurePosixPath()
+    return PurePosixPath(commonpath([str(file.parent) for file in files]))
+
+
+def _entries(data: dict[str, Any], section: str, path: Path) -> list[dict[str, Any]]:
+    entries = data.get(section, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{path}: key {section!r} must be a list of objects, as AliceVision writes it")
+    return entries
+
+
+def _alicevision_pose(value: Any, where: str) -> Rigid3:
+    transform = value.get("transform") if isinstance(value, dict) else None
+    if not isinstance(transform, dict):
+        raise InputError(f"{where}: key 'pose' must hold a transform")
+    by_columns = number_array(transform, "rotation", (9,), where=where).reshape(3, 3)
+    center = number_array(transform, "center", (3,), where=where)
+    return Rigid3.from_center(rigid_from_arrays(by_columns.T, center, where).rotation, center)
+
+
+_OPENSFM_SPHERICAL = ("spherical", "equirectangular")
+
+
+def is_opensfm(data: Any) -> bool:
+    """Return whether a JSON value looks like the list of reconstructions that OpenSfM writes."""
+    return isinstance(data, list) and bool(data) and all(isinstance(item, dict) and "shots" in item for item in data)
+
+
+def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rigid3], bool]:
+    """Return the poses of the reconstruction with the most shots, by image name, and whether lengths are metres.
+
+    The world is east, north, up in metres about `reference_lla`. Without GPS positions, OpenSfM writes a reference at
+    latitude and longitude 0, and the unit of length is arbitrary.
+
+    Raises:
+        InputError: if a value is invalid; it names the shot and the key.
+    """
+    for item in data:
+        if not isinstance(item.get("cameras"), dict) or not isinstance(item["shots"], dict):
+            raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
+    largest = max(data, key=lambda item: len(item["shots"]))
+    cameras, shots = largest["cameras"], largest["shots"]
+    poses = {name: _opensfm_pose(shot, cameras, f"{path}: shot {name!r}") for name, shot in shots.items()}
+    require_distinct(list(poses), path)
+    reference = largest.get("reference_lla")
+    somewhere = isinstance(reference, dict) and bool(reference.get("latitude") or reference.get("longitude"))
+    return poses, somewhere
+
+
+def _opensfm_pose(shot: Any, cameras: dict[str, Any], where: str) -> Rigid3:
+    if not isinstance(shot, dict):
+        raise InputError(f"{where}: expected an object, got {type(shot).__name__}")
+    camera = cameras.get(str(shot.get("camera", "")))
+    projection = camera.get("projection_type") if isinstance(camera, dict) else None
+    if projection not in _OPENSFM_SPHERICAL:
+        raise InputError(
+            f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas can be used"
+        )
+    rotvec, translation = (number_array(shot, key, (3,), where=where) for key in ("rotation", "translation"))
+    if not np.isfinite(rotvec).all():
+        raise InputError(f"{where}: key 'rotation' holds NaN or infinite numbers")
+    return rigid_from_arrays(rotation_from_rotvec(rotvec), translation, where)

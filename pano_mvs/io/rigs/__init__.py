@@ -1,1 +1,0 @@
-"""Rigs of fisheye cameras: calibration files, and the pictures of their captures."""

@@ -1,1 +1,0 @@
-"""Write splat bundles."""

@@ -1,1 +1,0 @@
-"""Decode image files safely: headers, limits and damage."""

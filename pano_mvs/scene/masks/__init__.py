@@ -1,1 +1,0 @@
-"""Masked and cropped panoramas: placing masks and crops, filling masked pixels."""

@@ -1,0 +1,293 @@
+"""Panoramas from the pictures of two calibrated fisheye lenses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pano_mvs.algorithms.stitching import stitch_lenses
+from pano_mvs.api import (
+    NOT_IN_KEY,
+    Context,
+    Each,
+    FilePart,
+    Files,
+    InputError,
+    Panorama,
+    Params,
+    Poses,
+    SourceItem,
+    SourcePath,
+    source,
+    stage,
+)
+from pano_mvs.core.paths import children
+from pano_mvs.geometry import FisheyeLens, LensRig, ray_grid
+from pano_mvs.io.colmap.writer import LensPictures, ModelForm, rig_configuration, write_lens_rig_model
+from pano_mvs.io.images.captures import Layout, RigPictures, list_rig_pictures
+from pano_mvs.io.images.metadata import position_from_exif, read_container
+from pano_mvs.io.images.names import printable_name
+from pano_mvs.io.rig_calibration import read_rig
+from pano_mvs.scene.files import item_stems
+from pano_mvs.scene.image_file import MAX_PIXELS, decode_image, decoding_bytes_per_pixel, write_png
+from pano_mvs.scene.image_header import stated_size_of_file
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.stages.source import working_size
+
+_NO_CALIBRATION = (
+    "calibration is not given, and the parameters of fisheye lenses cannot be guessed from their pictures. Give the "
+    "calibration of this camera as a YAML file (docs/rigs.md states its keys and how to measure them), or export the "
+    "images as panorama with the camera maker's program (stitching) and use source.folder"
+)
+
+
+class DualFisheyeParams(Params):
+    """Settings of source.dual_fisheye."""
+
+    path: SourcePath = Field(description="folder of the fisheye pictures, searched recursively")
+    calibration: SourcePath | None = Field(
+        default=None, description="YAML file with the parameters of both lenses and their poses; required"
+    )
+    layout: Annotated[Layout, NOT_IN_KEY] = Field(
+        default="auto",
+        description=(
+            "side_by_side: both circles in one file, the first lens on the left; folders: front/000.jpg, back/000.jpg; "
+            "suffixes: 000_front.jpg, 000_back.jpg, with the names of the lenses in the calibration"
+        ),
+    )
+    stitch_distance_m: float | None = Field(
+        default=3.0, gt=0, description="distance at which both lenses agree at the seam, in metres; null: infinite"
+    )
+    blend_deg: float = Field(
+        default=2.0, ge=0, le=90, description="width of the strip at the seam where both are mixed"
+    )
+    width: int | None = Field(
+        default=None, ge=16, description="width of the panoramas; by default that of the lenses at their axes"
+    )
+    max_width: int = Field(default=4096, ge=16, description="maximum width of the panoramas if width is not given")
+    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight down (stick)")
+    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
+    max_megapixels: Annotated[float, NOT_IN_KEY] = Field(
+        default=MAX_PIXELS / 1e6, gt=0, description="larger files are rejected before they are decoded"
+    )
+
+    def rig(self, calibration: FilePart) -> LensRig:
+        """Return the rig of a calibration file."""
+        distance = float("inf") if self.stitch_distance_m is None else self.stitch_distance_m
+        return read_rig(calibration, stitch_distance_m=distance, blend_deg=self.blend_deg)
+
+
+def list_captures(params: DualFisheyeParams) -> Iterator[SourceItem]:
+    """List the captures in a folder.
+
+    Raises:
+        InputError: if there is no calibration, it cannot be used, or there are fewer than two captures.
+    """
+    if params.calibration is None:
+        raise InputError(_NO_CALIBRATION)
+    notes: list[str] = []
+    rig = params.rig(FilePart(params.calibration))
+    captures = list_rig_pictures(params.path, rig.names, params.layout, notes=notes)
+    complete = [capture for capture in captures if not capture.problem]
+    if len(complete) < 2:
+        reason = next((f" ({capture.name}: {capture.problem})" for capture in captures if capture.problem), "")
+        raise InputError(
+            f"{params.path}: contains {len(complete)} complete captures of both lenses{reason}; depth needs two or "
+            "more, taken from different positions"
+        )
+    for capture in captures:
+        name, problem = printable_name(capture.name)
+        yield SourceItem(
+            name, _files(capture) | {"calibration": params.calibration}, capture.problem or problem, (*notes,)
+        )
+
+
+def stitching_memory_bytes(params: DualFisheyeParams, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for decoding the pictures of a capture and stitching them, from the headers of the files."""
+    item: SourceItem = inputs["item"]
+    decoded = 0
+    for role in ("first", "second"):
+        if role in item.files:
+            height, width = stated_size_of_file(item.files[role]) or (0, 0)
+            if height * width > params.max_megapixels * 1e6:
+                return 0
+            decoded += height * width * (decoding_bytes_per_pixel(item.files[role]) + 3)
+    columns = params.width or params.max_width
+    return 60_000_000 + decoded + 8 * columns**2 // 2 + 40_000 * columns
+
+
+@source("source.dual_fisheye", list_items=list_captures, memory=stitching_memory_bytes)
+def dual_fisheye(item: SourceItem, params: DualFisheyeParams, ctx: Context) -> Panorama:
+    """Stitch panoramas from the pictures of two calibrated fisheye lenses.
+
+    Every pixel is looked up in the lens that sees it, at the stitching distance; directions that no lens sees are
+    masked. The panorama knows its lenses: poses.refine uses the true ray of each observation, which starts at the
+    centre of its lens, and export.colmap also writes a model of the fisheye pictures as a rig.
+    """
+    rig = params.rig(item.file("calibration"))
+    first = item.file("first")
+    second = item.file("second") if "second" in item.files else None
+    data = first.read_bytes()
+    pictures = [_decoded(first, data, params)]
+    if second is not None:
+        pictures.append(_decoded(second, second.read_bytes(), params))
+    size_hw = _panorama_size(rig, params)
+    picture, valid = stitch_lenses(
+        _by_lens(pictures, rig, item, params=params), rig, size_hw=size_hw, threads=ctx.threads
+    )
+    del pictures
+    write_png(ctx.scratch / "panorama.png", picture)
+    panorama = Panorama(
+        image=FilePart(ctx.scratch / "panorama.png"),
+        size_hw=size_hw,
+        source_size_hw=size_hw,
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+        position_lla=position_from_exif(read_container(data).exif),
+        rig=rig,
+        first_lens=first,
+        second_lens=second,
+    )
+    if not valid.all():
+        panorama = panorama.with_mask(valid, ctx.scratch)
+    ctx.metric("valid", float(panorama.load_mask().mean()))
+    ctx.metric("lens_distance_m", 2 * rig.lens_offset_m)
+    return panorama
+
+
+def _files(capture: RigPictures) -> dict[str, Any]:
+    return dict(zip(("first", "second"), capture.files, strict=False))
+
+
+def _decoded(file: FilePart, data: bytes, params: DualFisheyeParams) -> NDArray[np.uint8]:
+    return decode_image(file.path, data, max_pixels=int(params.max_megapixels * 1e6))
+
+
+def _by_lens(
+    pictures: list[NDArray[np.uint8]], rig: LensRig, item: SourceItem, *, params: DualFisheyeParams
+) -> list[NDArray[np.uint8]]:
+    """Return the picture of each lens."""
+    assert params.calibration is not None
+    sizes = [lens.size_hw for lens in rig.lenses]
+    if len(pictures) == 2:
+        wanted = sizes
+    else:
+        if sizes[0][0] != sizes[1][0]:
+            raise InputError(
+                f"{params.calibration}: the pictures of both lenses must have the same height if they are in one file"
+            )
+        wanted = [(sizes[0][0], sizes[0][1] + sizes[1][1])]
+    for role, picture, (height, width) in zip(("first", "second"), pictures, wanted, strict=False):
+        if picture.shape[:2] != (height, width):
+            raise InputError(
+                f"{item.files[role]}: {picture.shape[1]}×{picture.shape[0]} px, but {params.calibration.name} is for "
+                f"{width}×{height} px{'' if len(pictures) == 2 else ' (both lenses side by side)'}. Calibrate the "
+                "camera in the mode in which it took these pictures, see docs/rigs.md"
+            )
+    return pictures if len(pictures) == 2 else [pictures[0][:, : sizes[0][1]], pictures[0][:, sizes[0][1] :]]
+
+
+def _panorama_size(rig: LensRig, params: DualFisheyeParams) -> tuple[int, int]:
+    natural = round(2 * np.pi * max(max(lens.focal_xy) for lens in rig.lenses))
+    width = params.width or min(natural, params.max_width)
+    return working_size((width // 2, width), width)
+
+
+FOLDER = "colmap_rig"
+
+
+def lens_rig_files(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, *, ctx: Context) -> dict[str, Path]:
+    """Write the models of the fisheye pictures, one for each group of poses, and return the files by target.
+
+    There are none if no panorama has a rig. Groups whose poses are not in metres are left out with a note.
+    """
+    stems = item_stems(images)
+    pictures = {name: _pictures(image, stems[name]) for name, image in images.items() if image.rig is not None}
+    files: dict[str, Path] = {}
+    if not pictures:
+        return files
+    for number, group in enumerate(split_groups(poses)):
+        if not group.metric:
+            ctx.note(
+                f"{FOLDER} was not written{f' for group {number}' if number else ''}: the unit of length of the poses "
+                "is not known, but the distance between the lenses is in metres. Add poses.scale (docs/rigs.md)"
+            )
+            continue
+        folder = ctx.scratch / f"rig_{number}"
+        write_lens_rig_model(folder, group, pictures, form=form)
+        files |= {f"{FOLDER}/sparse/{number}/{path.name}": path for path in children(folder)}
+    configuration = ctx.scratch / "rig_config.json"
+    first = next(image.rig for image in images.values() if image.rig is not None)
+    configuration.write_text(rig_configuration(first), encoding="utf-8")
+    return files | {f"{FOLDER}/rig_config.json": configuration}
+
+
+def lenses_memory_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for one fisheye picture, its mask, and the rays of the panorama."""
+    image: Panorama = inputs["image"]
+    if image.rig is None or image.first_lens is None:
+        return 0
+    height, width = image.size_hw
+    largest = 2 * max(lens.size_hw[0] * lens.size_hw[1] for lens in image.rig.lenses)
+    return 50_000_000 + largest * (decoding_bytes_per_pixel(image.first_lens.path) + 100) + 300 * height * width
+
+
+@stage("export.colmap_lenses", memory=lenses_memory_bytes)
+def colmap_lenses(image: Each[Panorama], ctx: Context) -> Files:
+    """Write the fisheye pictures of panoramas from source.dual_fisheye for the rig that export.colmap writes.
+
+    colmap_rig/images/<lens>/<image> are the pictures: copies of the files, or, if a file shows both lenses, its halves
+    as PNG. colmap_rig/masks has their masks (0 outside of the field of view), and colmap_rig/labels/<image>.png the
+    lens that each pixel of the panorama shows: 1 the first, 2 the second, 0 none.
+    """
+    rig, first = image.rig, image.first_lens
+    if rig is None or first is None:
+        ctx.note("{count} panoramas were not stitched by source.dual_fisheye, so they have no fisheye pictures")
+        return Files({})
+    files: dict[str, Path] = {}
+    for lens_idx, (name, lens) in enumerate(zip(rig.names, rig.lenses, strict=True)):
+        suffix = _suffix(image)
+        picture, mask = ctx.scratch / f"{name}{suffix}", ctx.scratch / f"{name}.mask.png"
+        picture.write_bytes(_lens_file(image, lens_idx))
+        write_png(mask, lens_mask(lens))
+        files[f"{FOLDER}/images/{name}/{{item}}{suffix}"] = picture
+        files[f"{FOLDER}/masks/{name}/{{item}}{suffix}.png"] = mask
+    labels = ctx.scratch / "labels.png"
+    write_png(labels, (rig.lens_of_bearings(ray_grid(image.size_hw)) + 1).astype(np.uint8))
+    return Files(files | {f"{FOLDER}/labels/{{item}}.png": labels})
+
+
+def lens_mask(lens: FisheyeLens) -> NDArray[np.uint8]:
+    """Return the pixels within the field of view of a lens, (H, W) uint8: 255 inside, 0 outside."""
+    height, width = lens.size_hw
+    pixels = np.stack(np.broadcast_arrays(np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5), axis=-1)
+    return np.where(np.isfinite(lens.ray_from_pixel(pixels)[..., 2]), np.uint8(255), np.uint8(0))
+
+
+def _pictures(image: Panorama, stem: str) -> LensPictures:
+    assert image.rig is not None
+    first, second = (f"{lens}/{stem}{_suffix(image)}" for lens in image.rig.names)
+    return LensPictures(image.rig, (first, second))
+
+
+def _suffix(image: Panorama) -> str:
+    assert image.first_lens is not None
+    return ".png" if image.second_lens is None else image.first_lens.path.suffix
+
+
+def _lens_file(image: Panorama, lens_idx: int) -> bytes:
+    """Return the file of one lens: the user's own, or half of it as PNG."""
+    assert image.rig is not None
+    assert image.first_lens is not None
+    if image.second_lens is not None:
+        return (image.first_lens, image.second_lens)[lens_idx].read_bytes()
+    both = decode_image(image.first_lens.path, image.first_lens.read_bytes())
+    width = image.rig.lenses[0].size_hw[1]
+    half = both[:, :width] if lens_idx == 0 else both[:, width:]
+    return bytes(cv2.imencode(".png", cv2.cvtColor(half, cv2.COLOR_RGB2BGR))[1].tobytes())

@@ -1,1 +1,0 @@
-"""Stages for rigs of fisheye lenses."""
