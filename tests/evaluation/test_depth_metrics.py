@@ -94,12 +94,6 @@ def test_nothing_to_count_is_not_a_number() -> None:
     assert np.isnan(nothing.valid_mae)
 
 
-def test_all_figures_come_as_a_dict_of_numbers() -> None:
-    figures = depth_metrics(np.ones(SIZE), np.ones(SIZE)).as_dict()
-    assert {"psnr_db", "w_mae", "w_delta_105", "valid_w_delta_105", "completeness"} <= set(figures)
-    assert all(isinstance(value, float | int) for value in figures.values())
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
