@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -13,8 +14,11 @@ from numpy.typing import NDArray
 from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.testing.scenes import SCENES, Scene
+from pano_mvs.testing.scenes import Scene
 from tests.stored import read_picture
+
+SCRATCH = Path(tempfile.gettempdir()) / "pano_mvs_benchmarks"
+"""Where benchmarks keep what they have rendered."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +41,12 @@ class Capture:
 
     def first(self, count: int) -> Capture:
         """Return the first few views only."""
-        names = list(self.panoramas)[:count]
-        return Capture(
-            self.name,
-            {name: self.panoramas[name] for name in names},
-            {name: self.poses[name] for name in names},
-            {name: self.ranges[name] for name in names},
-            self.outdoor,
-        )
+        return self.only(list(self.panoramas)[:count])
+
+    def only(self, names: Sequence[str]) -> Capture:
+        """Return some of the views."""
+        parts = [{name: part[name] for name in names} for part in (self.panoramas, self.poses, self.ranges)]
+        return replace(self, panoramas=parts[0], poses=parts[1], ranges=parts[2])
 
 
 def read_capture(folder: Path, *, width: int | None = None) -> Capture:
@@ -65,7 +67,7 @@ def read_capture(folder: Path, *, width: int | None = None) -> Capture:
         size = height * (width or own_width) // own_width, width or own_width
         name = Path(view.name).name
         panoramas[name] = Panorama(FilePart(path), size, (height, own_width))
-        ranges[name] = _shrunk(true, size)
+        ranges[name] = cv2.resize(true, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
     poses = {Path(name).name: pose for name, pose in truth.poses.items()}
     return Capture(folder.resolve().name, panoramas, {name: poses[name] for name in panoramas}, ranges)
 
@@ -85,23 +87,3 @@ def scene_capture(scene: Scene, folder: Path, *, width: int) -> Capture:
         panoramas[name], poses[name] = Panorama(FilePart(picture), size, size), pose
         ranges[name] = np.load(truth)
     return Capture(scene.name, panoramas, poses, ranges, scene.outdoor)
-
-
-def scene_captures(
-    folder: Path, *, names: Sequence[str] = tuple(SCENES), width: int = 512, seed: int = 0, exposure: float = 0.0
-) -> list[Capture]:
-    """Return the synthetic scenes of these names, rendered into sub-folders of `folder` once."""
-    scenes = {name: SCENES[name](seed=seed, exposure=exposure) for name in names}
-    return [
-        scene_capture(scene, folder / f"{name}-{width}-{seed}-{exposure}", width=width)
-        for name, scene in scenes.items()
-    ]
-
-
-def _shrunk(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
-    if ranges.shape == size_hw:
-        return ranges
-    result: NDArray[np.float32] = cv2.resize(ranges, size_hw[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(
-        np.float32
-    )
-    return result

@@ -1,4 +1,4 @@
-"""How near to the surfaces COLMAP's own fusion gets: `python -m tests.benchmarks.colmap_dense [--scene room …]`.
+"""How near to the surfaces COLMAP's own fusion gets.
 
 Writes the dense workspace of a synthetic scene (`export.colmap_faces`, `points.*`, `export.colmap_dense`), lets
 `pycolmap.stereo_fusion` fuse it on the CPU, and prints the distances of the fused points from the true surfaces: with
@@ -8,10 +8,9 @@ gives the least, and scaled to a point 3 units away from the nearest camera: not
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import read_ply_points
@@ -31,7 +29,8 @@ from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracke
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along
 from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, scene_capture
-from tests.benchmarks.dense_chain import DenseChain
+from tests.benchmarks.dense_chain import DenseChain, context, true_poses
+from tests.benchmarks.table import print_table
 
 FloatArray = NDArray[np.float64]
 _AT = 3.0
@@ -63,12 +62,6 @@ def write_workspace(
     deliver(model, out, "")
     shutil.rmtree(scratch)
     return out / "colmap_dense"
-
-
-def context(scratch: Path) -> Context:
-    """Return what a stage is given, with a scratch folder that is made."""
-    scratch.mkdir(parents=True)
-    return Context(rng=np.random.default_rng(0), scratch=scratch)
 
 
 def deliver(files: Files, out: Path, item: str) -> None:
@@ -119,40 +112,38 @@ def room_scene(views: int = 4) -> Scene:
     return Scene("room", default_room(), tuple(capture_poses(views)), *none)
 
 
-def line(name: str, errors: FloatArray, pixels: int) -> str:
+def row(name: str, errors: FloatArray, pixels: int) -> list[object]:
     """Return one row of the table."""
     if not len(errors):
-        return f"| {name} | 0 | – | – | – |"
+        return [name, 0, "–", "–", "–"]
     median, high = np.percentile(errors, [50, 95])
-    return f"| {name} | {len(errors)} | {100 * len(errors) / pixels:.0f} | {median:.3f} | {high:.2f} |"
+    return [name, len(errors), f"{100 * len(errors) / pixels:.0f}", f"{median:.3f}", f"{high:.2f}"]
 
 
-def main() -> None:
-    """Print a table as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", nargs="*", default=["room"], choices=["room", *SCENES])
-    parser.add_argument("--width", type=int, default=1024)
-    parser.add_argument("--size", type=int, default=300, help="pixels of a face")
-    parser.add_argument("--workflow", default="known_poses")
-    parser.add_argument("--min-confidence", type=int, nargs="*", default=[64])
-    parser.add_argument("--min-num-pixels", type=int, default=3)
-    given = parser.parse_args()
-    print("| scene, ranges | fused points | % of pixels | median mm at 3 m | p95 mm at 3 m |\n|---|---|---|---|---|")
-    for scene in (room_scene() if name == "room" else SCENES[name]() for name in given.scene):
-        with tempfile.TemporaryDirectory() as folder:
-            capture = scene_capture(scene, Path(folder) / "capture", width=given.width)
-            estimated = list(DenseChain(given.workflow).run(capture).range_maps.values())[-1]
-            cases = [("true", true_maps(capture), 64)]
-            cases += [(f"{given.workflow} {least}", estimated, least) for least in given.min_confidence]
-            for what, maps, least in cases:
-                poses = Poses.without_points(capture.poses, frame="the truth's", scale="the truth's", metric=True)
-                workspace = write_workspace(
-                    Path(folder) / what, capture.panoramas, poses, maps, size_px=given.size, min_confidence=least
-                )
-                points = fused_points(workspace, min_num_pixels=given.min_num_pixels)
-                errors = wall_distances(points, scene.room, scene.poses)
-                print(line(f"{scene.name}, {what}", errors, len(maps) * 6 * given.size**2), flush=True)
+def main(
+    scene: list[str] | None = None,
+    width: int = 1024,
+    size: int = 300,
+    workflow: str = "known_poses",
+    min_confidence: list[int] | None = None,
+    min_num_pixels: int = 3,
+) -> None:
+    """Print the table; `size` is that of a face in pixels, and a scene "room" or one of `pano_mvs.testing.scenes`."""
 
+    def rows() -> Iterator[list[object]]:
+        for made in (room_scene() if name == "room" else SCENES[name]() for name in scene or ["room"]):
+            with tempfile.TemporaryDirectory() as folder:
+                capture = scene_capture(made, Path(folder) / "capture", width=width)
+                estimated = list(DenseChain(workflow).run(capture).range_maps.values())[-1]
+                cases = [("true", true_maps(capture), 64)]
+                cases += [(f"{workflow} {least}", estimated, least) for least in min_confidence or [64]]
+                for what, maps, least in cases:
+                    place, poses = Path(folder) / what, true_poses(capture)
+                    workspace = write_workspace(
+                        place, capture.panoramas, poses, maps, size_px=size, min_confidence=least
+                    )
+                    points = fused_points(workspace, min_num_pixels=min_num_pixels)
+                    errors = wall_distances(points, made.room, made.poses)
+                    yield row(f"{made.name}, {what}", errors, len(maps) * 6 * size**2)
 
-if __name__ == "__main__":
-    main()
+    print_table(["scene, ranges", "fused points", "% of pixels", "median mm at 3 m", "p95 mm at 3 m"], rows())

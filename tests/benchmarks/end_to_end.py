@@ -1,4 +1,4 @@
-"""How long a whole capture takes: `python -m tests.benchmarks.end_to_end --images DIR [--workflow quality]`.
+"""How long a whole capture takes.
 
 Runs the command line on a folder of pictures twice with stores of their own, so that the second run finds its kernels
 compiled and nothing else, and prints wall and CPU seconds of the second: in all, and of each stage as the run itself
@@ -7,7 +7,6 @@ recorded them. CPU seconds include worker processes; on a busy machine they say 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -17,6 +16,9 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from tests.benchmarks.dense_chain import Overrides
+from tests.benchmarks.table import print_table
 
 
 def run_once(arguments: list[str], out: Path) -> tuple[float, float, dict[str, Any]]:
@@ -33,27 +35,15 @@ def run_once(arguments: list[str], out: Path) -> tuple[float, float, dict[str, A
     return wall, cpu, json.loads((out / "run.json").read_text(encoding="utf-8"))
 
 
-def main() -> None:
-    """Print the times of one workflow on one capture as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=Path, required=True)
-    parser.add_argument("--workflow", default="quickstart")
-    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="STAGE.PARAM=VALUE")
-    parser.add_argument("--warm", action="store_true", help="the kernels are compiled: one run is enough")
-    given = parser.parse_args()
-    arguments = [given.workflow, "--images", str(given.images)]
-    for override in given.overrides:
+def main(images: Path, workflow: str = "quickstart", overrides: Overrides = None, warm: bool = False) -> None:
+    """Print the times of one workflow on one capture; with `warm`, the kernels are compiled, and one run is enough."""
+    arguments = [workflow, "--images", str(images)]
+    for override in overrides or ():
         arguments += ["--set", override]
     with tempfile.TemporaryDirectory() as scratch:
-        if not given.warm:
+        if not warm:
             run_once(arguments, Path(scratch) / "first")
         wall, cpu, summary = run_once(arguments, Path(scratch) / "second")
-    name = " ".join([given.workflow, *given.overrides])
-    print(f"`{name}`: {wall:.1f} s wall, {cpu:.1f} s CPU, {os.cpu_count()} cores\n")
-    print("| stage | units | seconds in units |\n|---|---|---|")
-    for stage in summary["stages"]:
-        print(f"| {stage['name']} | {stage['run']} | {stage['unit_seconds']:.1f} |")
-
-
-if __name__ == "__main__":
-    main()
+    print(f"`{' '.join([workflow, *(overrides or ())])}`: {wall:.1f} s wall, {cpu:.1f} s CPU, {os.cpu_count()} cores\n")
+    rows = ([stage["name"], stage["run"], f"{stage['unit_seconds']:.1f}"] for stage in summary["stages"])
+    print_table(["stage", "units", "seconds in units"], rows)

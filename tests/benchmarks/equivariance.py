@@ -1,4 +1,4 @@
-"""Does it matter where in the picture a thing is: `python -m tests.benchmarks.equivariance [--data DIR] [--set …]`.
+"""Does it matter where in the picture a thing is.
 
 Poses are given and turned with the pictures; what the dense stages of a workflow (`--workflow`, default quality) make
 of them is compared stage by stage, so that the first stage that fails shows:
@@ -17,39 +17,42 @@ Synthetic scenes are rendered afresh for every turn. A place's shares are those 
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import (
+    Rigid3,
     pad_panorama,
     pixel_from_ray,
     pixel_solid_angle,
     ray_grid,
+    roll_panorama,
     rotation_from_quat_wxyz,
     rotation_from_rotvec,
     sample_panorama,
 )
-from pano_mvs.testing.scenes import SCENES
-from tests.benchmarks.captures import Capture
-from tests.benchmarks.dense_chain import DenseChain, DenseRun
-from tests.benchmarks.turned import FolderPlace, Place, ScenePlace, rolled
+from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.testing.scenes import SCENES, Scene
+from tests.benchmarks.captures import Capture, read_capture, scene_capture
+from tests.benchmarks.dense_chain import DenseChain, DenseRun, Overrides
+from tests.benchmarks.table import print_table
 
 Ranges = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Turns = Mapping[str, NDArray[np.float64]]
+_MARGIN_PX = 8
+_RAYS_PER_PIXEL = 3
 _JUMP, _JUMP_MARGIN = 0.05, 2
 _BAD = 0.05
 _SEAM_COLUMNS, _POLE_DEG = 4, 80.0
-HEADER = (
-    "| place | stage | roll: median | > 1 % | turn: median | > 1 % | seam bad % | inside | ratio "
-    "| poles bad % | at the equator | ratio |\n" + "|---" * 12 + "|"
-)
 
 
 @dataclass(frozen=True)
@@ -190,42 +193,165 @@ def _share(bad: Mask, weights: NDArray[np.float64]) -> float:
     return float(weights[bad].sum() / weights.sum()) if weights.size else float("nan")
 
 
-def line(place: str, stage: str, found: Equivariance) -> str:
+def row(place: str, stage: str, found: Equivariance) -> list[str]:
     """Return one row of the table."""
     cells = [place, stage]
     for median, share in (found.roll, found.turn):
         cells += [f"{median:.1e}", f"{100 * share:.1f} %"]
     for bad in (found.seam, found.poles):
         cells += [f"{100 * bad.there:.1f}", f"{100 * bad.elsewhere:.1f}", f"{bad.ratio:.2f}"]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--workflow", default="quality")
-    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="STAGE.PARAM=VALUE")
-    parser.add_argument("--scene", action="append", choices=list(SCENES), default=[], help="a synthetic scene")
-    parser.add_argument("--data", action="append", default=[], type=Path, metavar="DIR", help="captures with truth")
-    parser.add_argument("--width", type=int, default=512)
-    parser.add_argument("--views", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=0, help="of scenes and turns")
-    given = parser.parse_args()
-    chain = DenseChain(given.workflow, overrides=given.overrides)
+class Place(Protocol):
+    """Where pictures come from, whichever way the cameras are turned."""
+
+    @property
+    def capture(self) -> Capture:
+        """The capture as it is."""
+        ...
+
+    def turned(self, turns: Turns, folder: Path) -> Capture:
+        """Return the capture with some cameras, by name, turned by new_from_old (3, 3); pictures go to the folder."""
+        ...
+
+
+@dataclass(frozen=True)
+class ScenePlace:
+    """A synthetic scene, rendered afresh for every turn, so that no resampling blurs anything.
+
+    Sensor noise is left out: two draws of it are no question of equivariance.
+    """
+
+    scene: Scene
+    folder: Path
+    width: int
+
+    @property
+    def capture(self) -> Capture:
+        """The scene as it is."""
+        return scene_capture(self._still, self.folder / "as-is", width=self.width)
+
+    @property
+    def _still(self) -> Scene:
+        return dataclasses.replace(self.scene, noise=0.0)
+
+    def turned(self, turns: Turns, folder: Path) -> Capture:
+        """Return the scene with some cameras turned."""
+        named = {f"{idx:03d}.png": pose for idx, pose in enumerate(self.scene.poses)}
+        poses = tuple(_turn(pose, turns.get(name)) for name, pose in named.items())
+        return scene_capture(dataclasses.replace(self._still, poses=poses), folder, width=self.width)
+
+
+@dataclass(frozen=True)
+class FolderPlace:
+    """A rendered capture on disk; turned pictures are averages of nine Lanczos samples of the file's own pixels.
+
+    At the file's own resolution some blur remains, at half of it next to none.
+    """
+
+    source: Path
+    width: int
+    views: int
+
+    @property
+    def capture(self) -> Capture:
+        """The capture as it is."""
+        return read_capture(self.source, width=self.width).first(self.views)
+
+    def turned(self, turns: Turns, folder: Path) -> Capture:
+        """Return the capture with some cameras turned."""
+        whole, capture = read_capture(self.source).first(self.views), self.capture
+        panoramas, ranges = dict(capture.panoramas), dict(capture.ranges)
+        for name, turn in turns.items():
+            picture = turned_picture(whole.panoramas[name].load(), turn, capture.panoramas[name].size_hw)
+            panoramas[name] = written(picture, folder / name)
+            ranges[name] = _nearest(whole.ranges[name], turn, picture.shape[:2])
+        poses = {name: _turn(pose, turns.get(name)) for name, pose in capture.poses.items()}
+        return dataclasses.replace(capture, panoramas=panoramas, poses=poses, ranges=ranges)
+
+
+def rolled(capture: Capture, columns: Mapping[str, int], folder: Path) -> Capture:
+    """Return the capture with each picture rolled to the right by its own number of columns, exactly."""
+    panoramas, poses, ranges = {}, {}, {}
+    for name, panorama in capture.panoramas.items():
+        picture, turn = roll_panorama(panorama.load(), columns[name])
+        panoramas[name] = written(picture, folder / name)
+        poses[name] = _turn(capture.poses[name], turn)
+        ranges[name] = np.roll(capture.ranges[name], columns[name], axis=1)
+    return dataclasses.replace(capture, panoramas=panoramas, poses=poses, ranges=ranges)
+
+
+def turned_picture(
+    picture: NDArray[np.uint8], new_from_old: NDArray[np.float64], size_hw: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """Return what a turned camera sees, (h, w, 3), of a larger or equally large panorama (H, W, 3)."""
+    total = np.zeros((*size_hw, 3))
+    for part in np.ndindex(_RAYS_PER_PIXEL, _RAYS_PER_PIXEL):
+        fine = (_RAYS_PER_PIXEL * size_hw[0], _RAYS_PER_PIXEL * size_hw[1])
+        rays = ray_grid(fine)[part[0] :: _RAYS_PER_PIXEL, part[1] :: _RAYS_PER_PIXEL] @ new_from_old
+        x, y = np.moveaxis(pixel_from_ray(rays, picture.shape[:2]) + _MARGIN_PX - 0.5, -1, 0).astype(np.float32)
+        padded = pad_panorama(picture, _MARGIN_PX)
+        total += cv2.remap(padded, x, y, cv2.INTER_LANCZOS4).astype(np.float64)
+    return np.asarray(np.rint(total / _RAYS_PER_PIXEL**2), dtype=np.uint8)
+
+
+def written(picture: NDArray[np.uint8], path: Path) -> Panorama:
+    """Write an RGB picture without loss and return it as a panorama."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lossless = path.with_suffix(".png")
+    cv2.imwrite(str(lossless), picture[..., ::-1])
+    size = picture.shape[0], picture.shape[1]
+    return Panorama(FilePart(lossless), size, size)
+
+
+def _turn(pose: Rigid3, new_from_old: NDArray[np.float64] | None) -> Rigid3:
+    return pose if new_from_old is None else Rigid3(new_from_old, np.zeros(3)) @ pose
+
+
+def _nearest(
+    ranges: NDArray[np.float32], new_from_old: NDArray[np.float64], size_hw: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Return the ranges of the pixels in which a turned camera's rays arrive, (h, w)."""
+    height, width = ranges.shape
+    column, row = np.moveaxis(np.floor(pixel_from_ray(ray_grid(size_hw) @ new_from_old, (height, width))), -1, 0)
+    result: NDArray[np.float32] = ranges[np.clip(row, 0, height - 1).astype(int), np.mod(column, width).astype(int)]
+    return result
+
+
+def main(
+    workflow: str = "quality",
+    overrides: Overrides = None,
+    scene: list[str] | None = None,
+    data: list[Path] | None = None,
+    width: int = 512,
+    views: int = 4,
+    seed: int = 0,
+) -> None:
+    """Print the table.
+
+    Args:
+        workflow: preset or file.
+        overrides: as `--set` of `run`.
+        scene: synthetic scenes; default poles, if there is no `data`.
+        data: captures with truth.
+        width: of the panoramas.
+        views: number of views.
+        seed: of scenes and turns.
+    """
+    chain = DenseChain(workflow, overrides=overrides or ())
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        places: list[Place] = [FolderPlace(path, given.width, given.views) for path in given.data]
-        scenes = given.scene or ([] if given.data else ["poles"])
+        places: list[Place] = [FolderPlace(path, width, views) for path in data or ()]
         places += [
-            ScenePlace(SCENES[name](seed=given.seed, views=given.views), folder / name, given.width) for name in scenes
+            ScenePlace(SCENES[name](seed=seed, views=views), folder / name, width)
+            for name in scene or ([] if data else ["poles"])
         ]
-        print(f"{given.workflow} {' '.join(given.overrides)}, {given.width}×{given.width // 2}, {given.views} views")
-        print(HEADER)
-        for number, place in enumerate(places):
-            found = measure(chain, place, folder / str(number), seed=given.seed)
-            for stage, figures in found.items():
-                print(line(place.capture.name, stage, figures), flush=True)
 
+        def rows() -> Iterator[list[str]]:
+            for number, place in enumerate(places):
+                for stage, figures in measure(chain, place, folder / str(number), seed=seed).items():
+                    yield row(place.capture.name, stage, figures)
 
-if __name__ == "__main__":
-    main()
+        columns = ["place", "stage", "roll: median", "> 1 %", "turn: median", "> 1 %", "seam bad %", "inside", "ratio"]
+        print_table([*columns, "poles bad %", "at the equator", "ratio"], rows())

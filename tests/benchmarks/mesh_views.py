@@ -1,4 +1,4 @@
-"""How a mesh looks where no panorama was used: `python -m tests.benchmarks.mesh_views FOLDER [FOLDER …]`.
+"""How a mesh looks where no panorama was used.
 
 Leaves out one panorama of a rendered capture with true poses, computes ranges of the others by the dense stages of a
 workflow, and makes the mesh with coloured vertices (`export.mesh`) and the textured one (`export.mesh_textured`).
@@ -9,7 +9,6 @@ triangles of the second, with the colours of the nearest vertices. `--out` keeps
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -21,43 +20,27 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.mesh.surface import Mesh, decimated
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
-from pano_mvs.engine.stages.context import Context
-from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.stages.exports.mesh import MeshParams, TexturedParams, solved_mesh, textured_mesh
-from pano_mvs.stages.fusion import FusionParams, vote
 from tests.benchmarks.captures import Capture, read_capture
-from tests.benchmarks.dense_chain import DenseChain, given_records, true_poses
+from tests.benchmarks.dense_chain import DenseChain, context, true_poses
 from tests.evaluation.held_out_meshes import HeldOutScores, held_out_scores
 
 
-def without(capture: Capture, left_out: str) -> Capture:
-    """Return a capture without one of its panoramas."""
-    names = [name for name in capture.panoramas if name != left_out]
-    return Capture(
-        capture.name,
-        {name: capture.panoramas[name] for name in names},
-        {name: capture.poses[name] for name in names},
-        {name: capture.ranges[name] for name in names},
-        capture.outdoor,
-    )
-
-
-def meshes(capture: Capture, workflow: str, folder: Path, settings: dict[str, object]) -> tuple[Mesh, TexturedMesh]:
+def meshes(capture: Capture, workflow: str, folder: Path, triangles: int) -> tuple[Mesh, TexturedMesh]:
     """Return the mesh with coloured vertices and the textured one, and print the CPU seconds of their parts."""
     chain = DenseChain(workflow)
     started = time.process_time()
-    maps = chain.run(capture).range_maps
-    last = maps[list(maps)[-1]]
+    run = chain.run(capture)
+    last = list(run.range_maps.values())[-1]
     poses = true_poses(capture)
-    cloud = fused(chain, capture, maps)
+    cloud = chain.fused(capture, run)
     print(f"  ranges and fusion: {time.process_time() - started:.0f} s, {len(cloud)} points", flush=True)
     for name in ("plain", "textured"):
         (folder / name).mkdir()
     plain, _ = solved_mesh(cloud, MeshParams(), folder / "plain")
     started = time.process_time()
-    ctx = Context(np.random.default_rng(0), folder)
-    params = TexturedParams.model_validate(settings)
-    made = textured_mesh(cloud, (poses, capture.panoramas, last), params, folder=folder / "textured", ctx=ctx)
+    params, inputs = TexturedParams(triangles=triangles), (poses, capture.panoramas, last)
+    made = textured_mesh(cloud, inputs, params, folder=folder / "textured", ctx=context(folder))
     print(f"  texture: {time.process_time() - started:.0f} s without the solver", flush=True)
     return plain, made
 
@@ -67,21 +50,6 @@ def simplified(mesh: Mesh, triangles: int) -> Mesh:
     vertices, faces = decimated(mesh.vertices_in_world, mesh.faces, triangles=triangles)
     _, nearest = cKDTree(mesh.vertices_in_world).query(vertices)
     return Mesh(vertices, mesh.colors_rgb[nearest], faces)
-
-
-def fused(chain: DenseChain, capture: Capture, maps: dict[str, dict[str, RangeMap]]) -> PointCloud:
-    """Return the cloud that the workflow's fusion makes."""
-    name = next(name for name, entry in chain.stages.items() if entry.spec.name == "fusion.vote")
-    params = chain.stages[name].params
-    assert isinstance(params, FusionParams)
-    given = given_records(capture, true_poses(capture))
-    return vote(
-        ranges=maps[chain.graph.edges[name]["ranges"].producer],
-        poses=next(items for kind, items in given.items() if kind.__name__ == "Pose"),
-        images=capture.panoramas,
-        params=params,
-        ctx=Context(np.random.default_rng(0), Path(tempfile.gettempdir())),
-    )
 
 
 def report(name: str, mesh: Mesh | TexturedMesh, scores: HeldOutScores, *, of_most: float) -> None:
@@ -101,25 +69,32 @@ def psnr_of_most(picture: NDArray[np.uint8], truth: NDArray[np.uint8], valid: ND
     return float(10 * np.log10(255.0**2 / squared[: int(0.95 * len(squared))].mean()))
 
 
-def main() -> None:
-    """Print the scores of each capture."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("folders", type=Path, nargs="+", help="rendered captures with poses.json and depth.npz")
-    parser.add_argument("--left-out", default="004.png", help="the panorama to render")
-    parser.add_argument("--width", type=int, default=1024, help="width of the panoramas")
-    parser.add_argument("--workflow", default="quality", help="workflow of the ranges")
-    parser.add_argument("--triangles", type=int, default=TexturedParams().triangles, help="of the textured mesh")
-    parser.add_argument("--out", type=Path, help="folder for the pictures")
-    options = parser.parse_args()
-    for folder in options.folders:
-        capture = read_capture(folder, width=options.width)
-        print(f"{capture.name} at {options.left_out}, {options.width} px wide", flush=True)
-        truth, pose = capture.panoramas[options.left_out].load(), capture.poses[options.left_out]
-        valid = np.isfinite(capture.ranges[options.left_out])
+def main(
+    folders: list[Path],
+    left_out: str = "004.png",
+    width: int = 1024,
+    workflow: str = "quality",
+    triangles: int = 100_000,
+    out: Path | None = None,
+) -> None:
+    """Print the scores of each capture.
+
+    Args:
+        folders: rendered captures with poses.json and depth.npz.
+        left_out: the panorama to render.
+        width: of the panoramas.
+        workflow: of the ranges.
+        triangles: of the textured mesh.
+        out: folder for the pictures.
+    """
+    for folder in folders:
+        capture = read_capture(folder, width=width)
+        print(f"{capture.name} at {left_out}, {width} px wide", flush=True)
+        truth, pose = capture.panoramas[left_out].load(), capture.poses[left_out]
+        valid = np.isfinite(capture.ranges[left_out])
         with tempfile.TemporaryDirectory() as scratch:
-            used, settings = without(capture, options.left_out), {"triangles": options.triangles}
-            pair = meshes(used, options.workflow, Path(scratch), settings)
-        plain, made = pair
+            used = capture.only([name for name in capture.panoramas if name != left_out])
+            plain, made = meshes(used, workflow, Path(scratch), triangles)
         named: dict[str, Mesh | TexturedMesh] = {
             "vertices": plain,
             "as many": simplified(plain, len(made.faces)),
@@ -128,11 +103,7 @@ def main() -> None:
         for name, mesh in named.items():
             scores = held_out_scores(mesh, pose, truth, valid=valid)
             report(name, mesh, scores, of_most=psnr_of_most(scores.picture, truth, valid))
-            if options.out:
-                options.out.mkdir(parents=True, exist_ok=True)
-                path = options.out / f"{capture.name}_{name.replace(' ', '_')}.png"
+            if out:
+                out.mkdir(parents=True, exist_ok=True)
+                path = out / f"{capture.name}_{name.replace(' ', '_')}.png"
                 cv2.imwrite(str(path), scores.picture[..., ::-1])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""How much of people is masked, and of everything else: `python -m tests.benchmarks.operator [CAPTURE ...]`.
+"""How much of people is masked, and of everything else.
 
 Draws people into the panoramas of a synthetic court with four kinds of ground, and of captures with true poses and
 ranges (`rgb/`, `poses.json` and `depth.npz`). A different person crouches below the camera in each view, others stand
@@ -12,15 +12,16 @@ of images: JSON with `size_hw` and `polygons`, image name to polygons of (x, y).
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import dilated, share_of_sphere
@@ -30,8 +31,10 @@ from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.static_content import static_content
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.image_file import decode_image
 from pano_mvs.testing.scenes import courtyard
 from pano_mvs.testing.texture import noise
+from tests.benchmarks.captures import read_capture
 from tests.synthetic.persons import OUTFITS, Person, draw_people, person
 
 Mask = NDArray[np.bool_]
@@ -71,20 +74,12 @@ def synthetic_views(ground: str, *, views: int, seed: int) -> tuple[list[View], 
 
 def captured_views(folder: Path, *, views: int) -> tuple[list[View], float]:
     """Return views of a capture with truth, and the height of its ground: the median of what lies below the cameras."""
-    stored = np.load(folder / "depth.npz")
-    poses = json.loads((folder / "poses.json").read_text(encoding="utf-8"))["views"]
-    down = ray_grid(SIZE_HW)[..., 1] > 0.9
-    found, heights = [], []
-    for idx, file in enumerate(sorted((folder / "rgb").glob("*.png"))[:views]):
-        picture = cv2.resize(_read(file), SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
-        full = stored[file.stem]
-        step = full.shape[0] // SIZE_HW[0]
-        ranges = full[step // 2 :: step, step // 2 :: step].astype(np.float32)
-        ranges[~np.isfinite(ranges)] = np.nan
-        pose = Rigid3(np.array(poses[idx]["R"], float), np.array(poses[idx]["t"], float))
-        found.append((np.ascontiguousarray(picture), ranges, pose))
-        heights.append(float(np.nanmedian((pose.center + ray_grid(SIZE_HW)[down] * ranges[down, None])[:, 1])))
-    return found, float(np.max(heights))
+    capture = read_capture(folder, width=SIZE_HW[1]).first(views)
+    rays = ray_grid(SIZE_HW)
+    down = rays[..., 1] > 0.9
+    found = [(image.load(), capture.ranges[name], capture.poses[name]) for name, image in capture.panoramas.items()]
+    points = [pose.center + rays[down] * ranges[down, None] for _, ranges, pose in found]
+    return found, float(np.max([np.nanmedian(each[:, 1]) for each in points]))
 
 
 def populated(views: Sequence[View], ground_y: float, *, seed: int) -> list[Populated]:
@@ -137,7 +132,7 @@ def measured(views: Sequence[Populated]) -> Iterator[tuple[Populated, Mask, Mask
 def marked(file: Path, images: Path) -> None:
     """Print what masks.static and masks.operator mask of hand-marked areas."""
     marks = json.loads(file.read_text(encoding="utf-8"))
-    pictures = [_read(images / name) for name in marks["polygons"]]
+    pictures = [decode_image(images / name) for name in marks["polygons"]]
     small = [np.ascontiguousarray(cv2.resize(p, SIZE_HW[::-1], interpolation=cv2.INTER_AREA)) for p in pictures]
     static = static_content(small).pixels
     for (name, polygons), picture in zip(marks["polygons"].items(), pictures, strict=True):
@@ -154,23 +149,29 @@ def marked(file: Path, images: Path) -> None:
         )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", type=Path, nargs="*", help="folders with rgb/, poses.json and depth.npz")
-    parser.add_argument("--views", type=int, default=5, help="views of each place")
-    parser.add_argument("--seed", type=int, default=1, help="seed of places and people")
-    parser.add_argument("--marks", type=Path, nargs=2, metavar=("FILE", "IMAGES"), help="hand-marked areas")
-    options = parser.parse_args(arguments)
-    if options.marks:
-        marked(*options.marks)
+def main(
+    captures: Annotated[list[Path] | None, typer.Argument()] = None,
+    views: int = 5,
+    seed: int = 1,
+    marks: tuple[Path, Path] | None = None,
+) -> None:
+    """Print the tables.
+
+    Args:
+        captures: folders with rgb/, poses.json and depth.npz.
+        views: views of each place.
+        seed: of places and people.
+        marks: hand-marked areas: a file, and the folder of its images.
+    """
+    if marks:
+        marked(*marks)
         return
-    places = {ground: synthetic_views(ground, views=options.views, seed=options.seed) for ground in GROUNDS}
-    places |= {folder.name: captured_views(folder, views=options.views) for folder in options.captures}
+    places = {ground: synthetic_views(ground, views=views, seed=seed) for ground in GROUNDS}
+    places |= {folder.name: captured_views(folder, views=views) for folder in captures or ()}
     by_kind: dict[str, list[tuple[float, float, float]]] = {}
-    for place, (views, ground_y) in places.items():
+    for place, (shown, ground_y) in places.items():
         rest: list[tuple[float, ...]] = []
-        for view, first, second, seconds in measured(populated(views, ground_y, seed=options.seed)):
+        for view, first, second, seconds in measured(populated(shown, ground_y, seed=seed)):
             for kind, pixels in view.shown.items():
                 if share_of_sphere(pixels) > 5e-4:
                     shares = _share(first, pixels), _share(second, pixels), _share(first | second, pixels)
@@ -188,12 +189,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{kind:12} {len(found):3}  operator {mean[0]:6.1%} (least {least[0]:6.1%})  moving {mean[1]:6.1%} "
             f"({least[1]:6.1%})  both {mean[2]:6.1%} ({least[2]:6.1%})"
         )
-
-
-def _read(file: Path) -> Picture:
-    picture = cv2.imread(str(file))
-    assert picture is not None, file
-    return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
 def _somebody(
@@ -240,7 +235,3 @@ def _with_ground(picture: Picture, ranges: NDArray[np.float32], pose: Rigid3, *,
 
 def _share(pixels: Mask, of: Mask) -> float:
     return share_of_sphere(pixels & of) / max(share_of_sphere(of), 1e-12)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""Real captures without ground truth: `python -m tests.benchmarks.real_captures DIR … --out DIR [--width 2048]`.
+"""Real captures without ground truth.
 
 Each DIR is a folder of panoramas. `pano-mvs run` (the preset `quality`; `--workflow` chooses another) and COLMAP on its
 own (EQUIRECTANGULAR cameras, its SIFT, all pairs, its defaults, incremental and global) process the same images in the
@@ -13,25 +13,25 @@ same run. For each, the table shows
 Below it are the share of each range map that other views confirm, the points of the cloud, and how far our poses and
 COLMAP's differ: the median and maximum over all common pairs of the larger of rotation and direction difference.
 Images are reduced to `--width` columns first, for all programs alike; `--without-colmap` leaves COLMAP out. In `--out`
-are the table (`table.md`), our output folders, and three pictures of each cloud.
+are our output folders and three pictures of each cloud.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 
 import pano_mvs
 from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
@@ -44,7 +44,9 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Poses
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
+from tests.benchmarks.dense_chain import Overrides
 from tests.benchmarks.poses.captures_with_truth import MAPPERS, SEED, native_features, native_matches
+from tests.benchmarks.table import print_table
 
 _IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
 _POSE_STAGES = ("masks.", "features.", "global.", "pairs.", "matches.", "poses.", "source.")
@@ -131,31 +133,34 @@ def colmap(images: Path, mapper: str, database: Path) -> Row:
     return Row(f"COLMAP, {mapper}", tuple(models), cpu_s)
 
 
-def table(rows: Iterable[Row], confirmed: Callable[[Poses], np.ndarray], total: int) -> list[str]:
-    """Return the lines of the Markdown table of one capture."""
-    lines = [
-        "| | registered: largest model | … all models | doubted | points | residual °: median / 95 % "
-        "| confirmed %: median / least | CPU-s of the poses |",
-        "|---|---|---|---|---|---|---|---|",
+COLUMNS = (
+    "",
+    "registered: largest model",
+    "… all models",
+    "doubted",
+    "points",
+    "residual °: median / 95 %",
+    "confirmed %: median / least",
+    "CPU-s of the poses",
+)
+
+
+def cells(row: Row, confirmed: Callable[[Poses], np.ndarray], total: int) -> list[object]:
+    """Return a row of the table of one capture."""
+    if not row.models:
+        return [row.label, f"0 of {total}", 0, "–", "–", "–", "–", f"{row.cpu_s:.0f}"]
+    model, found, shares = row.models[0], reprojection_residuals(row.models[0]), confirmed(row.models[0])
+    known = np.isfinite(shares).any()
+    return [
+        row.label,
+        f"{len(model.names)} of {total}",
+        " + ".join(str(len(other.names)) for other in row.models),
+        sum(len(other.doubts) for other in row.models) or "–",
+        f"{len(model.points_in_world):,}",
+        "–" if found is None else f"{found.overall.median_deg:.3f} / {found.overall.p95_deg:.3f}",
+        f"{100 * np.nanmedian(shares):.0f} / {100 * np.nanmin(shares):.0f}" if known else "–",
+        f"{row.cpu_s:.0f}",
     ]
-    for row in rows:
-        if not row.models:
-            lines.append(f"| {row.label} | 0 of {total} | 0 | – | – | – | – | {row.cpu_s:.0f} |")
-            continue
-        model = row.models[0]
-        found = reprojection_residuals(model)
-        residual = "–" if found is None else f"{found.overall.median_deg:.3f} / {found.overall.p95_deg:.3f}"
-        shares = confirmed(model)
-        share = (
-            f"{100 * np.nanmedian(shares):.0f} / {100 * np.nanmin(shares):.0f}" if np.isfinite(shares).any() else "–"
-        )
-        everywhere = " + ".join(str(len(other.names)) for other in row.models)
-        doubts = sum(len(other.doubts) for other in row.models)
-        lines.append(
-            f"| {row.label} | {len(model.names)} of {total} | {everywhere} | {doubts or '–'} "
-            f"| {len(model.points_in_world):,} | {residual} | {share} | {row.cpu_s:.0f} |"
-        )
-    return lines
 
 
 def confirmation(run: RunOutput, images: Path) -> Callable[[Poses], np.ndarray]:
@@ -205,35 +210,32 @@ def write_pictures(run: RunOutput, poses: Poses, out: Path) -> None:
         cv2.imwrite(str(out / f"cloud_{name}.png"), image[..., ::-1])
 
 
-def measure(folder: Path, out: Path, options: argparse.Namespace) -> list[str]:
-    """Return the Markdown lines of one capture."""
-    out.mkdir(parents=True)
-    total = reduced(folder, out / "images", options.width)
-    run, whole_s, poses_s = ours(out / "images", out / "run", options.workflow, options.set)
+def measure(folder: Path, out: Path, *, workflow: str, width: int, overrides: Sequence[str], beside: bool) -> None:
+    """Print the table of one capture and what is below it, and write pictures of its cloud."""
+    total = reduced(folder, out / "images", width)
+    run, whole_s, poses_s = ours(out / "images", out / "run", workflow, overrides)
     groups = () if run.poses is None else tuple(split_groups(run.poses))
-    rows = [Row(f"pano_mvs, `{options.workflow}`", groups, poses_s)]
-    if not options.without_colmap:
+    rows = [Row(f"pano_mvs, `{workflow}`", groups, poses_s)]
+    if beside:
         with tempfile.TemporaryDirectory() as scratch:
             rows += [colmap(out / "images", mapper, Path(scratch) / "native.db") for mapper in MAPPERS]
-    lines = [f"### {folder.name}: {total} images, at most {options.width} columns", ""]
-    lines += table(rows, confirmation(run, out / "images"), total)
-    shares = [view.consistent for view in run.summary.views if view.consistent is not None]
-    lines += ["", f"The whole run took {whole_s:.0f} CPU-s."]
+    print(f"### {folder.name}: {total} images, at most {width} columns\n")
+    confirmed = confirmation(run, out / "images")
+    print_table(COLUMNS, (cells(row, confirmed, total) for row in rows))
+    shares = [100 * view.consistent for view in run.summary.views if view.consistent is not None]
+    print(f"\nThe whole run took {whole_s:.0f} CPU-s.")
     if shares:
-        lines += [f"Confirmed pixels of the range maps: {_spread(shares)}; cloud: {run.summary.cloud.points:,} points."]
+        low, middle, high = np.quantile(shares, [0, 0.5, 1])
+        spread = f"{middle:.0f} % in the median of the views ({low:.0f} to {high:.0f} %)"
+        print(f"Confirmed pixels of the range maps: {spread}; cloud: {run.summary.cloud.points:,} points.")
     for row in rows[1:]:
         if groups and row.models:
-            lines += [f"{row.label} and ours: {difference(groups[0], row.models[0])}."]
+            print(f"{row.label} and ours: {difference(groups[0], row.models[0])}.")
     for name, why in {**run.summary.poses.rejected, **run.summary.poses.doubts}.items():
-        lines += [f"- {name}: {why}"]
+        print(f"- {name}: {why}")
     if groups:
         write_pictures(run, groups[0], out)
-    return [*lines, ""]
-
-
-def _spread(shares: Sequence[float]) -> str:
-    low, middle, high = (100 * float(value) for value in np.quantile(shares, [0, 0.5, 1]))
-    return f"{middle:.0f} % in the median of the views ({low:.0f} to {high:.0f} %)"
+    print(flush=True)
 
 
 def _children_s() -> float:
@@ -241,22 +243,15 @@ def _children_s() -> float:
     return times.children_user + times.children_system
 
 
-def main() -> None:
-    """Measure the captures that the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR")
-    parser.add_argument("--out", type=Path, required=True, help="an empty or new folder")
-    parser.add_argument("--workflow", default="quality")
-    parser.add_argument("--width", type=int, default=2048)
-    parser.add_argument("--set", action="append", default=[], metavar="STAGE.PARAM=VALUE")
-    parser.add_argument("--without-colmap", action="store_true")
-    options: Any = parser.parse_args()
-    for folder in options.folders:
-        lines = measure(folder, options.out / folder.name, options)
-        with (options.out / "table.md").open("a", encoding="utf-8") as file:
-            file.write("\n".join(lines) + "\n")
-        print("\n".join(lines), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def main(
+    folders: list[Path],
+    out: Annotated[Path, typer.Option()],
+    workflow: str = "quality",
+    width: int = 2048,
+    overrides: Overrides = None,
+    without_colmap: bool = False,
+) -> None:
+    """Measure captures; `out` is an empty or new folder."""
+    for folder in folders:
+        place = out / folder.name
+        measure(folder, place, workflow=workflow, width=width, overrides=overrides or (), beside=not without_colmap)

@@ -1,7 +1,5 @@
 """Measure the times with which a run estimates stages that no earlier run with its cache has computed.
 
-    python -m tests.benchmarks.reference_times [PRESET ...]     # default: quickstart quality
-
 Each preset runs on its samples, serially, into a new cache that the presets share. Times are CPU seconds, those of
 child processes included, so that they hold for one thread of an idle machine, whatever else runs. Stages that the
 presets do not have keep the times that they had. The result is `pano_mvs/session/reference_times.json`; runs scale it
@@ -16,6 +14,9 @@ import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
 
 import pano_mvs
 from pano_mvs.core.digest import digest_from_bytes
@@ -63,11 +64,7 @@ def measure(presets: list[str]) -> dict[str, list[list[object]]]:
         return samples_in(cache / FILE_NAME)
 
 
-def main() -> None:
-    """Measure, and write the file."""
-    body = json.dumps(merged(samples_in(TARGET), measure(sys.argv[1:] or ["quickstart", "quality"])), indent=0)
+def main(presets: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+    """Measure presets, by default quickstart and quality, and write the file."""
+    body = json.dumps(merged(samples_in(TARGET), measure(presets or ["quickstart", "quality"])), indent=0)
     TARGET.write_text(f"{digest_from_bytes(body.encode())}\n{body}", encoding="utf-8", newline="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """How soon a shared page shows its first complete picture, and how often it draws while it is turned.
 
-    python -m tests.benchmarks.shared_page PAGE [--browser firefox] [--seconds 5]
-
 PAGE is a folder that `pano-mvs share` wrote. The browsers draw in software. Beside the frames per second stands the
 processor time of the browser per frame, which depends less on what else the machine does: with two free cores, 60 ms
 allow 30 frames per second.
@@ -9,11 +7,12 @@ allow 30 frames per second.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 from pathlib import Path
+from typing import Literal
 
+from tests.benchmarks.table import print_table
 from tests.share.browser import Browser, open_browser
 
 _READY = "typeof PanoMvs === 'object' && PanoMvs.page && PanoMvs.page.settled"
@@ -38,22 +37,18 @@ _INSIDE = "PanoMvs.page.nearest() ? PanoMvs.page.stepInside(PanoMvs.page.nearest
 _VIEWS = {"surface": _SURFACE, "points": _POINTS, "inside": _INSIDE}
 
 
-def main() -> None:
-    """Measure a page and print the figures as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path)
-    parser.add_argument("--browser", choices=("chromium", "firefox"), default="chromium")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of turning per view")
-    parser.add_argument("--openings", type=int, default=5)
-    given = parser.parse_args()
-    with open_browser(given.browser, width=1280, height=720) as browser:
-        opened = [_opening_ms(browser, given.page / "index.html") for _ in range(given.openings)]
+def main(
+    page: Path, browser: Literal["chromium", "firefox"] = "chromium", seconds: float = 5.0, openings: int = 5
+) -> None:
+    """Measure a page and print the figures; `seconds` are those of turning per view."""
+    with open_browser(browser, width=1280, height=720) as window:
+        opened = [_opening_ms(window, page / "index.html") for _ in range(openings)]
         middle, worst = statistics.median(opened), max(opened)
         print(f"first complete picture: median {middle:.0f} ms of {len(opened)}, worst {worst:.0f} ms\n")
-        print("| view | frames/s | CPU ms/frame | pace |\n|---|---|---|---|")
-        for name, script in _VIEWS.items():
-            if browser.evaluate(f"(async () => {script})()"):
-                print(f"| {name} | {' | '.join(_turning(browser, given.seconds))} |", flush=True)
+        shown = (name for name, script in _VIEWS.items() if window.evaluate(f"(async () => {script})()"))
+        print_table(
+            ["view", "frames/s", "CPU ms/frame", "pace"], ([name, *_turning(window, seconds)] for name in shown)
+        )
         print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
@@ -92,7 +87,3 @@ def _cpu_s(process: int) -> float:
         total += ticks[number]
         pending += children.get(number, [])
     return total / os.sysconf("SC_CLK_TCK")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""The paper's Tables 2 and 3 on rendered captures with truth: `python -m tests.benchmarks.tables [--data DIR …]`.
+"""The paper's Tables 2 and 3 on rendered captures with truth.
 
 S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images Using Virtual Depth". 2, 3 and 4
 cameras are the first views of a capture, the reference is view 0; windows 5, 7, 9; poses known or estimated from the
@@ -13,18 +13,19 @@ other views swept too, as its consistency check needs them. Prints Markdown.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.scene import Poses
 from pano_mvs.session.session import presets_folder
 from tests.benchmarks.captures import Capture, read_capture
-from tests.benchmarks.dense_chain import DenseChain, score_view
-from tests.benchmarks.depth_metrics import DepthMetrics, constant_baseline
+from tests.benchmarks.dense_chain import DenseChain
+from tests.benchmarks.depth_metrics import constant_baseline, depth_metrics
 from tests.benchmarks.poses.sparse_chain import SparseChain
+from tests.benchmarks.table import print_table
 
 # What the paper reports: (cameras, poses) to MSE ×10⁻² and PSNR, window 7 (Table 2), …
 PAPER_TABLE_2 = {
@@ -52,7 +53,7 @@ RIVALS = {"classroom": ("UniFuse", 26.71), "smallroom": ("360SD-Net", 22.36)}
 WINDOWS = (5, 7, 9)
 SAMPLE = presets_folder() / "samples" / "classroom"
 KNOWN, ESTIMATED, UNSCALED = "known", "estimated", "estimated, no scale factors"
-HEADER = "| cameras | window | poses | MSE ×10⁻² | PSNR | the paper | wδ<1.05 | wMAE |\n" + "|---" * 8 + "|"
+HEADER = ("cameras", "window", "poses", "MSE ×10⁻²", "PSNR", "the paper", "wδ<1.05", "wMAE")
 ABLATIONS = {
     "no bilateral filter of the pictures": ["depth.prefilter_diameter=0"],
     "sources looked up where they are, not turned first": ["depth.derotate=false"],
@@ -63,33 +64,38 @@ ABLATIONS = {
 }
 
 
-def score(chain: DenseChain, capture: Capture, poses: Poses | None, *, all_views: bool = False) -> DepthMetrics:
+def score(chain: DenseChain, capture: Capture, poses: Poses | None) -> SimpleNamespace:
     """Return the scores of view 0 by the dense stages of a workflow, with these poses or the true ones."""
     name = next(iter(capture.panoramas))
-    run = chain.run(capture, poses=poses, references=None if all_views else [name])
+    run = chain.run(capture, poses=poses, references=[name])
     scale = 1.0
     if poses is not None:
         found = {image: poses.cam_from_world(idx) for idx, image in enumerate(poses.names)}
         scale = align_centers(found, {image: capture.poses[image] for image in found}).scale
     last = list(run.range_maps.values())[-1]
-    return score_view(last[name], capture.ranges[name], scale=scale).filled
+    return depth_metrics(last[name].range, capture.ranges[name], scale=scale)
 
 
-def paper_rows(capture: Capture, workflow: str, sparse: SparseChain, overrides: Sequence[str]) -> Iterator[str]:
-    """Return the rows of both tables, by the workflow's own poses and by the true ones."""
-    chains = {window: DenseChain(workflow, overrides=[f"depth.window={window}", *overrides]) for window in WINDOWS}
+def paper_rows(capture: Capture, workflow: str) -> Iterator[Sequence[object]]:
+    """Yield the rows of both tables, by the workflow's own poses and by the true ones."""
+    yield row("–", "–", "the median of the truth everywhere", constant_baseline(next(iter(capture.ranges.values()))))
+    if capture.name in RIVALS:
+        name, psnr = RIVALS[capture.name]
+        yield "–", "–", f"best rival in the paper, {name}", "", "", f"{psnr:.2f}", "", ""
+    sparse = SparseChain(workflow)
+    chains = {window: DenseChain(workflow, overrides=[f"depth.window={window}"]) for window in WINDOWS}
     for cameras in (2, 3, 4):
         part = capture.first(cameras)
         estimated = sparse.poses(part)
         if len(estimated.names) < cameras:
-            yield f"| {cameras} | | {ESTIMATED} | only {len(estimated.names)} registered | | | | |"
+            yield cameras, "", f"{ESTIMATED}: only {len(estimated.names)} registered", "", "", "", "", ""
         ways: dict[str, Poses | None] = {KNOWN: None, ESTIMATED: estimated}
         if cameras > 2:
             ways[UNSCALED] = unit_translations(estimated)
         for window, chain in chains.items():
             for way, poses in ways.items():
-                found = score(chain, part, poses)
-                yield row(f"{cameras} | {window} | {way}", found, reported(capture.name, cameras, window, way))
+                said = reported(capture.name, cameras, window, way)
+                yield row(cameras, window, way, score(chain, part, poses), paper=said)
 
 
 def reported(name: str, cameras: int, window: int, way: str) -> str:
@@ -102,52 +108,34 @@ def reported(name: str, cameras: int, window: int, way: str) -> str:
     return "–"
 
 
-def row(label: str, found: DepthMetrics, paper: str) -> str:
+def row(cameras: object, window: object, way: str, found: SimpleNamespace, *, paper: str = "–") -> list[object]:
     """Return one row of a table."""
-    return (
-        f"| {label} | {100 * found.mse:.3f} | {found.psnr_db:.2f} | {paper} | {found.w_delta_105:.3f} "
-        f"| {found.w_mae:.3f} |"
-    )
+    scores = f"{found.w_delta_105:.3f}", f"{found.w_mae:.3f}"
+    return [cameras, window, way, f"{100 * found.mse:.3f}", f"{found.psnr_db:.2f}", paper, *scores]
 
 
-def tables(capture: Capture, workflow: str, presets: Sequence[str]) -> Iterator[str]:
-    """Return the lines of one capture's tables."""
-    four = capture.first(4)
-    truth = next(iter(capture.ranges.values()))
-    yield f"\n### {capture.name}\n\n{HEADER}"
-    yield row("– | – | the median of the truth everywhere", constant_baseline(truth), "–")
-    if capture.name in RIVALS:
-        name, psnr = RIVALS[capture.name]
-        yield f"| – | – | best rival in the paper, {name} | | | {psnr:.2f} | | |"
-    yield from paper_rows(capture, workflow, SparseChain(workflow), ())
-    yield f"\n4 cameras, window 7, known poses, `{workflow}` but for one thing:\n\n{HEADER}"
-    for label, overrides in ABLATIONS.items():
-        yield row(f"4 | 7 | {label}", score(DenseChain(workflow, overrides=overrides), four, None), "–")
-    if presets:
-        yield f"\nOther workflows, 4 cameras:\n\n{HEADER}"
-    for preset in presets:
-        chain = DenseChain(preset)
-        for way, poses in ((KNOWN, None), (ESTIMATED, SparseChain(preset).poses(four))):
-            yield row(f"4 | `{preset}` | {way}", score(chain, four, poses, all_views=True), "–")
+def main(
+    data: list[Path] | None = None, workflow: str = "paper", preset: list[str] | None = None, width: int | None = None
+) -> None:
+    """Print the tables of all captures.
 
-
-def main() -> None:
-    """Print, or write, the tables of all captures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", action="append", type=Path, metavar="DIR", help="default: the sample that is shipped")
-    parser.add_argument("--workflow", default="paper", help="with the paper's stages under the paper's names")
-    parser.add_argument("--preset", action="append", default=[], help="also this workflow; repeatable")
-    parser.add_argument("--width", type=int, help="of the pictures; default their own")
-    parser.add_argument("--out", type=Path, help="also written here")
-    given = parser.parse_args()
-    lines: list[str] = []
-    for folder in given.data or [SAMPLE]:
-        for line in tables(read_capture(folder, width=given.width), given.workflow, given.preset):
-            print(line, flush=True)
-            lines.append(line)
-            if given.out:
-                given.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        data: captures with truth; default: the sample that is included.
+        workflow: with the paper's stages under the paper's names.
+        preset: also these workflows.
+        width: of the pictures; default their own.
+    """
+    for folder in data or [SAMPLE]:
+        capture = read_capture(folder, width=width)
+        four = capture.first(4)
+        print(f"\n### {capture.name}\n")
+        print_table(HEADER, paper_rows(capture, workflow))
+        print(f"\n4 cameras, window 7, known poses, `{workflow}` except for one thing:\n")
+        chains = {label: DenseChain(workflow, overrides=overrides) for label, overrides in ABLATIONS.items()}
+        print_table(HEADER, (row(4, 7, label, score(chain, four, None)) for label, chain in chains.items()))
+        if preset:
+            print("\nOther workflows, 4 cameras:\n")
+        for name in preset or ():
+            ways = {KNOWN: None, ESTIMATED: SparseChain(name).poses(four)}
+            rows = (row(4, f"`{name}`", way, score(DenseChain(name), four, poses)) for way, poses in ways.items())
+            print_table(HEADER, rows)

@@ -1,4 +1,4 @@
-"""Are standard deviations of ranges what they claim to be: `python -m tests.benchmarks.uncertainty [--data DIR …]`.
+"""Are standard deviations of ranges what they claim to be.
 
 Runs the dense stages of a workflow (`--workflow`, default quality) with true poses on synthetic scenes and on rendered
 captures with truth, and prints for each place the share of confirmed pixels whose error is within one, two and three
@@ -8,9 +8,8 @@ deviation, and how the median error grows with it. Poses are true, so that only 
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,14 +20,10 @@ from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.testing.scenes import SCENES
-from tests.benchmarks.captures import Capture, read_capture, scene_captures
-from tests.benchmarks.dense_chain import DenseChain
+from tests.benchmarks.captures import SCRATCH, Capture, read_capture, scene_capture
+from tests.benchmarks.dense_chain import DenseChain, Overrides
+from tests.benchmarks.table import print_table
 
-HEADER = (
-    "| place | pixels | within 1 σ % | 2 σ % | 3 σ % | median σ % | median error % by quarter of σ |\n"
-    + "|---" * 7
-    + "|"
-)
 _EDGE = 1.1
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +56,7 @@ def halved_truth(truth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(edge, truth[1::2, 1::2], mean).astype(np.float32)
 
 
-def line(chain: DenseChain, capture: Capture, *, references: int) -> str:
+def row(chain: DenseChain, capture: Capture, *, references: int) -> list[object]:
     """Return one row of the table."""
     run = chain.run(capture)
     checked = next(
@@ -71,33 +66,41 @@ def line(chain: DenseChain, capture: Capture, *, references: int) -> str:
     error, sigma, area = (np.concatenate(part) for part in zip(*parts, strict=True))
     limits = np.quantile(sigma, [0.25, 0.5, 0.75])
     quarters = [np.median(error[np.digitize(sigma, limits) == quarter]) for quarter in range(4)]
-    shares = " | ".join(f"{100 * share:.1f}" for share in coverage(error, sigma, area))
+    shares = [f"{100 * share:.1f}" for share in coverage(error, sigma, area)]
     medians = " ".join(f"{100 * value:.2f}" for value in quarters)
-    return f"| {capture.name} | {len(error)} | {shares} | {100 * np.median(sigma):.2f} | {medians} |"
+    return [capture.name, len(error), *shares, f"{100 * np.median(sigma):.2f}", medians]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--workflow", default="quality", help="workflow or preset")
-    parser.add_argument("--data", type=Path, action="append", default=[], help="a capture with truth; repeatable")
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES), help="synthetic scenes")
-    parser.add_argument("--views", type=int, default=5, help="number of views of a capture")
-    parser.add_argument("--references", type=int, default=3, help="number of views that are scored")
-    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="STAGE.PARAM=VALUE")
-    chosen = parser.parse_args(arguments)
-    chain = DenseChain(chosen.workflow, overrides=chosen.overrides)
-    print(HEADER)
-    for folder in chosen.data:
-        full = read_capture(folder).first(chosen.views)
-        half = read_capture(folder, width=next(iter(full.ranges.values())).shape[1] // 2).first(chosen.views)
-        ranges = {name: halved_truth(truth) for name, truth in full.ranges.items()}
-        print(line(chain, Capture(half.name, half.panoramas, half.poses, ranges), references=chosen.references))
-    with tempfile.TemporaryDirectory() as folder_name:
-        for capture in scene_captures(Path(folder_name), names=chosen.scenes, width=512):
-            print(line(chain, capture, references=chosen.references))
+def captures(data: Sequence[Path], scenes: Sequence[str], views: int) -> Iterator[Capture]:
+    """Yield captures with truth at half their size, and synthetic scenes."""
+    for folder in data:
+        full = read_capture(folder).first(views)
+        half = read_capture(folder, width=next(iter(full.ranges.values())).shape[1] // 2).first(views)
+        yield replace(half, ranges={name: halved_truth(truth) for name, truth in full.ranges.items()})
+    for name in scenes:
+        yield scene_capture(SCENES[name](seed=0, exposure=0.0), SCRATCH / f"{name}-512", width=512)
 
 
-if __name__ == "__main__":
+def main(
+    workflow: str = "quality",
+    data: list[Path] | None = None,
+    scene: list[str] | None = None,
+    views: int = 5,
+    references: int = 3,
+    overrides: Overrides = None,
+) -> None:
+    """Print the table.
+
+    Args:
+        workflow: preset or file.
+        data: captures with truth.
+        scene: synthetic scenes; default all.
+        views: number of views of a capture.
+        references: number of views that are scored.
+        overrides: as `--set` of `run`.
+    """
     cv2.setNumThreads(1)
-    main()
+    chain = DenseChain(workflow, overrides=overrides or ())
+    columns = ("place", "pixels", "within 1 σ %", "2 σ %", "3 σ %", "median σ %", "median error % by quarter of σ")
+    places = captures(data or (), scene or list(SCENES), views)
+    print_table(columns, (row(chain, capture, references=references) for capture in places))

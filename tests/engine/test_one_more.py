@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,21 +10,15 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import open_session
-from tests.benchmarks.engine.plan import PLUGIN, WORKFLOW
+from tests.benchmarks.engine.simulated_capture import write_picture, write_simulated
 from tests.engine.conftest import settle
 
-COUNT = 60
+COUNT = 24
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "plug.py").write_text(PLUGIN)
-    (tmp_path / "wf.yaml").write_text(WORKFLOW)
-    (tmp_path / "capture").mkdir()
-    for number in range(COUNT):
-        path = tmp_path / "capture" / f"{number:05d}.txt"
-        path.write_text(str(number))
-        settle(path)
+    write_simulated(tmp_path, COUNT)
     return tmp_path
 
 
@@ -35,7 +30,8 @@ def run(folder: Path) -> dict[str, int]:
 
 def test_one_more_picture_runs_what_it_touches_and_nothing_else(folder: Path) -> None:
     assert run(folder)["matches"] == 8 * COUNT - 36
-    (folder / "capture" / "00030x.txt").write_text("12345")
+    more = write_picture(folder, COUNT)
+    settle(Path(shutil.move(more, more.with_name("000012x.png"))))
     assert run(folder) == {
         "images": 1,
         "features": 1,
@@ -44,7 +40,8 @@ def test_one_more_picture_runs_what_it_touches_and_nothing_else(folder: Path) ->
         "poses": 1,
         "views": 1,
         "depth": 5,  # its own, and the four whose neighbours it is now among
-        "smooth": 9,  # those that look at one of the five
+        "checked": 9,  # those that look at one of the five
+        "previews": 5,  # of those, the ones whose ranges are others now
         "cloud": 1,
     }
     assert run(folder) == {}

@@ -1,4 +1,4 @@
-"""Damage a store at random and see that all of it is noticed: `python -m tests.stress.damage [N] [options]`.
+"""Damage a store at random and see that all of it is noticed.
 
 N times a random blob or record of a toy's store gets one random bit flipped, or loses its end. Each must be noticed
 when it is read, by `cache verify`, and by a run that has to read it; and a run must make the store whole again, with
@@ -7,16 +7,15 @@ the files that it delivers the same to the byte.
 
 from __future__ import annotations
 
-import argparse
 import random
-import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
+
+import typer
 
 from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
@@ -165,30 +164,19 @@ def _whole(patient: Patient, paths: list[Path]) -> list[str]:
     return [*damage.removed, *damage.incomplete, *(f"{path} is not back" for path in paths if not path.exists())]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Damage, print what came of it, and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stress.damage", description=__doc__.splitlines()[0])
-    parser.add_argument("count", nargs="?", type=int, default=500, help="how many blobs and records are damaged")
-    parser.add_argument("--executor", default="processes", help="serial or processes")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    rng, started, wrong = random.Random(options.seed), time.monotonic(), 0
-    folder = Path(tempfile.mkdtemp(prefix="pano-mvs-damage-"))
-    try:
-        patient = make_patient(folder / "toy", executor=options.executor)
-        for what, check in (
-            ("read", unnoticed_when_read),
-            ("verified and run", not_healed_after_verification),
-            ("run", not_healed_by_running),
-        ):
-            found = check(patient, options.count, rng)
+def main(count: Annotated[int, typer.Argument()] = 500, executor: str = "processes", seed: int = 0) -> int:
+    """Damage `count` blobs and records, print what came of it, and return the exit code."""
+    rng, started, wrong = random.Random(seed), time.monotonic(), 0
+    checks = {
+        "read": unnoticed_when_read,
+        "verified and run": not_healed_after_verification,
+        "run": not_healed_by_running,
+    }
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-damage-") as folder:
+        patient = make_patient(Path(folder) / "toy", executor=executor)
+        for what, check in checks.items():
+            found = check(patient, count, rng)
             wrong += len(found)
-            print(f"{what}: {options.count} damaged, {len(found)} faults", *found[:10], sep="\n  ", flush=True)
-    finally:
-        shutil.rmtree(folder)
+            print(f"{what}: {count} damaged, {len(found)} faults", *found[:10], sep="\n  ", flush=True)
     print(f"{time.monotonic() - started:.0f} s")
     return 1 if wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
-"""Read damaged and hostile files of every kind: `python -m tests.stress.hostile [N] [options]`.
+"""Read damaged and hostile files of every kind.
 
-N mutations, seeded, of good files (lost ends, flipped bits, numbers at their extremes, text that is none), and beside
+Mutations, seeded, of good files (lost ends, flipped bits, numbers at their extremes, text that is none), and beside
 them all files that were crafted by hand: headers that promise more than there is, compressed bombs, counts of
 thousands of digits, poses that are no numbers. Each is read in a process whose memory is limited. It must be read, or
 refused with an error of ours that names the file in few words: no traceback, no warning, no crash, no endless reading.
@@ -9,7 +9,6 @@ Then all hostile pictures are given to a run, which must lose these and nothing 
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import resource
@@ -23,8 +22,10 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.engine.cache.store import Store
@@ -251,21 +252,19 @@ def faults_of_run(count: int, seed: int, folder: Path) -> tuple[int, list[str]]:
     return number, wrong
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Read, print what came of it, and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stress.hostile", description=__doc__.splitlines()[0])
-    parser.add_argument("count", nargs="?", type=int, default=400, help="how many mutations")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--memory-mb", type=int, default=1500, help="what reading may take beyond the program itself")
-    options = parser.parse_args(arguments)
+def main(count: Annotated[int, typer.Argument()] = 400, seed: int = 0, memory_mb: int = 1500) -> int:
+    """Read `count` mutations, print what came of it, and return the exit code.
+
+    Reading may take `memory_mb` beyond the program itself.
+    """
     started, total, peak, wrong = time.monotonic(), 0, 0, list[str]()
-    for text, bytes_used in outcomes(options.count, options.seed, options.memory_mb * 1_000_000):
+    for text, bytes_used in outcomes(count, seed, memory_mb * 1_000_000):
         total, peak = total + 1, max(peak, bytes_used)
         if text:
             wrong.append(text)
             print(text, flush=True)
     with tempfile.TemporaryDirectory(prefix="pano-mvs-hostile-") as name:
-        pictures, faults = faults_of_run(options.count, options.seed, Path(name))
+        pictures, faults = faults_of_run(count, seed, Path(name))
     print(*faults, sep="\n")
     kinds = Counter(text.partition(":")[0] == "crafted" for text in wrong)
     print(
@@ -273,7 +272,3 @@ def main(arguments: list[str] | None = None) -> int:
         f"{pictures} hostile pictures: {len(faults)} faults; {time.monotonic() - started:.0f} s"
     )
     return 1 if wrong or faults else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

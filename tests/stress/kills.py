@@ -1,12 +1,12 @@
-"""Kill runs at random and see that nothing is lost: `python -m tests.stress.kills [N] [options]`.
+"""Kill runs at random and see that nothing is lost.
 
-Two runs go on at the same time on one store, each into a folder of its own. N times, at a random moment, one of them
+Two runs go on at the same time on one store, each into a folder of its own. Many times, at a random moment, one of them
 gets a SIGKILL, or one of its worker processes does; a main process that was killed is started again with the same
 command, and so is one that ended because a unit's worker was killed three times. Most moments are some units after
 the kill before, so that every stage is met; the others are random times, so that starting and ending are met too.
 Whenever both have come to their end, the files that they delivered must be, byte for byte, those of a clean run in a
 store of its own, `cache verify` must find nothing damaged, and nothing half written may lie about. Then both start anew
-in an empty store, until N have been killed.
+in an empty store, until enough have been killed.
 
 Without `--workflow`, a toy workflow whose stages take some hundredths of a second each. With it, any workflow; its
 deliverables must be the same from run to run, as they are to be anyway.
@@ -14,7 +14,6 @@ deliverables must be the same from run to run, as they are to be anyway.
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import shutil
@@ -26,6 +25,9 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from tests.stress.captures import SLEEP_VARIABLE, deliverables, write_toy
 
@@ -262,25 +264,33 @@ def half_written(store: Path) -> list[str]:
     return sorted(path.relative_to(store).as_posix() for path in found)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Kill, print what came of it, and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stress.kills", description=__doc__.splitlines()[0])
-    parser.add_argument("count", nargs="?", type=int, default=200, help="how many are killed")
-    parser.add_argument("--workflow", help="a workflow file or a preset; by default a toy")
-    parser.add_argument("--executor", default="processes", help="serial, processes or dask")
-    parser.add_argument("--workers", type=int, default=2, help="of processes and dask")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    options, more = parser.parse_known_args(arguments)  # what is not known here is for `pano-mvs run`
+def main(
+    count: Annotated[int, typer.Argument()] = 200,
+    workflow: str = "",
+    executor: str = "processes",
+    workers: int = 2,
+    seed: int = 0,
+    more: list[str] | None = None,
+) -> int:
+    """Kill, print what came of it, and return the exit code.
+
+    Args:
+        count: how many are killed.
+        workflow: a workflow file or a preset; by default a toy.
+        executor: serial, processes or dask.
+        workers: of processes and dask.
+        seed: of the moments.
+        more: further arguments of `pano-mvs run`.
+    """
     with tempfile.TemporaryDirectory(prefix="pano-mvs-kills-") as name:
         folder = Path(name)
-        workflow = str(Path(options.workflow).absolute()) if options.workflow else str(write_toy(folder))
-        if options.workflow and not Path(options.workflow).is_file():
-            workflow = options.workflow  # a preset
-        workers = [] if options.executor == "serial" else ["--workers", str(options.workers)]
-        command = [sys.executable, "-m", "pano_mvs", "run", workflow, "--executor", options.executor, *workers, *more]
+        used = workflow or str(write_toy(folder))
+        used = str(Path(used).absolute()) if Path(used).is_file() else used  # else a preset
+        number = [] if executor == "serial" else ["--workers", str(workers)]
+        command = [sys.executable, "-m", "pano_mvs", "run", used, "--executor", executor, *number, *(more or ())]
         environment = os.environ | {SLEEP_VARIABLE: os.environ.get(SLEEP_VARIABLE, "0.05"), "COLUMNS": "400"}
         started = time.monotonic()
-        killed = kill_runs(Setting(command, environment, folder), options.count, random.Random(options.seed))
+        killed = kill_runs(Setting(command, environment, folder), count, random.Random(seed))
     quarters = [
         sum(n for done, n in killed.at.items() if quarter == min(3, 4 * done // max(1, killed.units)))
         for quarter in range(4)
@@ -292,7 +302,3 @@ def main(arguments: list[str] | None = None) -> int:
     )
     print("FAILED: " + "\n".join(killed.wrong) if killed.wrong else "deliverables as of a clean run, 0 bad records")
     return 1 if killed.wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

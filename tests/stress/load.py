@@ -1,6 +1,6 @@
-"""Bad items, killed workers and a full disk in one run: `python -m tests.stress.load [COUNT] [options]`.
+"""Bad items, killed workers and a full disk in one run.
 
-Of COUNT tiny panoramas one in a hundred is bad, in ten ways (see `bad_items`). The capture is run by worker processes,
+Of many tiny panoramas one in a hundred is bad, in ten ways (see `bad_items`). The capture is run by worker processes,
 or by a dask scheduler that exists. Workers are killed at random moments. Once the disk of the cache is full: the run
 must end with exit code 4, and the same command goes on when there is room. A worker's death costs a unit one of three
 tries; where a good item was hit three times, the same command is given again. In the end the exit code must be 3,
@@ -13,7 +13,6 @@ scheduler and its workers are started as a person would start them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -29,7 +28,9 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from tests.stress.bad_items import FULL_VARIABLE, Capture, write_capture
 from tests.stress.captures import deliverables
@@ -287,35 +288,36 @@ def _run_json(out: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Load each executor, print what came of it, and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.stress.load", description=__doc__.splitlines()[0])
-    parser.add_argument("count", nargs="?", type=int, default=2000, help="number of panoramas")
-    parser.add_argument("--bad", type=int, help="how many of them are bad; by default one in a hundred, ten at least")
-    parser.add_argument("--executors", nargs="+", default=["processes", "dask"], help="one after the other")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--kills", type=int, default=20, help="how many workers are killed")
-    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills, in the mean")
-    parser.add_argument("--folder", type=Path, help="where all is made; by default a temporary folder")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    bad = options.bad or max(10, options.count // 100)
-    failed = False
-    for executor in options.executors:
-        with tempfile.TemporaryDirectory(prefix="pano-mvs-load-", dir=options.folder) as name:
-            verdict = load(
-                Path(name),
-                count=options.count,
-                bad=bad,
-                executor=executor,
-                workers=options.workers,
-                kills=options.kills,
-                every_s=options.every,
-                seed=options.seed,
-            )
+def main(
+    count: Annotated[int, typer.Argument()] = 2000,
+    bad: int = 0,
+    executors: list[str] | None = None,
+    workers: int = 2,
+    kills: int = 20,
+    every_s: float = 10.0,
+    folder: Path | None = None,
+    seed: int = 0,
+) -> int:
+    """Load each executor, print what came of it, and return the exit code.
+
+    Args:
+        count: number of panoramas.
+        bad: how many of them are bad; by default one in a hundred, ten at least.
+        executors: one after the other; default processes and dask.
+        workers: number of worker processes.
+        kills: how many workers are killed.
+        every_s: mean time between two kills.
+        folder: where all is made; default a temporary folder.
+        seed: of what is bad and of the kills.
+    """
+    bad, failed = bad or max(10, count // 100), False
+    settings: dict[str, Any] = {"workers": workers, "kills": kills, "every_s": every_s, "seed": seed}
+    for executor in executors or ("processes", "dask"):
+        with tempfile.TemporaryDirectory(prefix="pano-mvs-load-", dir=folder) as name:
+            verdict = load(Path(name), count=count, bad=bad, executor=executor, **settings)
         per_unit_ms = 1000 * verdict.cpu_s / max(1, verdict.units)
         print(
-            f"{executor}: {options.count} panoramas, {bad} bad, {verdict.units} units, {verdict.killed} workers "
+            f"{executor}: {count} panoramas, {bad} bad, {verdict.units} units, {verdict.killed} workers "
             f"killed, {verdict.runs} runs, {verdict.wall_s:.0f} s, {verdict.cpu_s:.0f} CPU s "
             f"({per_unit_ms:.0f} ms a unit), peak {verdict.peak_mb:.0f} MB",
             *verdict.wrong[:20],
@@ -325,7 +327,3 @@ def main(arguments: list[str] | None = None) -> int:
         failed |= bool(verdict.wrong)
     print("FAILED" if failed else "all that was delivered is as of a clean run, and only what is bad is missing")
     return int(failed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Run tests as on other processors: `python -m tests.stress.other_cpus [--only NAME] [pytest arguments]`.
+"""Run tests as on other processors.
 
 Each variant sets environment variables that make numba, numpy or OpenBLAS leave instructions of this processor unused,
 or fixes the number of threads, and runs pytest in a process of its own. Without arguments for pytest the folders whose
@@ -7,12 +7,13 @@ results depend on arithmetic are run: tests/algorithms and tests/geometry.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import subprocess
 import sys
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 NUMERIC = ("tests/algorithms", "tests/geometry")
 
@@ -46,22 +47,13 @@ def variants() -> dict[str, dict[str, str]]:
     }
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the tests under each variant, print which of them fail, and return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.stress.other_cpus", description="Run tests as on other processors."
-    )
-    parser.add_argument("--only", action="append", choices=sorted(variants()), help="one variant; may be repeated")
-    options, for_pytest = parser.parse_known_args(arguments)
+def main(pytest_arguments: Annotated[list[str] | None, typer.Argument()] = None, only: list[str] | None = None) -> int:
+    """Run the tests under each variant, or some only, print which of them fail, and return the exit code."""
     failed = []
-    for name in options.only or variants():
+    for name in only or variants():
         print(f"== {name}", flush=True)
-        command = [sys.executable, "-m", "pytest", "-q", *(for_pytest or NUMERIC)]
+        command = [sys.executable, "-m", "pytest", "-q", *(pytest_arguments or NUMERIC)]
         if subprocess.run(command, env=os.environ | variants()[name], check=False).returncode:
             failed.append(name)
     print(f"FAILED: {', '.join(failed)}" if failed else "passed under all variants")
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -24,12 +24,12 @@ def test_hostile_files_are_read_or_refused_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_hostile_files_take_little_memory_and_end_no_run() -> None:
-    assert hostile.main(["60"]) == 0
+    assert hostile.main(60) == 0
 
 
 @pytest.mark.slow
 def test_much_damage_is_healed_by_processes() -> None:
-    assert damage.main(["80", "--executor", "processes"]) == 0
+    assert damage.main(80) == 0
 
 
 def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", ["processes", "serial"])
 def test_killed_runs_lose_nothing(executor: str) -> None:
-    assert kills.main(["3", "--executor", executor]) == 0
+    assert kills.main(3, executor=executor) == 0
 
 
 @pytest.mark.slow

@@ -173,7 +173,7 @@ def automatic_pairs(
         apart = np.full((count, count), np.inf)
         apart[np.ix_(located, located)] = _squared_distances(places)
         nearest = np.where(located, np.minimum(_NEAREST, left), 0)
-        _choose(chosen, nearest, looks, apart)
+        _choose(chosen, nearest, looks, apart=apart)
         left -= nearest
         reasons.append(f"the {nearest.max()} nearest by the positions of {np.count_nonzero(located)}")
     _choose(chosen, left, looks)
@@ -246,7 +246,7 @@ def _share_that_follow(looks: FloatArray) -> float:
 
 
 def _choose(
-    chosen: NDArray[np.bool_], counts: NDArray[np.intp], looks: FloatArray, apart: FloatArray | None = None
+    chosen: NDArray[np.bool_], counts: NDArray[np.intp], looks: FloatArray, *, apart: FloatArray | None = None
 ) -> None:
     """Add to `chosen`, (N, N), for each image the nearest others that are not chosen, at most (N,) counts of them.
 

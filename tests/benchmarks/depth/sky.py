@@ -1,4 +1,4 @@
-"""How much of the sky is found, and what is lost: `python -m tests.benchmarks.depth.sky [--place NAME …]`.
+"""How much of the sky is found, and what is lost.
 
 Synthetic places with the sky over a court, behind branches and slats, and through the windows of a room, known poses,
 four views, 512×256: `depth.sweep` with 96 planes, `filters.consistency`, `filters.sky`. Prints the share of the pixels
@@ -8,22 +8,19 @@ average, and without the stage the share of the sky on which other views confirm
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from pano_mvs.geometry import pixel_solid_angle
-from pano_mvs.scene import Record
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.testing.scenes import courtyard
-from tests.benchmarks.captures import scene_capture
-from tests.benchmarks.depth.stored_chain import StoredChain
+from tests.benchmarks.captures import SCRATCH, Capture, scene_capture
+from tests.benchmarks.dense_chain import DenseChain
+from tests.benchmarks.depth.scores import share_of_sphere
+from tests.benchmarks.table import print_table
 from tests.synthetic.places import window_room, yard
 
 MAKERS = {maker.__name__: maker for maker in (courtyard, yard, window_room)}
@@ -38,58 +35,42 @@ PLACES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("window_room", {"seed": 0, "sky": "overcast"}),
     ("window_room", {"seed": 3, "sky": "clouds", "exposure": 0.05}),
 )
-SETTINGS = ("depth.planes=96",)
 
 
-def shares(found: NDArray[np.bool_], truth: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the share of the sky that is found, and that of the rest that is taken for sky, in percent.
+def figures(capture: Capture) -> list[float]:
+    """Return the worst and mean share of the sky that is found, of the rest that is lost, and what is confirmed."""
+    chain = DenseChain("known_poses", overrides=["depth.planes=96"])
+    chain.dense = ["depth", "checked", "sky"]
+    maps = chain.run(capture).range_maps
+    rows = []
+    for image, truth in capture.ranges.items():
+        found, nothing = maps["sky"][image].sky, ~np.isfinite(truth)
+        assert found is not None
+        confirmed = maps["checked"][image].confidence >= CONSISTENT_CONFIDENCE[0]
+        cases = ((found, nothing), (found, ~nothing), (confirmed, nothing))
+        rows.append([share_of_sphere(where, within=part) for where, part in cases])
+    found_there, lost, confirmed_there = np.array(rows).T
+    return [
+        *(float(each) for each in (found_there.min(), found_there.mean(), lost.max(), lost.mean())),
+        float(confirmed_there.mean()),
+    ]
+
+
+def main(place: list[str] | None = None, width: int = 512, scratch: Path = SCRATCH / "sky") -> None:
+    """Print the table.
 
     Args:
-        found: (H, W), the pixels that are taken for sky.
-        truth: (H, W), NaN where there is no surface.
+        place: only these; default all.
+        width: of the panoramas.
+        scratch: folder of rendered panoramas.
     """
-    weights = np.broadcast_to(pixel_solid_angle(found.shape)[:, None], found.shape)
-    sky = ~np.isfinite(truth)
-    return (
-        100 * float(weights[found & sky].sum() / weights[sky].sum()),
-        100 * float(weights[found & ~sky].sum() / weights[~sky].sum()),
-    )
-
-
-def line(place: str, arguments: dict[str, Any], *, scratch: Path, width: int) -> str:
-    """Return one row of the table."""
-    name = " ".join([place, *(f"{key} {value}" for key, value in arguments.items())])
-    capture = scene_capture(MAKERS[place](**arguments), scratch / f"{name}-{width}", width=width)
-    memory: dict[str, Record] = {}
-    chain = StoredChain("known_poses", overrides=SETTINGS, store=scratch / "maps", memory=memory)
-    chain.chain.dense = [stage for stage in chain.chain.dense if stage in ("depth", "checked", "sky")]
-    maps = chain.run(capture, label=f"{name}-{width}", references=list(capture.panoramas)).range_maps
-    rows, confirmed = [], []
-    for image, truth in capture.ranges.items():
-        sky = maps["sky"][image].sky
-        assert sky is not None
-        rows.append(shares(sky, truth))
-        confirmed.append(shares(maps["checked"][image].confidence >= CONSISTENT_CONFIDENCE[0], truth)[0])
-    found, lost = np.array(rows).T
-    return (
-        f"| {name} | {found.min():.1f} | {found.mean():.1f} | {lost.max():.2f} | {lost.mean():.2f} "
-        f"| {np.mean(confirmed):.0f} |"
-    )
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--place", action="append", choices=list(MAKERS), help="only these; default all")
-    parser.add_argument("--width", type=int, default=512)
-    parser.add_argument("--scratch", type=Path, default=Path(tempfile.gettempdir()) / "pano_mvs_sky")
-    given = parser.parse_args(arguments)
-    print("| place | found, worst % | mean | lost, worst % | mean | confirmed without % |\n" + "|---" * 6 + "|")
-    for place, settings in PLACES:
-        if given.place is None or place in given.place:
-            print(line(place, settings, scratch=given.scratch, width=given.width), flush=True)
-
-
-if __name__ == "__main__":
     cv2.setNumThreads(1)
-    main()
+
+    def rows() -> Iterator[list[str]]:
+        for maker, arguments in PLACES:
+            if place is None or maker in place:
+                name = " ".join([maker, *(f"{key} {value}" for key, value in arguments.items())])
+                capture = scene_capture(MAKERS[maker](**arguments), scratch / f"{name}-{width}", width=width)
+                yield [name, *(f"{figure:.2f}" for figure in figures(capture))]
+
+    print_table(["place", "found, worst %", "mean", "lost, worst %", "mean", "confirmed without %"], rows())

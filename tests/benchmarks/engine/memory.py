@@ -1,4 +1,4 @@
-"""How much memory a sweep takes: `python -m tests.benchmarks.engine.memory [--small | --large]`.
+"""How much memory a sweep takes.
 
 The peak of the resident memory of a fresh process for each configuration, less that of one that has made the pictures
 and loaded the kernels but swept nothing larger than 16 × 32. With --large: all that a process takes in which a panorama
@@ -7,12 +7,11 @@ of 8192 × 4096 pixels is swept against two others, pictures and limits included
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Literal
 
 import numba
@@ -22,8 +21,7 @@ from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3
 from tests.benchmarks.sweep import FAR, NEAR, pictures
-
-ROWS, PLANES, SOURCES = 512, 128, 3
+from tests.benchmarks.table import print_table
 
 
 def peak_mb(rows: int, planes: int, sources: int, aggregation: str, threads: int) -> float:
@@ -60,49 +58,39 @@ def large_peak_mb(rows: int, planes: int, aggregation: Literal["box", "sgm"], th
 
 
 def fresh_peak_mb(*configuration: object) -> float:
-    """Return `peak_mb` of a fresh process."""
-    command = [sys.executable, "-m", "tests.benchmarks.engine.memory", "--one", json.dumps(configuration)]
+    """Return `peak_mb`, or of four values `large_peak_mb`, of a fresh process."""
+    command = [sys.executable, "-m", "tests.benchmarks", "engine.memory", "--one", json.dumps(configuration)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table, or the one figure that a fresh process is asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--small", action="store_true", help="a quarter of the rows and of the planes")
-    parser.add_argument("--large", action="store_true", help="8192 × 4096 pixels")
-    parser.add_argument("--one", help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
-    if options.one:
-        configuration = json.loads(options.one)
+def main(large: bool = False, one: str = "", rows: int = 512, planes: int = 128, sources: int = 3) -> None:
+    """Print the table, or the one figure that a fresh process is asked for; `large` is for 8192 × 4096 pixels."""
+    if one:
+        configuration = json.loads(one)
         print(peak_mb(*configuration) if len(configuration) == 5 else large_peak_mb(*configuration))
         return
-    if options.large:
-        print("| rows | planes | aggregation | threads | peak, MB |\n|---|---|---|---|---|")
-        for large in ((4096, 32, "box", 2), (4096, 128, "sgm", 2)):
-            print("| " + " | ".join(map(str, large)) + f" | {fresh_peak_mb(*large):.0f} |", flush=True)
+    if large:
+        sizes = ((4096, 32, "box", 2), (4096, 128, "sgm", 2))
+        measured = ([*size, f"{fresh_peak_mb(*size):.0f}"] for size in sizes)
+        print_table(["rows", "planes", "aggregation", "threads", "peak, MB"], measured)
         return
-    part = 4 if options.small else 1
-    rows, planes = ROWS // part, PLANES // part
     configurations = [
-        (rows, planes // 4, SOURCES, "box", 1),
-        (rows, planes, SOURCES, "box", 1),
-        (rows, planes, SOURCES, "box", 2),
-        (rows, planes // 4, 2 * SOURCES, "box", 1),
-        (2 * rows, planes // 4, SOURCES, "box", 1),
-        (rows, planes // 4, SOURCES, "sgm", 1),
-        (rows, planes, SOURCES, "sgm", 1),
+        (rows, planes // 4, sources, "box", 1),
+        (rows, planes, sources, "box", 1),
+        (rows, planes, sources, "box", 2),
+        (rows, planes // 4, 2 * sources, "box", 1),
+        (2 * rows, planes // 4, sources, "box", 1),
+        (rows, planes // 4, sources, "sgm", 1),
+        (rows, planes, sources, "sgm", 1),
     ]
-    print("| rows | planes | sources | aggregation | threads | peak, MB |\n|---|---|---|---|---|---|")
-    peaks = {}
-    for configuration in configurations:
-        peaks[configuration] = fresh_peak_mb(*configuration)
-        print("| " + " | ".join(map(str, configuration)) + f" | {peaks[configuration]:.0f} |", flush=True)
+    peaks: list[float] = []
+
+    def measure() -> Iterator[list[object]]:
+        for configuration in configurations:
+            peaks.append(fresh_peak_mb(*configuration))
+            yield [*configuration, f"{peaks[-1]:.0f}"]
+
+    print_table(["rows", "planes", "sources", "aggregation", "threads", "peak, MB"], measure())
     more = planes - planes // 4
-    slope = (peaks[configurations[1]] - peaks[configurations[0]]) / more * 1024
-    voxels = more * 2 * rows * rows
-    per_voxel = (peaks[configurations[6]] - peaks[configurations[5]]) * 2**20 / voxels
+    slope, per_voxel = (peaks[1] - peaks[0]) / more * 1024, (peaks[6] - peaks[5]) * 2**20 / (more * 2 * rows * rows)
     print(f"\nbox: {slope:.1f} KB for each further plane; sgm: {per_voxel:.2f} bytes for each pixel and further plane")
-
-
-if __name__ == "__main__":
-    main()

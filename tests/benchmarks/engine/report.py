@@ -1,14 +1,11 @@
 """How long the report of a large run takes to write, and how large it is.
 
-Run it with `python -m tests.benchmarks.engine.report [views]`.
-
 Poses with 400 observations a view, eight pairs a view, small range maps, and one full-sized preview that all views
 share. The second time is that of a run that computed nothing: its page takes the pictures from the first.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -83,7 +80,7 @@ def _poses(names: list[str], rng: np.random.Generator) -> Poses:
     )
 
 
-def main(count: int) -> None:
+def main(count: int = 5000) -> None:
     """Print the times, of the processor and passed, and the size."""
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -98,7 +95,3 @@ def main(count: int) -> None:
                 f"{count} views, {what}: {time.process_time() - worked:.2f} s of work, "
                 f"{time.perf_counter() - passed:.2f} s passed, {size / 1e6:.1f} MB"
             )
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5000)

@@ -1,7 +1,5 @@
 """The command line with an executor that computes nothing.
 
-Run it with `python -m tests.benchmarks.engine.simulated_executor COMMAND…`.
-
 Of each stage the first unit is computed; the others get its parts under a digest of their own, and a record each. What
 a run takes is then what planning, scheduling, recording and delivering take.
 """

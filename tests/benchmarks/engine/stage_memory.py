@@ -1,7 +1,5 @@
 """What each dense stage of a workflow takes in memory.
 
-Run it with `python -m tests.benchmarks.engine.stage_memory [--workflow quality]`.
-
 The stages run in this process on a rendered room, at two sizes. Before each unit the peak that Linux keeps of the
 resident memory is reset; what the unit adds to what was there before is its own. The difference between the two sizes
 gives bytes for each pixel of a panorama, the rest is what a stage takes whatever the size. Linux alone.
@@ -9,18 +7,18 @@ gives bytes for each pixel of a panorama, the rest is what a stage takes whateve
 
 from __future__ import annotations
 
-import argparse
 import gc
 import tempfile
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.scene import Record
 from pano_mvs.testing.scenes import SCENES
-from tests.benchmarks.captures import Capture, scene_capture
-from tests.benchmarks.dense_chain import DenseChain
+from tests.benchmarks.captures import scene_capture
+from tests.benchmarks.dense_chain import DenseChain, Overrides
+from tests.benchmarks.table import print_table
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -46,34 +44,22 @@ def _memory(field: str) -> int:
     return int(line.split()[1]) * 1024
 
 
-def peaks(workflow: str, capture: Capture, overrides: Sequence[str]) -> Mapping[str, int]:
-    """Return the peak of each stage, in bytes; the kernels are loaded."""
-    chain = MeasuredChain(workflow, overrides=overrides)
-    chain.run(capture)
-    return dict(chain.peaks)
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--workflow", default="quality", help="preset or file")
-    parser.add_argument("--set", action="append", default=[], metavar="STAGE.PARAM=VALUE", help="as in run")
-    parser.add_argument("--widths", type=int, nargs=2, default=[1024, 2048], help="of the panoramas")
-    parser.add_argument("--views", type=int, default=4, help="one of them the reference, the others its sources")
-    options = parser.parse_args()
+def main(
+    workflow: str = "quality", overrides: Overrides = None, widths: tuple[int, int] = (1024, 2048), views: int = 4
+) -> None:
+    """Print the table; one of the views is the reference, the others its sources."""
     found = []
-    for width in (64, *options.widths):  # the first loads and compiles
+    for width in (64, *widths):  # the first loads and compiles
         with tempfile.TemporaryDirectory() as folder:
-            capture = scene_capture(next(iter(SCENES.values()))(seed=0, exposure=0.0), Path(folder), width=width).first(
-                4
-            )
-            found.append(peaks(options.workflow, capture, options.set))
-    small, large = (width * width // 2 for width in options.widths)
-    print(f"| stage | bytes per pixel | MB beside | MB at {options.widths[1]} columns |\n|---|---|---|---|")
-    for name, most in found[2].items():
-        per_pixel = (most - found[1][name]) / (large - small)
-        print(f"| {name} | {per_pixel:.0f} | {(most - per_pixel * large) / 1e6:.0f} | {most / 1e6:.0f} |")
+            scene = next(iter(SCENES.values()))(seed=0, exposure=0.0)
+            chain = MeasuredChain(workflow, overrides=overrides or ())
+            chain.run(scene_capture(scene, Path(folder), width=width).first(views))
+            found.append(chain.peaks)
+    small, large = (width * width // 2 for width in widths)
 
+    def rows() -> Iterator[list[str]]:
+        for name, most in found[2].items():
+            per_pixel = (most - found[1][name]) / (large - small)
+            yield [name, f"{per_pixel:.0f}", f"{(most - per_pixel * large) / 1e6:.0f}", f"{most / 1e6:.0f}"]
 
-if __name__ == "__main__":
-    main()
+    print_table(["stage", "bytes per pixel", "MB beside", f"MB at {widths[1]} columns"], rows())
