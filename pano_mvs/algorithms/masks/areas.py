@@ -35,14 +35,14 @@ def area_labels(pixels: Mask) -> NDArray[np.int64]:
 def area_sizes(labels: NDArray[np.int64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the sum of weights (H, W) over the area of each label, (H W,)."""
     inside = labels >= 0
-    return np.bincount(labels[inside], weights[inside], labels.size)
+    return np.asarray(np.bincount(labels[inside], weights[inside], labels.size), np.float64)
 
 
 def large_areas(pixels: Mask, min_area_deg2: float) -> Mask:
     """Return the connected areas of at least a size, (H, W)."""
     labels, weights = area_labels(pixels), pixel_weights(pixels.shape)
     sizes = area_sizes(labels, weights) / weights.sum() * SQUARE_DEG_OF_SPHERE
-    return (labels >= 0) & (sizes >= min_area_deg2)[labels]
+    return np.asarray((labels >= 0) & (sizes >= min_area_deg2)[labels])
 
 
 def opened_areas(pixels: Mask, radius_px: int) -> Mask:

@@ -206,4 +206,4 @@ def _without_gaps(found: Mask) -> Mask:
     closed = closed_areas(found, max(1, round(len(found) / 180)))
     labels, weights = area_labels(~closed), pixel_weights(found.shape)
     small = area_sizes(labels, weights) < 0.3 * weights[found].sum()
-    return closed | ((labels >= 0) & small[labels])
+    return np.asarray(closed | ((labels >= 0) & small[labels]))
