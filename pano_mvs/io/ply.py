@@ -390,7 +390,7 @@ def _text_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void]
 
 
 def _layout(lines: list[str], path: Path) -> _Layout:
-    """Return the layout of the vertices from the lines of the header, or raise InputError if they are no plain ones."""
+    """Return the layout of the vertices by the lines of the header; InputError unless each property is one number."""
     words = [line.split() for line in lines if line.strip() and not line.startswith(("comment", "obj_info"))]
     form = next((word[1] for word in words if word[0] == "format" and len(word) == 3), "")
     elements = [idx for idx, word in enumerate(words) if word[0] == "element"]
