@@ -45,8 +45,12 @@ class Capture:
 
     def only(self, names: Sequence[str]) -> Capture:
         """Return some of the views."""
-        parts = [{name: part[name] for name in names} for part in (self.panoramas, self.poses, self.ranges)]
-        return replace(self, panoramas=parts[0], poses=parts[1], ranges=parts[2])
+        return replace(
+            self,
+            panoramas={name: self.panoramas[name] for name in names},
+            poses={name: self.poses[name] for name in names},
+            ranges={name: self.ranges[name] for name in names},
+        )
 
 
 def read_capture(folder: Path, *, width: int | None = None) -> Capture:

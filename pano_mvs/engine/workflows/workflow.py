@@ -21,7 +21,7 @@ from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, did_you_mean, merge_stages, read_text
 from pano_mvs.engine.workflows.overrides import apply_overrides
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
-from pano_mvs.engine.workflows.yaml_text import Located, Problems
+from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +152,7 @@ class WorkflowReader:
         Raises:
             WorkflowError: if the text is not YAML.
         """
+        parse_yaml(text, self.shown_as)  # without a list of problems, it raises the first one
         files = self._read_files(text, path)
         for file in files:
             self._load_plugins(file.root.value.get("plugins"))

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.algorithms.faces.layout import Face, FaceLayout, panorama_faces
+from pano_mvs.algorithms.faces.layout import Face, panorama_faces
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.io.colmap.workspace import (
     read_colmap_map,
@@ -24,6 +24,7 @@ from pano_mvs.io.colmap.workspace import (
     write_stereo_configs,
 )
 from pano_mvs.io.colmap.writer import CutPanorama, write_rig_model
+from pano_mvs.scene.files import FaceLayout
 from pano_mvs.scene.image_file import decode_image
 from tests.io.colmap.test_model import NAMES, noisy_poses
 
