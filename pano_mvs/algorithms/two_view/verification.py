@@ -36,8 +36,8 @@ _ROTATION_SHARE = 0.9
 _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
-# Of learned matches: about where a pair is as likely right as wrong, see `tests.benchmarks.poses.tours.pair_evidence`.
-_MAX_LOG10_LEARNED = -50.0
+MAX_LOG10_LEARNED = -50.0
+"""For learned matches: about where a pair is as likely right as wrong (`tests.benchmarks.poses.tours.pair_evidence`)."""
 
 
 @checks_settings
@@ -89,7 +89,7 @@ def verify_pair(
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
     learned = bool(first.learned and second.learned)
-    most = _MAX_LOG10_LEARNED if learned else MAX_LOG10_FALSE_ALARMS
+    most = MAX_LOG10_LEARNED if learned else MAX_LOG10_FALSE_ALARMS
     pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, most)
     count = len(matches_idx)
     if count < max(min_inliers, MIN_MATCHES):

@@ -18,6 +18,7 @@ from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
@@ -181,12 +182,15 @@ def _is_significant(
 
     The rotation and the direction of a verified pair are more than chance by themselves. What the pair leaves open, the
     lengths, is determined by another verified pair that agrees, or by the ranges of the matches that are known. The
-    pairs that agree must outweigh those that do not.
+    pairs that agree must outweigh those that do not. Learned matches that no verified pair supports must be as
+    significant as those of a pair, because false ones agree with one another.
     """
     agreeing, disagreeing, has_length = _evidence_of_pairs(alignment, first, second, views)
     if sum(agreeing) < sum(disagreeing):
         return False
-    return alignment.log10_false_alarms <= _MAX_LOG10_FALSE_ALARMS or len(agreeing) > 1 or has_length
+    learned = any(features.learned for features in first.pairs.features.values())
+    limit = MAX_LOG10_LEARNED if learned and not agreeing else _MAX_LOG10_FALSE_ALARMS
+    return alignment.log10_false_alarms <= limit or len(agreeing) > 1 or has_length
 
 
 def _evidence_of_pairs(

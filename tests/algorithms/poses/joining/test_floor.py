@@ -64,7 +64,8 @@ class _TrueFloors(Floors):
         """No pictures are needed."""
 
     def length(self, first: int, second: int, second_from_first: Rigid3) -> float:
-        return float(np.linalg.norm(np.subtract(*(list(CENTERS.values())[image] for image in (first, second)))))
+        centers = list(CENTERS.values())
+        return float(np.linalg.norm(np.subtract(centers[first], centers[second])))
 
     def camera_height(self, model: PlacedModel) -> float:
         first, second = sorted(model.cameras)
