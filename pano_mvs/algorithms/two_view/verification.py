@@ -37,7 +37,7 @@ _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
 MAX_LOG10_LEARNED = -50.0
-"""For learned matches: about where a pair is as likely right as wrong (`tests.benchmarks.poses.tours.pair_evidence`)."""
+"""For learned matches: about where a pair is as likely right as wrong (see docs/learned.md, False pairs)."""
 
 
 @checks_settings
