@@ -27,8 +27,9 @@ Plane = NDArray[np.float32]
 LENGTHS = np.geomspace(0.2, 5.0, 60)
 """Lengths of a translation that are compared, in heights of the camera."""
 MIN_MARGIN = 0.1
-"""A length must agree better than any other by this correlation. In an empty house of 32 panoramas, 23 of 28 such lengths
-of right pairs were right within 20 %, and most others put the floor on a counter; of 15 wrong pairs, one had a length."""
+"""A length must agree better than any other by this correlation. In an empty house of 32 panoramas, 23 of 28 such
+lengths of right pairs were right within 20 %, and most others put the floor on a counter; of 15 wrong pairs, one had a
+length."""
 
 _WIDTH_PX = 512
 _RADIUS, _FEET, _CELLS = 3.0, 0.3, 72  # the part of the floor that is compared, in heights; below it stands the tripod
