@@ -95,7 +95,8 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel, floors: Floors |
     """Return the alignment of two models by their matches or their floors; None if these do not determine it."""
     views = _views_between(first, second)
     best = _by_matches(first, second, views)
-    if floors is None:
+    has_use = len(second.cameras) > 1 if best is not None else any(views.values())
+    if floors is None or not has_use:
         return best
     heights = [floors.camera_height(model) if len(model.cameras) > 1 else np.nan for model in (first, second)]
     if best is not None:
