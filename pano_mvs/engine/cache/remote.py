@@ -21,7 +21,7 @@ from typing import Any
 from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import PanoMvsError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, read_regular, remove_whole, replacing
-from pano_mvs.core.paths import is_link
+from pano_mvs.core.paths import below, is_file, is_link
 from pano_mvs.engine.cache.blobs import SUFFIX
 from pano_mvs.engine.cache.packs import RECORD, values_of
 from pano_mvs.engine.cache.store import Store, record_from_bytes
@@ -173,7 +173,7 @@ class RemoteCache:
 
     def _layout(self) -> object:
         """Return what the remote cache says of its layout, or None if there is none."""
-        if not self._attempt(lambda: self._files.exists(self._path("layout.json"))):
+        if not self._attempt(lambda: self._files.isfile(self._path("layout.json"))):
             return None
         try:
             return json.loads(self._attempt(lambda: self._read("layout.json")))
@@ -221,8 +221,8 @@ def _local_files(store: Store, *, unfinished: bool = False) -> dict[str, int]:
     found = {
         path.relative_to(store.root).as_posix(): path
         for folder in ("blobs", "records", "packs", "runs", "pins")
-        for path in (store.root / folder).rglob("*")
-        if path.is_file() and not is_link(path)
+        for path in below(store.root / folder)
+        if is_file(path) and not is_link(path)
     }
     left_out = set() if unfinished else set(store.blobs.packs.without_index())
     return {name: path.stat().st_size for name, path in found.items() if _belongs(name, store) and path not in left_out}
