@@ -12,13 +12,11 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import shape
 from pano_mvs.engine.planning.forecast import StageForecast, forecast, makespan
-from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.planning.run_options import RunOptions
-from pano_mvs.engine.planning.source_listing import SourceListing
+from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
+from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.session.forecasting import expected_report_s
-from pano_mvs.session.python_errors import names_arguments
+from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.session import Session, check_output, open_session
-from pano_mvs.session.settings import overrides_from_settings
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,11 +17,16 @@ import pytest
 
 import pano_mvs
 from pano_mvs.cli.doctor import command, libraries, machine
+from pano_mvs.cli.doctor.checks import (
+    folder_finding,
+    is_older,
+    kernel_cache_finding,
+    machine_findings,
+    package_findings,
+    plugin_findings,
+)
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.doctor.libraries import library_findings, run_probe
-from pano_mvs.cli.doctor.machine import folder_finding, kernel_cache_finding, machine_findings
-from pano_mvs.cli.doctor.packages import is_older, package_findings
-from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.session.session import presets_folder

@@ -34,10 +34,9 @@ from pano_mvs.core.files import (
     write_text,
 )
 from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
-from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
 from pano_mvs.engine.cache.latest_runs import RunHistory
-from pano_mvs.engine.cache.packed_refs import PackedRefs
 from pano_mvs.engine.cache.packs import RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
@@ -127,7 +126,6 @@ class UnitRecord:
         rejected: image name to the reason why the result leaves it out.
         doubts: image name to the reason why the result is doubtful there.
         seconds: computing time.
-        checked: whether the input files were compared with the digests in the key; early versions did not do this.
     """
 
     key: str
@@ -139,7 +137,6 @@ class UnitRecord:
     rejected: Mapping[str, str] = field(default_factory=dict)
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
-    checked: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a JSON value."""
@@ -153,7 +150,7 @@ class UnitRecord:
             "rejected": dict(self.rejected),
             "doubts": dict(self.doubts),
             "seconds": self.seconds,
-            "checked": self.checked,
+            "checked": True,
         }
 
     @staticmethod
@@ -170,6 +167,8 @@ class UnitRecord:
         seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a metric or a time is not finite")
+        if value.get("checked") is not True:
+            raise ValueError("of an early version, which did not compare what a unit read with the digests in its key")
         return UnitRecord(
             key=str(value["key"]),
             identity=identity,
@@ -180,7 +179,6 @@ class UnitRecord:
             rejected={str(name): str(reason) for name, reason in rejected.items()},
             doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
-            checked=value.get("checked") is True,
         )
 
     def blobs(self) -> Iterator[BlobRef]:

@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import open_session

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.planning import without_collector

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from pano_mvs.engine.cache.blobs import BlobRef
-from pano_mvs.engine.cache.packed_refs import PackedRefs
+from pano_mvs.engine.cache.blobs import BlobRef, PackedRefs
 from pano_mvs.engine.cache.store import ItemRef
 
 PARTS = {

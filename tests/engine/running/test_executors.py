@@ -16,11 +16,11 @@ import pytest
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.executors import choose, unit_json, worker_process
-from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors import choose, unit_json
+from pano_mvs.engine.executors import processes as worker_process
+from pano_mvs.engine.executors.choose import SerialExecutor, make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
 from pano_mvs.engine.executors.unit_json import unit_from_json, unit_to_json, write_large_inputs
 from pano_mvs.engine.planning.units import Unit

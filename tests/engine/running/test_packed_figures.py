@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from pano_mvs.engine.running.packed_figures import PackedFigures
+from pano_mvs.engine.running.statistics import PackedFigures
 
 FIGURES = {"inliers": 213.0, "residual_deg": 0.1 + 0.2, "least": -0.0, "large": 1e300}
 

@@ -9,8 +9,8 @@ import pytest
 
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import FinishedJob
 from pano_mvs.engine.running.events import RunResult, SilentObserver, UnitStatus

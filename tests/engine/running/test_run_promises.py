@@ -7,7 +7,7 @@ import pytest
 from pano_mvs.core.errors import InputError, RunStoppedError, StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.protocol import JobOutcome
-from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running import run as module
 from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import pytest
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.units import PENDING, StageState
 from pano_mvs.engine.running import run as run_module
 from pano_mvs.engine.running.events import Failure, RunResult, SilentObserver
