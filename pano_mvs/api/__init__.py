@@ -31,8 +31,7 @@ from pano_mvs.engine.stages.params import (
     params_from,
     settings_from,
 )
-from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
-from pano_mvs.engine.stages.stage import SourceItem, source, stage
+from pano_mvs.engine.stages.stage import All, Each, Names, Near, One, SourceItem, source, stage
 from pano_mvs.geometry import (
     Rigid3,
     Similarity3,

@@ -21,7 +21,6 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.forecasting import forecast_run, remember_report
 from pano_mvs.session.outputs import (
     INTERRUPTED,
     earlier_files,
@@ -29,6 +28,7 @@ from pano_mvs.session.outputs import (
     write_outputs,
     write_outputs_after_error,
 )
+from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.session import Session, check_output, open_session

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from pano_mvs.core.kernel_cache import count_compiled
 from pano_mvs.engine.planning.forecast import StageForecast, makespan
-from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
+from pano_mvs.engine.running.events import Failure, Observer, StageSummary, UnitStatus
 from pano_mvs.session.progress import (
     Event,
     Forecast,
@@ -295,7 +295,7 @@ def _share(work: Sequence[tuple[float, float]], unknown: int) -> float:
 _ESTIMATE_EVERY_S = 1.0
 
 
-class EventObserver:
+class EventObserver(Observer):
     """An observer of the engine's run that passes everything on as events, and adds the time left."""
 
     def __init__(self, progress: Progress, clock: Callable[[], float] = time.monotonic) -> None:

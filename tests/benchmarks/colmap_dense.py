@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Names
+from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_reader import read_ply_points
 from pano_mvs.scene import Files, Panorama, Poses, RangeMap

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Cardinality, Port
-from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views

@@ -18,6 +18,7 @@ import pytest
 import pano_mvs
 from pano_mvs.cli.doctor import command, libraries, machine
 from pano_mvs.cli.doctor.checks import (
+    Finding,
     folder_finding,
     is_older,
     kernel_cache_finding,
@@ -25,7 +26,6 @@ from pano_mvs.cli.doctor.checks import (
     package_findings,
     plugin_findings,
 )
-from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.doctor.libraries import library_findings, run_probe
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry

@@ -8,13 +8,13 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
-from pano_mvs.cli.doctor.finding import Finding, State
 from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
 from pano_mvs.core.memory import free_memory_bytes, size_text
@@ -23,6 +23,29 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.stages.registry import PLUGINS_VARIABLE, Registry, plugin_files_in, user_plugin_folders
 from pano_mvs.results.summary import CACHE_VARIABLE
+
+State: TypeAlias = Literal["ok", "note", "warning", "failed"]
+"""`note`: nothing is wrong. `warning`: something is slower or missing. `failed`: a run cannot work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check.
+
+    Attributes:
+        group: packages, libraries, machine, disk or plugins.
+        what: the subject of the check.
+        state: the verdict.
+        detail: what was found.
+        remedy: what to do; given with every warning and failure.
+    """
+
+    group: str
+    what: str
+    state: State
+    detail: str
+    remedy: str = ""
+
 
 KNOWN_VARIABLES = (CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER")
 _MIN_MEMORY_BYTES, _MIN_DISK_BYTES = 3_000_000_000, 5_000_000_000

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeAlias
 
-from pano_mvs.cli.doctor.finding import Finding, State
+from pano_mvs.cli.doctor.checks import Finding, State
 
 TIMEOUT_S = 180.0
 Answer: TypeAlias = Mapping[str, Any] | str

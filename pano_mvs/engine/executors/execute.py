@@ -39,7 +39,7 @@ from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import key_fields
-from pano_mvs.engine.stages.ports import Cardinality, Names, Port
+from pano_mvs.engine.stages.stage import Cardinality, Names, Port
 from pano_mvs.scene import Axis
 from pano_mvs.scene.pairs_and_views import pair_from_name
 from pano_mvs.scene.record import changed_text, vanished_text

@@ -16,8 +16,7 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
-from pano_mvs.engine.stages.ports import Cardinality
-from pano_mvs.engine.stages.stage import INDEX_PORT, SourceItem
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, SourceItem
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry

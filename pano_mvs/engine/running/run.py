@@ -35,7 +35,7 @@ from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
-from pano_mvs.engine.running.events import Failure, Observer, RunResult, SilentObserver, consequence_of
+from pano_mvs.engine.running.events import Failure, Observer, RunResult, consequence_of
 from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
@@ -99,7 +99,7 @@ class Run:
         self.options = options
         self.store = store
         self.out = out
-        self.observer = observer or SilentObserver()
+        self.observer = observer or Observer()
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
         if options.isolate and not self.executor.enforces_timeouts:

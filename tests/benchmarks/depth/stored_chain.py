@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import Cardinality
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.scene import Poses, RangeMap, Record, Views
 from tests.benchmarks.captures import Capture

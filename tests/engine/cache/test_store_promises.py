@@ -21,9 +21,8 @@ from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.core.processes import process_place
 from pano_mvs.engine.cache import store as store_module
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
-from pano_mvs.engine.cache.disk_guard import DiskGuard
 from pano_mvs.engine.cache.stat_cache import StatCache
-from pano_mvs.engine.cache.store import MIN_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, DiskGuard, ItemRef, Store, UnitRecord, record_from_bytes
 from pano_mvs.scene import FilePart, Part, Record
 from tests.engine.conftest import settle
 

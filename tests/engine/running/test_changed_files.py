@@ -12,7 +12,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.running.events import RunResult, SilentObserver
+from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
 from tests.engine.toy import NUMBERS
@@ -94,7 +94,7 @@ def texts(toy: Toy) -> Toy:
     return toy
 
 
-class Meddler(SilentObserver):
+class Meddler(Observer):
     """Does something once, when a unit has been computed."""
 
     def __init__(self, stage: str, item: str, meddle: Callable[[], object]) -> None:
@@ -111,9 +111,7 @@ class Meddler(SilentObserver):
         self.warnings.append(text)
 
 
-def run(
-    toy: Toy, observer: SilentObserver | None = None, *, executor: str = "serial", cache: str = "cache"
-) -> RunResult:
+def run(toy: Toy, observer: Observer | None = None, *, executor: str = "serial", cache: str = "cache") -> RunResult:
     session = toy.session(cache=toy.folder / cache)
     store = Store(session.store_root)
     made: Executor
