@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable
-
 import pytest
 
-from pano_mvs.engine.cache.blobs import BlobRef
-from pano_mvs.engine.cache.packed_refs import PackedRefs
-from pano_mvs.engine.cache.store import ItemRef
+from pano_mvs.engine.cache.blobs import BlobRef, PackedRefs
 
 PARTS = {
     "meta": BlobRef("0" * 32, 0, ".json"),
@@ -42,28 +37,3 @@ def test_packed_references_differ_in_any_field() -> None:
         assert all(packed != PackedRefs(PARTS | {name: other}) for other in others)
     with pytest.raises(KeyError, match="nothing"):
         packed["nothing"]
-
-
-def test_a_reference_has_what_it_was_made_of() -> None:
-    ref = ItemRef("Kind", "0f" * 16, PARTS)
-    assert (ref.kind, ref.digest, dict(ref.parts)) == ("Kind", "0f" * 16, PARTS)
-    assert ref == ItemRef.from_json(ref.to_json())
-    assert ref == ItemRef("Kind", "0f" * 16, dict(reversed(PARTS.items())))
-    others = ItemRef("Other", "0f" * 16, PARTS), ItemRef("Kind", "00" * 16, PARTS), ItemRef("Kind", "0f" * 16, {})
-    assert all(ref != other for other in (*others, "Kind"))
-    assert repr(ref).startswith("ItemRef(kind='Kind', digest='0f0f")
-    for wrong in ("", "0f", "0F" * 16, "0f" * 17, "none" * 8):
-        with pytest.raises(ValueError, match="not a digest"):
-            ItemRef("Kind", wrong, PARTS)
-
-
-def test_packed_references_take_a_third_of_the_memory_of_a_dict() -> None:
-    def bytes_of(make: Callable[[dict[str, BlobRef]], object]) -> int:
-        tracemalloc.start()
-        held = [make({name: BlobRef(f"{idx:032x}", 1000 + idx, ".npy") for name in PARTS}) for idx in range(100)]
-        found, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert len(held) == 100
-        return found
-
-    assert 3 * bytes_of(PackedRefs) < bytes_of(dict)

@@ -17,9 +17,10 @@ import pytest
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
-from pano_mvs.engine.executors import dask_cluster, dask_task
+from pano_mvs.engine.executors import dask_cluster
+from pano_mvs.engine.executors import dask_cluster as dask_task
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.stages import stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
