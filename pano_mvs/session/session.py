@@ -82,8 +82,12 @@ def open_session(
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except InvalidWorkflowError as error:
-        first = [mistake] if mistake else []
-        raise WorkflowError([*first, *error.problems, *wiring_problems(error.stages, error.unknown)]) from None
+        own = f"--images {images}: "  # said by the mistake already
+        found = [*error.problems, *wiring_problems(error.stages, error.unknown)]
+        others = [problem for problem in found if not (mistake and problem.startswith(own))]
+        if not others:
+            raise InputError(mistake) from None
+        raise WorkflowError([*([mistake] if mistake else []), *others]) from None
     if mistake:
         raise InputError(mistake)
     if images is not None and not is_folder(images) and workflow.stages["images"].spec.name != _VIDEO_SOURCE:

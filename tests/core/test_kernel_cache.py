@@ -85,7 +85,7 @@ def test_processes_that_need_the_same_kernel_compile_it_once(tmp_path: Path) -> 
 
     environment = {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
-    with (kernel_cache.PACKAGE / "algorithms" / "filters" / "kernels_components.py").open() as lock:
+    with (kernel_cache.PACKAGE / "algorithms" / "filters" / "kernels_fill.py").open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         command = [sys.executable, "-c", COMPILE]
         started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]

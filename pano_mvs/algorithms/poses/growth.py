@@ -187,7 +187,11 @@ def _grown(
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     for image in edge:
-        if reason := _unsupported(model, image):
+        if image in model.cameras and (reason := _unsupported(model, image)):
+            for other in model.held_by([image]):
+                model.remove(other)
+                left.add(other)
+                reasons[other] = "its pairs are all with images that could not be registered"
             model.remove(image)
             left.add(image)
             reasons[image] = reason

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from types import TracebackType
-from typing import IO
+from typing import TextIO, cast
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,6 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from pano_mvs.cli.streams import apart
 from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
 from pano_mvs.session.progress import (
     Event,
@@ -54,14 +54,15 @@ class ProgressDisplay:
         self._countdown = Countdown()
         self._began = clock()
         self._lock = threading.RLock()  # the display is drawn by a thread of its own
-        self._file = console.file
+        self._file = cast(TextIO, console.file)
         self._open = ExitStack()
         self._has_begun = False
         self._kernels, self._kernels_at = 0, -math.inf
 
     def __enter__(self) -> ProgressDisplay:
         """Start to draw, on a stream that stays when the output of units is captured (executor `serial`)."""
-        self.console.file = self._open.enter_context(_kept_stream(self.console.file))
+        if (stream := apart(self._file)) is not self._file:
+            self.console.file = self._open.enter_context(stream)
         if self.console.is_terminal:
             self._open.enter_context(
                 Live(
@@ -178,19 +179,6 @@ class ProgressDisplay:
         ]
         name = one_line(summary.stage).ljust(_NAME_WIDTH)
         self.console.print(escape(f"{name} {', '.join(parts)}  {summary.seconds:.1f} s"), highlight=False)
-
-
-@contextmanager
-def _kept_stream(stream: IO[str]) -> Iterator[IO[str]]:
-    """Yield a stream that writes to where this one does now, even if its file descriptor is redirected later."""
-    try:
-        descriptor = os.dup(stream.fileno())
-    except (OSError, AttributeError):  # it has no file, as in tests and notebooks
-        yield stream
-        return
-    encoding, errors = getattr(stream, "encoding", None), getattr(stream, "errors", None)
-    with os.fdopen(descriptor, "w", encoding=encoding, errors=errors) as kept:
-        yield kept
 
 
 def _count(stage: StageProgress) -> str:

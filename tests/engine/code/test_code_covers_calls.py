@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import threading
 from collections.abc import Iterator
@@ -31,7 +32,7 @@ def recorded_calls() -> Iterator[set[CodeType]]:
     called: set[CodeType] = set()
 
     def record(frame: FrameType, event: str, _: object) -> None:
-        if event == "call":
+        if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:  # class bodies run at the first import
             called.add(frame.f_code)
 
     threading.setprofile(record)

@@ -95,7 +95,8 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel, floors: Floors |
     """Return the alignment of two models by their matches or their floors; None if these do not determine it."""
     views = _views_between(first, second)
     best = _by_matches(first, second, views)
-    if floors is None:
+    has_use = len(second.cameras) > 1 if best is not None else any(views.values())
+    if floors is None or not has_use:
         return best
     heights = [floors.camera_height(model) if len(model.cameras) > 1 else np.nan for model in (first, second)]
     if best is not None:
@@ -156,7 +157,7 @@ def _by_floor(
         if np.isfinite(lengths).all():
             similarity = _with_pair(models, pair, _hypotheses(models, pair, view)[0], lengths=(lengths[0], lengths[1]))
             found = Alignment(similarity, np.zeros(0, np.bool_), 0, view.log10_false_alarms, 0.0, 0.0, 0.0, 0.0)
-            agreeing, disagreeing, _ = _evidence_of_pairs(found, *models, views)
+            agreeing, disagreeing, _ = _evidence_of_pairs(found, *models, views=views)
             return found if sum(agreeing) > sum(disagreeing) else None
     return None
 
@@ -185,7 +186,7 @@ def _is_significant(
     pairs that agree must outweigh those that do not. Learned matches that no verified pair supports must be as
     significant as those of a pair, because false ones agree with one another.
     """
-    agreeing, disagreeing, has_length = _evidence_of_pairs(alignment, first, second, views)
+    agreeing, disagreeing, has_length = _evidence_of_pairs(alignment, first, second, views=views)
     if sum(agreeing) < sum(disagreeing):
         return False
     learned = any(features.learned for features in first.pairs.features.values())
@@ -194,7 +195,7 @@ def _is_significant(
 
 
 def _evidence_of_pairs(
-    alignment: Alignment, first: PlacedModel, second: PlacedModel, views: Mapping[Edge, TwoView]
+    alignment: Alignment, first: PlacedModel, second: PlacedModel, *, views: Mapping[Edge, TwoView]
 ) -> tuple[list[float], list[float], bool]:
     """Return the significance of the verified pairs that agree with an alignment, and of those that do not.
 

@@ -20,7 +20,12 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
-from pano_mvs.algorithms.poses.placement.view_graph import Edge, consistent_edges, views_by_position
+from pano_mvs.algorithms.poses.placement.view_graph import (
+    Edge,
+    connected_groups,
+    consistent_edges,
+    views_by_position,
+)
 from pano_mvs.algorithms.two_view.verification import verify_pose
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
@@ -181,6 +186,15 @@ class PlacedModel:
         self.chosen = {edge: rank for edge, rank in self.chosen.items() if image not in edge}
         self._ranges[image][:] = np.nan
         self._parallax[image][:] = 0
+
+    def held_by(self, images: Collection[int]) -> list[int]:
+        """Return the images that only pairs with some of the images connect to the largest part of the others."""
+        if not images:
+            return []
+        left = [edge for edge in self.chosen if not {*edge} & {*images}]
+        connected = {image for edge in self.chosen for image in edge} - {*images}
+        largest = max((connected & {*group} for group in connected_groups(left, len(self.pairs.names))), key=len)
+        return sorted(connected - largest)
 
     def seed(self, edge: Edge, rank: int) -> None:
         """Start with a pair of images, in the frame of the first image, one unit of length apart."""

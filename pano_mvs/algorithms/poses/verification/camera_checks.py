@@ -382,6 +382,9 @@ def _conclude(
         else:
             found.doubts[image] = "; ".join(reasons)
     _doubt_pairs_alone(model, found)
+    for image in model.held_by(found.removed):
+        found.removed[image] = "its pairs are all with images that were left out"
+        found.doubts.pop(image, None)
     for image in found.removed:
         model.remove(image)
         del found.shares[image], found.expected[image]
