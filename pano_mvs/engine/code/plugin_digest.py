@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.engine.code.reach import strip
 
 
 def code_digest(path: Path) -> str:
@@ -76,11 +75,9 @@ def _collect(path: Path, roots: _Roots, trees: dict[str, str]) -> None:
     if name in trees:
         return
     tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-    imported = _imported_files(tree, path.parent, roots)
-    strip(tree)
-    trees[name] = ast.unparse(tree)
-    for file in imported:
-        _collect(file, roots, trees)
+    trees[name] = ast.dump(_without_docstrings(tree), include_attributes=False)
+    for imported in _imported_files(tree, path.parent, roots):
+        _collect(imported, roots, trees)
 
 
 def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]:
@@ -108,3 +105,12 @@ def _module_files(base: Path, dotted: str) -> list[Path]:
     if parts:
         candidates.append(base.joinpath(*parts).with_suffix(".py"))
     return [candidate for candidate in candidates if candidate.is_file()]
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            match node.body:
+                case [ast.Expr(value=ast.Constant(value=str())), *rest]:
+                    node.body = rest or [ast.Pass()]
+    return tree

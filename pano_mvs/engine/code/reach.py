@@ -19,12 +19,15 @@ from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import is_file
+from pano_mvs.engine.code.canonical import canonical_text, strip
 
 _IMPORT, _WHOLE = "<import>", "<all>"
-_HELP_ARGUMENTS = frozenset({"description", "title", "examples", "doc"})
+_AT_RUN_TIME = "/"
+"""Prefix of the paths that `import_module` and its like import."""
+
 _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _STAGE_DECORATORS = frozenset(
-    (f"pano_mvs.{module}", name) for module in ("api", "engine.stages.stage") for name in ("stage", "source")
+    f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")
 )
 """These do not count: their arguments are already in the key of the stage, or cannot affect its result."""
 
@@ -37,7 +40,7 @@ class Reach:
     """The code that a function reaches.
 
     Attributes:
-        digest: of all definitions; it may differ between versions of Python.
+        digest: of all definitions.
         definitions: `module:name` of each definition, to its digest.
         libraries: top-level names of other packages that these use, except the standard library.
     """
@@ -55,13 +58,15 @@ class _Definition:
         text: the statements, without what cannot affect results.
         uses: dotted names.
         annotations: dotted names in the annotations of functions.
-        bindings: names that imports inside of it bind; see `_Module.bindings`.
+        bindings: names that imports inside of it bind, each to everything that it stands for; see `_Module.bindings`.
+        loads: dotted paths that it imports when it runs.
     """
 
     text: str = ""
     uses: set[str] = field(default_factory=set)
     annotations: set[str] = field(default_factory=set)
-    bindings: dict[str, tuple[str, str]] = field(default_factory=dict)
+    bindings: dict[str, set[tuple[str, str]]] = field(default_factory=dict)
+    loads: set[str] = field(default_factory=set)
 
 
 @dataclass(slots=True)
@@ -95,7 +100,9 @@ class _Module:
             whole.text += part.text
             whole.uses |= part.uses
             whole.annotations |= part.annotations
-            whole.bindings |= part.bindings
+            whole.loads |= part.loads
+            for own, places in part.bindings.items():
+                whole.bindings.setdefault(own, set()).update(places)
         return whole
 
 
@@ -162,35 +169,37 @@ class CodeGraph:
         definition = found.definition(what)
         uses = {use: self._refer(module, definition, use, libraries) for use in sorted(definition.uses)}
         targets = {f"{module}:{_IMPORT}"}.union(*uses.values())
-        for home, name in definition.bindings.values():
-            targets |= self._imports(f"{home}.{name}".rstrip("."))
+        targets = targets.union(*map(self._imports, definition.loads))
         if what == _IMPORT:
             libraries.clear()  # what a module only loads does not depend on the version of a library
             targets.update(*map(self._imports, (module, *found.loads)))
-            targets.update(f"{star}:{_WHOLE}" for star in found.stars if self._module(star) is not None)
+            for star in found.stars:
+                targets |= self._targets(star, [], libraries)
         # Include what names refer to: another import of the same name changes what is called.
-        edges = {use: sorted(found_by) or self._path(module, definition, use) for use, found_by in uses.items()}
+        edges = {use: sorted(found_by) or self._paths(module, definition, use) for use, found_by in uses.items()}
         return digest_from_value([definition.text, edges]) if definition.text else "", targets, libraries
 
     def _refer(self, module: str, definition: _Definition, use: str, libraries: set[str]) -> set[str]:
         """Return the nodes to which a dotted name in a definition refers; none for builtins and unknown names."""
+        if use.startswith(_AT_RUN_TIME):
+            return self._targets(use[1:], [], libraries)
         found = self._module(module)
         assert found is not None, module
         name, *further = use.split(".")
-        if name in definition.bindings:
-            home, inner = definition.bindings[name]
-            return self._targets(home, [*filter(None, [inner]), *further], libraries)
+        targets: set[str] = set()
+        for home, inner in definition.bindings.get(name, ()):
+            targets |= self._targets(home, [*filter(None, [inner]), *further], libraries)
         if name in found.statements or name in found.effect_names or name in found.bindings:
-            return self._targets(module, [name, *further], libraries)
-        return set()
+            targets |= self._targets(module, [name, *further], libraries)
+        return targets
 
-    def _path(self, module: str, definition: _Definition, use: str) -> str:
-        """Return the path of a name that leads out of the packages."""
+    def _paths(self, module: str, definition: _Definition, use: str) -> list[str]:
+        """Return the paths of a name that leads out of the packages."""
         found = self._module(module)
         assert found is not None, module
         name, dot, rest = use.partition(".")
-        bound = definition.bindings.get(name) or found.bindings.get(name)
-        return "" if bound is None else f"{bound[0]}.{bound[1]}{dot}{rest}"
+        own = [found.bindings[name]] if name in found.bindings else []
+        return sorted(f"{home}.{inner}{dot}{rest}" for home, inner in {*definition.bindings.get(name, ()), *own})
 
     def _targets(self, module: str, names: list[str], libraries: set[str]) -> set[str]:
         """Return the nodes of a name in a module; if it leads out of the packages, add the library instead."""
@@ -246,22 +255,23 @@ class CodeGraph:
                 self._modules[module] = None
         return self._modules[module]
 
-    def _read(self, module: str) -> tuple[str | None, bool]:
+    def _read(self, module: str) -> tuple[bytes | None, bool]:
         top, *below = module.split(".")
         root = self._packages.get(top)
         if root is None:
             return None, False
         folder = root.joinpath(*below)
-        places = [folder / "__init__.py", folder.with_name(f"{folder.name}.py")] if root.suffix != ".py" else [root]
-        path = next(filter(is_file, places), None) if not below or root.suffix != ".py" else None
+        file = folder.with_name(f"{folder.name}.py")
+        places = [folder / "__init__.py", *([file] if below else [])] if root.suffix != ".py" else [root][len(below) :]
+        path = next(filter(is_file, places), None)
         try:
-            return (None if path is None else path.read_text(encoding="utf-8")), path == folder / "__init__.py"
-        except (OSError, UnicodeDecodeError):
+            return (None if path is None else path.read_bytes()), path == folder / "__init__.py"
+        except OSError:
             return None, False
 
 
 @cache
-def _analysed(text: str, package: str, followed: frozenset[str]) -> _Module:
+def _analysed(text: str | bytes, package: str, followed: frozenset[str]) -> _Module:
     """Return what a module holds.
 
     Args:
@@ -286,19 +296,20 @@ def _definition(statement: ast.stmt, module: _Module) -> _Definition:
     found = _Definition()
     if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
         statement.decorator_list = [
-            one for one in statement.decorator_list if _decorator(one, module) not in _STAGE_DECORATORS
+            one for one in statement.decorator_list if ".".join(_decorator(one, module)) not in _STAGE_DECORATORS
         ]
     for node in ast.walk(statement):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            found.bindings |= dict(_bound(node, module.package))
+            found.loads.update(_loaded(node, module.package))
+            for name, place in _bound(node, module.package):
+                found.bindings.setdefault(name, set()).add(place)
         elif isinstance(node, ast.arg | ast.FunctionDef | ast.AsyncFunctionDef):
             annotation = node.annotation if isinstance(node, ast.arg) else node.returns
             found.annotations.update(() if annotation is None else _names_of_annotation(annotation))
     whole = ast.Module([statement], [])
     strip(whole)
-    found.text = f"{ast.unparse(whole)}\n"
+    found.text = canonical_text(whole) if whole.body else ""
     found.uses.update(_names_in(whole))
-    found.bindings |= {use: (use[1:], "") for use in found.uses if use.startswith("/")}  # imports at run time
     return found
 
 
@@ -313,11 +324,12 @@ def _sorted(statement: ast.stmt, module: _Module, followed: frozenset[str]) -> t
             registers = [
                 one
                 for one in made
-                if one not in _STAGE_DECORATORS
+                if ".".join(one) not in _STAGE_DECORATORS
                 and one[0].partition(".")[0] in {"", *followed}
                 and one[1].rpartition(".")[2] not in _PURE_DECORATORS
             ]
-            return [statement.name], any(home or name in module.statements for home, name in registers)
+            known = {"", *module.statements, *module.effect_names}  # other names are builtins
+            return [statement.name], any(home or name.partition(".")[0] in known for home, name in registers)
         case ast.Assign() | ast.AnnAssign() | ast.AugAssign() if names := _assigned_names(statement):
             return names, False
         case ast.If(test=ast.Name(id="TYPE_CHECKING") | ast.Attribute(attr="TYPE_CHECKING")):
@@ -341,12 +353,17 @@ def _bind(statement: ast.Import | ast.ImportFrom, module: _Module) -> None:
     for name, (home, inner) in _bound(statement, module.package):
         if inner == "*":
             module.stars.append(home)
-            module.loads.append(home)
         else:
             module.bindings[name] = home, inner
-            module.loads.append(f"{home}.{inner}".rstrip("."))
+    module.loads.extend(_loaded(statement, module.package))
+
+
+def _loaded(statement: ast.Import | ast.ImportFrom, package: str) -> Iterator[str]:
+    """Yield the dotted paths that an import imports; the last part may be a name in a module."""
     if isinstance(statement, ast.Import):
-        module.loads.extend(alias.name for alias in statement.names)
+        yield from (alias.name for alias in statement.names)
+    else:
+        yield from (f"{home}.{inner}".removesuffix(".*") for _, (home, inner) in _bound(statement, package))
 
 
 def _bound(statement: ast.Import | ast.ImportFrom, package: str) -> Iterator[tuple[str, tuple[str, str]]]:
@@ -381,13 +398,13 @@ def _assigned_names(statement: ast.Assign | ast.AnnAssign | ast.AugAssign) -> li
 
 
 def _names_in(node: ast.AST) -> Iterator[str]:
-    """Yield the dotted names in code, and `/module` for an import at run time."""
+    """Yield the dotted names in code, and `_AT_RUN_TIME` with a path for an import at run time."""
     if isinstance(node, ast.expr) and (chain := _dotted(node)):
         yield chain
         return
     if isinstance(node, ast.Call) and _dotted(node.func).rpartition(".")[2] in _DYNAMIC_IMPORTS and node.args:
         if isinstance(name := node.args[0], ast.Constant) and isinstance(name.value, str):
-            yield f"/{name.value}"
+            yield f"{_AT_RUN_TIME}{name.value}"
     elif isinstance(node, ast.AnnAssign):
         yield from _names_of_annotation(node.annotation)
     for child in ast.iter_child_nodes(node):
@@ -410,34 +427,3 @@ def _dotted(node: ast.expr) -> str:
         names.append(node.attr)
         node = node.value
     return ".".join([node.id, *reversed(names)]) if isinstance(node, ast.Name) else ""
-
-
-def strip(tree: ast.AST) -> None:
-    """Remove from a tree, in place, what cannot affect results.
-
-    This removes docstrings and other bare strings, `pass`, the annotations of functions and of variables outside
-    classes, and the help texts of settings (`Field(description=…)`, `setting(doc=…)`). The annotations in classes are
-    kept, because they define the fields of dataclasses and settings.
-    """
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            node.returns = None
-        elif isinstance(node, ast.arg):
-            node.annotation = None
-        elif isinstance(node, ast.Call) and _dotted(node.func).rpartition(".")[2] in {"Field", "setting"}:
-            node.keywords = [keyword for keyword in node.keywords if keyword.arg not in _HELP_ARGUMENTS]
-        for block in ("body", "orelse", "finalbody"):
-            if isinstance(statements := getattr(node, block, None), list):
-                kept = statements if isinstance(node, ast.ClassDef) else map(_without_annotation, statements)
-                setattr(node, block, [one for one in kept if one is not None and not _has_no_effect(one)])
-
-
-def _without_annotation(statement: ast.stmt) -> ast.stmt | None:
-    if not isinstance(statement, ast.AnnAssign):
-        return statement
-    return statement.value and ast.Assign([statement.target], statement.value, lineno=statement.lineno)
-
-
-def _has_no_effect(statement: ast.stmt) -> bool:
-    bare = statement.value if isinstance(statement, ast.Expr) else None
-    return isinstance(statement, ast.Pass) or (isinstance(bare, ast.Constant) and isinstance(bare.value, str))

@@ -209,6 +209,13 @@ def test_a_module_whose_names_come_by_a_star_counts_whole(tmp_path: Path) -> Non
     assert {"pack.tools:scale", "pack.tools:two"} <= reach(tmp_path, edits={"pack/start.py": edit}).definitions.keys()
 
 
+def reach_of_text(text: str) -> Reach:
+    """Return what `f` reaches in a module with some variables, beside another module."""
+    names = "".join(f"{name} = 0\n" for name in "ghi")
+    texts = {"pack": ("", True), "pack.m": (f"{names}{text}", False), "pack.k": ("h = 1\ng = 2\nprint()\n", False)}
+    return CodeGraph({}, texts=texts).reach_of(["pack.m:f"])
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -216,21 +223,48 @@ def test_a_module_whose_names_come_by_a_star_counts_whole(tmp_path: Path) -> Non
         ("def f(a=g):\n    def inner():\n        return lambda b=h: a + b\n    return inner", {"g", "h"}),
         ("def f():\n    try:\n        pass\n    except g as h:\n        raise h", {"g", "h"}),
         ("class f(g):\n    h = i\n    def j(self):\n        return h", {"g", "h", "i"}),
+        ("class f:\n    x: 'g' = 1", {"g"}),
+        ("class f:\n    x: Annotated[h, 'of the grid'] = 1", {"h"}),
         ("f = j = {'a': h}", {"h", "j"}),
         ("f = 1\nf += g", {"g"}),
+        ("f: int = g", {"g"}),
         ("if g:\n    f = h\nelse:\n    f = i", {"g", "h", "i", "<import>"}),
+        ("def f(a: h, *b: 'i') -> int:\n    x: g = 1", {"h", "i"}),
+        ("def f():\n    match x:\n        case {'b': c, **d}:\n            return g(c)", {"g"}),
+        ("def f():\n    return a().b[g].h", {"g"}),
         ("def f():\n    import pack.k as c\n    return c.h", {"/pack.k:h", "/pack.k:<import>"}),
+        ("def f():\n    import pack.k\n    return pack.k.h", {"/pack.k:h", "/pack.k:<import>"}),
+        ("def f():\n    import pack.k", {"/pack.k:<import>"}),
         ("def f():\n    from . import k\n    return k.h()", {"/pack.k:h", "/pack.k:<import>"}),
-        ("def f():\n    return import_module('pack.k').h", {"/pack.k:h", "/pack.k:<all>", "/pack.k:<import>"}),
+        ("def f():\n    return import_module('pack.k').h", {"/pack.k:h", "/pack.k:g", "/pack.k:<import>"}),
+        (
+            "class f:\n    def a(self):\n        from .k import h\n    def b(self):\n        return h",
+            {"h", "/pack.k:h", "/pack.k:<import>"},
+        ),
+        (
+            "def f():\n    def a():\n        from .k import g as c\n    from .k import h as c\n    return c",
+            {"/pack.k:g", "/pack.k:h", "/pack.k:<import>"},
+        ),
+        ("def f(): ...\n@g.register\ndef j(): ...", {"g", "<import>"}),
+        ("from functools import cache\n@cache\ndef f(): ...\n@staticmethod\ndef j(): ...", set()),
     ],
 )
 def test_names_that_code_uses(text: str, expected: set[str]) -> None:
-    names = "".join(f"{name} = 0\n" for name in "ghi")
-    texts = {"pack": ("", True), "pack.m": (f"{names}{text}", False), "pack.k": ("h = 1\nprint(h)\n", False)}
-    found = CodeGraph({}, texts=texts).reach_of(["pack.m:f"]).definitions.keys()
+    found = reach_of_text(text).definitions.keys()
     own = {name.removeprefix("pack.m:") for name in found if name.startswith("pack.m:")} - {"f"}
     others = {f"/{name}" for name in found if not name.startswith("pack.m:")}
-    assert own | others == {name for name in expected if not name.endswith("<all>")}
+    assert own | others == expected
+
+
+@pytest.mark.parametrize("text", ["from torch import *\ndef f(): ...", "def f():\n    import_module('torch')"])
+def test_libraries_that_a_star_or_a_call_imports(text: str) -> None:
+    assert reach_of_text(text).libraries == {"torch"}
+
+
+def test_a_file_in_another_encoding_counts(tmp_path: Path) -> None:
+    text = "# -*- coding: latin-1 -*-\ndef f():\n    return 'Grün'\n"
+    (tmp_path / "one.py").write_bytes(text.encode("latin-1"))
+    assert CodeGraph({"one": tmp_path / "one.py"}).reach_of(["one:f"]).definitions.keys() == {"one:f"}
 
 
 def test_left_out_packages_do_not_count(tmp_path: Path) -> None:

@@ -75,6 +75,12 @@ def test_a_function_of_a_docstring_alone_is_an_empty_one(tmp_path: Path) -> None
     assert digest(tmp_path, 'def f():\n    """Nothing."""\n') == digest(tmp_path, "def f():\n    pass\n")
 
 
+def test_a_number_or_a_second_text_is_no_docstring(tmp_path: Path) -> None:
+    assert digest(tmp_path, "def f():\n    1\n    return 2\n") != digest(tmp_path, "def f():\n    return 2\n")
+    assert digest(tmp_path, '"""A."""\n"""B."""\n') != digest(tmp_path, '"""A."""\n')
+    assert digest(tmp_path, '"""A."""\n"""B."""\n') == digest(tmp_path, '"""C."""\n"""B."""\n')
+
+
 @pytest.mark.parametrize(
     ("start", "texts", "counted", "not_counted"),
     [
