@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef, PackedRefs
+from pano_mvs.engine.cache.store import ItemRef
 
 PARTS = {
     "meta": BlobRef("0" * 32, 0, ".json"),
@@ -37,3 +38,16 @@ def test_packed_references_differ_in_any_field() -> None:
         assert all(packed != PackedRefs(PARTS | {name: other}) for other in others)
     with pytest.raises(KeyError, match="nothing"):
         packed["nothing"]
+
+
+def test_a_reference_has_what_it_was_made_of() -> None:
+    ref = ItemRef("Kind", "0f" * 16, PARTS)
+    assert (ref.kind, ref.digest, dict(ref.parts)) == ("Kind", "0f" * 16, PARTS)
+    assert ref == ItemRef.from_json(ref.to_json())
+    assert ref == ItemRef("Kind", "0f" * 16, dict(reversed(PARTS.items())))
+    others = ItemRef("Other", "0f" * 16, PARTS), ItemRef("Kind", "00" * 16, PARTS), ItemRef("Kind", "0f" * 16, {})
+    assert all(ref != other for other in (*others, "Kind"))
+    assert repr(ref).startswith("ItemRef(kind='Kind', digest='0f0f")
+    for wrong in ("", "0f", "0F" * 16, "0f" * 17, "none" * 8):
+        with pytest.raises(ValueError, match="not a digest"):
+            ItemRef("Kind", wrong, PARTS)

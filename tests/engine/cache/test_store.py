@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.events import Observer
-from pano_mvs.scene import Record
+from pano_mvs.scene import RangeMap, Record
 from tests.engine.conftest import Toy
 from tests.permissions import permissions_hold
 
@@ -62,6 +64,12 @@ def test_equal_values_share_blobs_and_digest(tmp_path: Path) -> None:
     first, second = Store(tmp_path / "a"), Store(tmp_path / "b")
     value = Sample(np.ones((2, 2), np.float32), (), (), 1.0)
     assert first.put_value(value) == second.put_value(value)
+
+
+def test_value_that_breaks_its_kind_is_refused(tmp_path: Path) -> None:
+    wrong = RangeMap(np.zeros((2, 4), np.float32), np.ones((2, 4), np.uint8))
+    with pytest.raises(ContractError, match="invalid is NaN"):
+        Store(tmp_path).put_value(wrong)
 
 
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
@@ -131,6 +139,12 @@ def test_caches_are_marked_also_those_of_earlier_versions(tmp_path: Path) -> Non
     tmp_path.joinpath("a").chmod(0o700)
     Store(tmp_path / "a")
     assert mark.exists()
+
+
+def test_store_of_another_layout_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "layout.json").write_text(json.dumps({"layout": 99}))
+    with pytest.raises(UsageError, match="--cache"):
+        Store(tmp_path)
 
 
 def test_much_damage_takes_few_passes(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -341,6 +342,23 @@ def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
     assert not {"difference", "shifted", "mean"} & set(ran(gated)), "nothing follows a stage before it has passed"
 
 
+@pytest.mark.slow
+def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
+    count = toy.folder / "count"
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
+    if x.value == 30:
+        with open({str(count)!r}, "a") as file: file.write("x")
+        raise ValueError("again")''',
+        ),
+    )
+    assert run_with(toy, two_processes, "scaled.retries=2").exit_code == 3
+    assert count.read_text() == "xxx"
+
+
 def test_declared_memory_bounds_how_many_run_at_a_time(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     log = toy.folder / "log"
     toy.edit(
@@ -486,3 +504,14 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     before = threading.active_count()
     assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
     assert threading.active_count() == before
+
+
+@pytest.mark.slow
+def test_same_work_twice_is_done_once(toy: Toy) -> None:
+    """Two pictures of the same content have the same key; side by side they must not both be computed."""
+    shutil.copy(toy.folder / "capture" / "1.txt", toy.folder / "capture" / "0.txt")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.05)'))
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert told(side_by_side) == told(serial)
+    assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")

@@ -247,6 +247,14 @@ def test_files_of_an_image_that_failed_meanwhile_are_not_forgotten(toy: Toy) -> 
     assert "mean/2.txt" in mended.published
 
 
+def test_names_that_meet_after_the_extension_is_dropped_stay_apart(toy: Toy) -> None:
+    for name in ("a.txt", "a.b.txt", "a.b.txt.txt"):
+        toy.number(name, "1")
+    toy.run()
+    names = {name for name in toy.deliverables() if name.startswith("mean/a")}
+    assert len(names) == 3
+
+
 def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.run()
 
