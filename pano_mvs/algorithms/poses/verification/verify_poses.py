@@ -15,7 +15,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel,
 from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.joints import joint_doubts
-from pano_mvs.algorithms.two_view.verification import MIN_MATCHES
+from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, MIN_MATCHES
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -140,11 +140,12 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
 def with_unconfirmed_doubts(
     poses: Poses, features: Mapping[str, Features], two_views: Mapping[tuple[str, str], TwoView]
 ) -> Poses:
-    """Return poses of one group with doubts about cameras that learned matches with a single image place.
+    """Return poses of one group with doubts about cameras that weak or learned matches with a single image place.
 
     Networks also match equal doors, posters and windows of different rooms, and a false pair looks as good as a true
-    one. If removing a pair without enough matches of its own detector divides the group, no third image confirms the
-    pair; the smaller part is doubtful, or both parts of equal size.
+    one. Where matches are so few that networks are asked too, and find nothing, other pairs are often false as well: of
+    16 such pairs in a real tour and six rendered houses, four were. If removing such a pair divides the group, no third
+    image confirms it; the smaller part is doubtful, or both parts of equal size.
 
     Args:
         poses: the poses.
@@ -155,7 +156,8 @@ def with_unconfirmed_doubts(
     pairs = [pair for pair, view in two_views.items() if view and {*pair} <= {*position}]
     doubts = dict(poses.doubts)
     for pair in pairs:
-        if not _rests_on_learned(two_views[pair], features[pair[0]], features[pair[1]]):
+        kind = _kind_of_weakness(two_views[pair], features[pair[0]], features[pair[1]])
+        if not kind:
             continue
         edges = np.array([[position[name] for name in other] for other in pairs if other != pair]).reshape(-1, 2)
         links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(position),) * 2)
@@ -166,17 +168,19 @@ def with_unconfirmed_doubts(
         fewest = min(map(len, sides))
         for side, other in zip(sides, reversed(pair), strict=True):
             for idx in side if len(side) == fewest else ():
-                reason = f"only learned matches with {other} place it, and no third image confirms them"
+                reason = f"only {kind} matches with {other} place it, and no third image confirms them"
                 name = poses.names[idx]
                 doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
     return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})
 
 
-def _rests_on_learned(view: TwoView, first: Features, second: Features) -> bool:
-    """Return whether a pair has learned matches, and too few others to verify it."""
+def _kind_of_weakness(view: TwoView, first: Features, second: Features) -> str:
+    """Return "learned" if a pair has too few other matches to verify it, "few" if learned ones do not; else ""."""
     own = np.array([len(first) - first.learned, len(second) - second.learned])
     others = int((view.matches_idx < own).all(axis=1).sum())
-    return others < min(MIN_MATCHES, len(view.matches_idx))
+    if others < min(MIN_MATCHES, len(view.matches_idx)):
+        return "learned"
+    return "few" if first.learned and second.learned and view.log10_false_alarms > MAX_LOG10_LEARNED else ""
 
 
 def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> Poses:

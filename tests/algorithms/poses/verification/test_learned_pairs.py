@@ -1,4 +1,4 @@
-"""Cameras that only learned matches with one other image place are doubtful."""
+"""Cameras that only weak or learned matches with one other image place are doubtful."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from tests.algorithms.poses.synthetic_capture import features_from_bearings
 OWN, LEARNED = 40, 60
 
 
-def pair_of(count: int, *, start: int) -> TwoView:
+def pair_of(count: int, *, start: int, exponent: float = -80.0) -> TwoView:
     matches = np.arange(start, start + count, dtype=np.int32)
-    return TwoView(
-        np.stack([matches, matches], axis=1), np.eye(3), np.array([0.0, 0, 1]), np.zeros(count, np.float32), "general"
-    )
+    residuals = np.zeros(count, np.float32)
+    view = TwoView(np.stack([matches, matches], axis=1), np.eye(3), np.array([0.0, 0, 1]), residuals, "general")
+    return replace(view, log10_false_alarms=exponent)
 
 
 SIFT, NETWORK, FEW = pair_of(30, start=0), pair_of(50, start=OWN - 10), pair_of(6, start=0)
+WEAK = pair_of(30, start=0, exponent=-20.0)
 
 
 @pytest.mark.parametrize(
@@ -35,10 +36,12 @@ SIFT, NETWORK, FEW = pair_of(30, start=0), pair_of(50, start=OWN - 10), pair_of(
         ({"ab": NETWORK, "bc": NETWORK, "cd": NETWORK, "ad": NETWORK}, ""),
         ({"ab": NETWORK}, "ab"),
         ({"ab": FEW}, ""),
+        ({"ab": SIFT, "bc": SIFT, "cd": WEAK}, "d"),
+        ({"ab": SIFT, "bc": WEAK, "ac": WEAK}, ""),
     ],
-    ids=["own", "last", "middle", "triangle", "ring", "two", "few"],
+    ids=["own", "last", "middle", "triangle", "ring", "two", "few", "weak", "weak triangle"],
 )
-def test_a_bridge_of_learned_matches_is_doubtful(pairs: dict[str, TwoView], doubted: str) -> None:
+def test_a_bridge_of_weak_or_learned_matches_is_doubtful(pairs: dict[str, TwoView], doubted: str) -> None:
     names = sorted({*"".join(pairs)})
     rays = np.random.default_rng(1).normal(size=(OWN + LEARNED, 3))
     features = dict.fromkeys(names, replace(features_from_bearings(rays), learned=LEARNED))
