@@ -1,8 +1,8 @@
 """Parts of a model that verified pairs contradict: the cut through its cameras that most evidence speaks against.
 
 A camera, or a room, in a wrong place mostly has pairs of its own that put it there: structure repeats. But other pairs
-tell the truth, and contradict the cameras. Counted by camera or over all pairs they are few; counted among the pairs
-that cross the cut between the wrong part and the rest, they weigh nearly as much as those that agree.
+are right, and contradict the cameras. Counted by camera or over all pairs they are few; counted among the pairs that
+cross the cut between the wrong part and the rest, they weigh nearly as much as those that agree.
 """
 
 from __future__ import annotations
