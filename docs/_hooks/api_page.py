@@ -13,7 +13,7 @@ from typing import Any
 from markdown_text import docstring
 
 from pano_mvs import api
-from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import Cardinality
 from pano_mvs.scene import Record
 
 _INTRODUCTION = """# API for plugins

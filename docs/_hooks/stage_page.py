@@ -13,9 +13,8 @@ from setting_schema import limits_of, type_of
 
 from pano_mvs import api, stages
 from pano_mvs.engine.stages.params import NOT_IN_KEY
-from pano_mvs.engine.stages.ports import Port
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage import Port, StageSpec
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.schema import workflow_schema
 

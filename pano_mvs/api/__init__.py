@@ -21,10 +21,17 @@ from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, Usag
 from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.settings import Setting, checks_settings, setting
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
-from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
-from pano_mvs.engine.stages.settings import arguments_from, params_from, settings_from
-from pano_mvs.engine.stages.stage import SourceItem, source, stage
+from pano_mvs.engine.stages.params import (
+    NOT_IN_KEY,
+    InputPath,
+    Params,
+    RegisteredIn,
+    SourcePath,
+    arguments_from,
+    params_from,
+    settings_from,
+)
+from pano_mvs.engine.stages.stage import All, Each, Names, Near, One, SourceItem, source, stage
 from pano_mvs.geometry import (
     Rigid3,
     Similarity3,

@@ -129,9 +129,9 @@ def run(
 ) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import division_of, run_in_blocks
-    from pano_mvs.cli.plan.command import show_dry_run
+    from pano_mvs.cli.plan_commands import show_dry_run
     from pano_mvs.cli.run.command import run_workflow
-    from pano_mvs.engine.planning.run_options import RunOptions
+    from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
@@ -173,9 +173,8 @@ def plan(
     ] = "",
 ) -> None:
     """Show what a run would compute, and why; nothing is written to the output folder."""
-    from pano_mvs.cli.plan.command import show_plan
-    from pano_mvs.cli.plan.explain import explain_unit
-    from pano_mvs.engine.planning.run_options import RunOptions
+    from pano_mvs.cli.plan_commands import explain_unit, show_plan
+    from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.session import check_output, open_session
 
     run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
@@ -212,7 +211,7 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Write the JSON Schema of workflows, for completion and validation in editors."""
-    from pano_mvs.cli.schema_command import show_schema
+    from pano_mvs.cli.workflow_commands import show_schema
 
     show_schema(workflow, out)
 
@@ -230,7 +229,7 @@ def show(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Print a workflow and the files that it extends, or one file with all settings."""
-    from pano_mvs.cli.show_command import show_workflow
+    from pano_mvs.cli.workflow_commands import show_workflow
     from pano_mvs.session.session import open_session
 
     show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
@@ -246,7 +245,7 @@ def status(
     cache: CacheOption = None,
 ) -> None:
     """Show what the latest run did and what is cached now."""
-    from pano_mvs.cli.plan.status import show_status
+    from pano_mvs.cli.plan_commands import show_status
 
     show_status(target, out, overrides=overrides or [], images=images, cache=cache, console=Console())
 
@@ -255,7 +254,7 @@ def status(
 @guarded
 def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
     """Rewrite report.html from run.json and the cache, without computing anything."""
-    from pano_mvs.cli.report_command import rewrite_report
+    from pano_mvs.cli.page_commands import rewrite_report
 
     rewrite_report(out, cache, Console())
 
@@ -370,7 +369,7 @@ def share(
     cache: CacheOption = None,
 ) -> None:
     """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
-    from pano_mvs.cli.share_command import share_output
+    from pano_mvs.cli.page_commands import share_output
     from pano_mvs.share import ShareOptions
 
     options = ShareOptions(title, points, triangles, width, quality)
@@ -394,7 +393,7 @@ def split_capture(
 ) -> None:
     """Divide a capture into overlapping blocks: folders of links to its images."""
     from pano_mvs.cli.merge_command import split_command
-    from pano_mvs.session.merging.split import Division
+    from pano_mvs.session.merging.block_runs import Division
 
     split_command(images, to, Division(size, overlap, loop, poses), console=Console())
 
@@ -440,7 +439,7 @@ def inspect_pixel(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Analyse one pixel: its ray, its range after each stage, and its cost for every depth hypothesis."""
-    from pano_mvs.cli.inspect.command import PixelWanted, inspect
+    from pano_mvs.cli.inspect_command import PixelWanted, inspect
     from pano_mvs.session.commands import reopen
 
     session = reopen(target, overrides=overrides or [], images=images, cache=cache)

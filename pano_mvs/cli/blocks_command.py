@@ -11,13 +11,12 @@ from rich.markup import escape
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.merge_command import merge_blocks_command
-from pano_mvs.cli.plan.command import show_dry_run
+from pano_mvs.cli.plan_commands import show_dry_run
 from pano_mvs.cli.run.command import interrupted_by_termination, run_shown
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.session.commands import run_command
-from pano_mvs.session.merging.block_runs import BlockRun, block_runs, divided, open_blocks
+from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, open_blocks
 from pano_mvs.session.merging.merge import BLOCKS
-from pano_mvs.session.merging.split import Division
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 

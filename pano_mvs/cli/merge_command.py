@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from pano_mvs.core.text import plural
+from pano_mvs.session.merging.block_runs import Division, split_images
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.merging.split import Division, split_images
 
 
 def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:

@@ -10,7 +10,6 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.command import run_workflow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.results.run_output import RunOutput, load
-from pano_mvs.session.camera_height import height_note
 from pano_mvs.session.running import Execution
 from pano_mvs.session.scaling import (
     WORKFLOW_FILE,
@@ -21,6 +20,7 @@ from pano_mvs.session.scaling import (
     metres_from_text,
     scaled_session,
 )
+from pano_mvs.session.summarise import height_note
 
 _USUAL_HEIGHTS_M = (0.3, 4.0)
 """Outside of these, the height of the cameras is called in question."""

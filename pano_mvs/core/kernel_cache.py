@@ -68,8 +68,13 @@ def kernel_cache_folder(package: Path = PACKAGE) -> Path:
     Raises:
         OSError: if the user has no writable folder for caches.
     """
+    return user_cache_folder() / "pano-mvs" / "kernels" / kernels_digest(package)
+
+
+def kernels_digest(package: Path = PACKAGE) -> str:
+    """Return a digest of all kernel files of a package."""
     sources = {str(path.relative_to(package)): path.read_bytes() for path in below(package, "kernels*.py")}
-    return user_cache_folder() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
+    return digest_from_value(sources)[:16]
 
 
 def count_compiled() -> int:

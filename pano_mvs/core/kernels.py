@@ -6,17 +6,21 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+from numba.core.caching import IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 
-from pano_mvs.core.kernel_cache import compilation_time
+from pano_mvs.core.kernel_cache import PACKAGE, compilation_time, kernels_digest
 
 if os.name == "posix":
     import fcntl
 
 _locked: set[str] = set()
+_own_digest = cache(kernels_digest)
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -33,10 +37,10 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         return lambda decorated: kernel(decorated, **options)
     compiled = njit(cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True, **options)(function)
     if not config.DISABLE_JIT:
-        compile_or_load = compiled.compile
+        compile_or_load, folder = compiled.compile, _cache_folder(compiled, function)
 
         def compile_once(signature: Any) -> Any:
-            with _alone(function.__code__.co_filename):
+            with _alone(folder):
                 return compile_or_load(signature)
 
         compiled.compile = compile_once
@@ -48,34 +52,51 @@ def inlined(function: Callable[..., Any]) -> Any:
     return njit(cache=True, error_model="numpy", nogil=True, inline="always")(function)
 
 
-@contextmanager
-def _alone(path: str) -> Iterator[None]:
-    """Lock a file of kernels against other processes; it is locked once if its kernels call each other.
+def _cache_folder(compiled: Any, function: Callable[..., Any]) -> str:
+    """Return the folder of a kernel's code, which for our own kernels is named after the module instead of the file.
 
-    Kernels call those of other files while they are compiled, but never in a circle, so that no two processes wait for
-    each other. Without locks, as on some network file systems, every process compiles by itself.
+    Copies of the package in several environments share what one of them has compiled. Numba notices edits of the file
+    that holds a kernel only; here, the digest of all kernel files decides whether code is still valid. Kernels
+    elsewhere, of which the digest says nothing, are left to numba, and so are all if the cache cannot be written.
+    """
+    kept, root = compiled._cache, Path(config.CACHE_DIR)
+    is_ours = Path(function.__code__.co_filename).is_relative_to(PACKAGE)
+    if is_ours and Path(kept._cache_path).is_relative_to(root):
+        digest = _own_digest()
+        folder = str((root if root.name == digest else root / digest) / function.__module__)
+        kept._impl.locator._cache_path = kept._cache_path = folder
+        kept._cache_file = IndexDataCacheFile(folder, kept._impl.filename_base, digest)
+    return str(kept._cache_path)
+
+
+@contextmanager
+def _alone(folder: str) -> Iterator[None]:
+    """Lock the kernels of a module against other processes; they are locked once if they call each other.
+
+    Kernels call those of other modules while they are compiled, but never in a circle, so that no two processes wait
+    for each other. Without locks, as on some network file systems, every process compiles by itself.
     """
     with global_compiler_lock:  # of numba, for the threads of this process
-        if path in _locked:
+        if folder in _locked:
             yield
             return
         started, is_outermost = time.perf_counter(), not _locked
-        _locked.add(path)
+        _locked.add(folder)
         try:
-            with _file_lock(path):
+            with _file_lock(folder):
                 yield
         finally:
-            _locked.remove(path)
+            _locked.remove(folder)
             if is_outermost:
                 compilation_time.seconds += time.perf_counter() - started
 
 
 @contextmanager
-def _file_lock(path: str) -> Iterator[None]:
-    try:
-        handle = os.open(path, os.O_RDONLY) if os.name == "posix" else -1
-    except OSError:
-        handle = -1
+def _file_lock(folder: str) -> Iterator[None]:
+    handle = -1
+    with suppress(OSError):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        handle = os.open(Path(folder) / "lock", os.O_RDWR | os.O_CREAT) if os.name == "posix" else -1
     if handle < 0:
         yield
         return

@@ -1,26 +1,16 @@
-"""The verdict of a run: how it ended, whether the result is reliable, and its main figures."""
+"""The verdict of a run, its main figures, and its findings: what is wrong or doubtful, and what to do about it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import re
+from collections import Counter
+from collections.abc import Collection, Sequence
 
 from pano_mvs.core.text import plural
 from pano_mvs.results.figures import degrees, figure, median, share, significant
-from pano_mvs.results.findings import compares_views, doubt_mood, findings
-from pano_mvs.results.records import Tile, Verdict
+from pano_mvs.results.records import Finding, PoseGroup, PosesSummary, Tile, Verdict
 from pano_mvs.results.residuals import Residuals
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.results.thresholds import (
-    FAIR_COMPLETE,
-    FAIR_CONSISTENT,
-    FAIR_REGISTERED,
-    FAIR_RESIDUAL_PX,
-    GOOD_COMPLETE,
-    GOOD_CONSISTENT,
-    GOOD_REGISTERED,
-    GOOD_RESIDUAL_PX,
-    mood_of,
-)
 
 _SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {
@@ -143,3 +133,300 @@ def _accuracy(summary: RunSummary) -> list[Tile]:
     if relative is not None:
         tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the ground truth"))
     return tiles
+
+
+GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
+# Residuals are measured in pixels of the panorama: a median within one pixel is good.
+GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
+# The sky fills up to half of the sphere, so only a much smaller share of valid pixels is bad.
+GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
+# No other view confirms walls without texture: a third of the pixels of a furnished room is a good share.
+GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
+# A ceiling or floor of which other views confirm less than this is reported, because its ranges may be far off.
+FAIR_CONFIRMED_SIDE = 0.15
+# A model is bad if more than half of its cameras are doubtful.
+FAIR_UNDOUBTED = 0.5
+
+
+def mood_of(value: float, good: float, fair: float) -> str:
+    """Return "good", "fair" or "bad".
+
+    Args:
+        value: the figure to judge.
+        good: threshold of "good"; a lower bound if it is greater than `fair`, else an upper bound.
+        fair: threshold of "fair".
+    """
+    if good > fair:
+        return "good" if value >= good else "fair" if value >= fair else "bad"
+    return "good" if value <= good else "fair" if value <= fair else "bad"
+
+
+_FEW_LINKS = 2
+_SHOWN_GROUPS = 5
+_SHOWN_DOUBTS = 5
+_NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
+_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # endings that differ between singular and plural
+
+
+def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:
+    """Return what is wrong or doubtful in a run, the worst first.
+
+    Args:
+        summary: of the run.
+        residual_px: median reprojection residual in pixels of the panoramas, if known.
+    """
+    found = [
+        *_stopped(summary),
+        *_failures(summary),
+        *_registration(summary),
+        *_doubts(summary),
+        *_groups(summary),
+        *_graph(summary),
+        *_imprecision(residual_px),
+        *_views(summary),
+        *_sides(summary),
+        *_empty_cloud(summary),
+        *_baseline(summary),
+    ]
+    return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
+
+
+def _stopped(summary: RunSummary) -> list[Finding]:
+    stopped = summary.stopped
+    if not stopped:
+        return []
+    if stopped == "interrupted":
+        return [
+            Finding(
+                "fair",
+                "The run was interrupted. This report shows what it had finished.",
+                "Run the same command again to continue.",
+            )
+        ]
+    stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
+    return [Finding("bad", f"The run stopped early: {stopped}", "Correct this and run the same command again.")]
+
+
+def _failures(summary: RunSummary) -> list[Finding]:
+    failures, blocked = summary.failures, summary.blocked
+    if not failures:
+        return []
+    stages = Counter(failure.stage for failure in failures)
+    where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
+    more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
+    verb = plural(len(failures), "unit of work failed", "units of work failed")
+    return [
+        Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
+    ]
+
+
+def _registration(summary: RunSummary) -> list[Finding]:
+    registered, rejected = len(summary.poses.registered), summary.poses.rejected
+    total = registered + len(rejected)
+    if not total or not rejected:
+        return []
+    mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
+    text = (
+        f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
+        f"{_commonest(list(rejected.values()))}."
+    )
+    if mood == "good":
+        return [Finding("", text)]
+    return [
+        Finding(
+            mood,
+            text,
+            "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well.",
+        )
+    ]
+
+
+def doubt_mood(poses: PosesSummary) -> str:
+    """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
+    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
+
+
+def _doubts(summary: RunSummary) -> list[Finding]:
+    doubts, poses = summary.doubtful_images, summary.poses
+    if not doubts:
+        return []
+    reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
+    more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
+    what = "camera" if poses.doubts else "image"
+    count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
+    them = plural(len(reasons), "it and its", "them and their")
+    mood = doubt_mood(poses) if poses.doubts else "fair"
+    return [
+        Finding(
+            mood,
+            f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+            f"Take panoramas between {them} neighbours that show something unique, or leave "
+            f"{plural(len(reasons), 'it', 'these images')} out.",
+        )
+    ]
+
+
+def _groups(summary: RunSummary) -> list[Finding]:
+    groups = summary.poses.groups
+    if len(groups) < 2:
+        return []
+    sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
+    more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
+    largest = len(groups[0].images)
+    text = (
+        f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
+        f"largest has {largest} {plural(largest, 'panorama')}; "
+        f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}. They may also be different places."
+    )
+    return [Finding("fair", text, pictures_between(groups))]
+
+
+def _named(group: PoseGroup) -> str:
+    names = group.images
+    return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
+
+
+def pictures_between(groups: Sequence[PoseGroup]) -> str:
+    """Return between which images to take more, to connect smaller groups to the largest one, which is the first."""
+    found = []
+    for pair in (group.nearest_pair for group in groups[1:]):
+        if pair:
+            matches, candidates = pair.matches, pair.candidates
+            known = (
+                f"{matches} {plural(matches, 'match', 'matches')}"
+                if matches
+                else f"{candidates} {plural(candidates, 'candidate')}"
+            )
+            found.append(f"{pair.first} and {pair.second} ({known})")
+    if not found:
+        return "Take panoramas between the groups, 0.5–1 m apart, so that they overlap both."
+    more = " …" if len(found) > _SHOWN_GROUPS else ""
+    return f"To connect them, take panoramas between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
+
+
+def _commonest(reasons: Sequence[str]) -> str:
+    """Return the most frequent reason, ignoring figures and names in it, and its frequency."""
+    kinds = [_ENDINGS.sub("", _NAMES_AND_FIGURES.sub("…", reason)) for reason in reasons]
+    ((kind, count),) = Counter(kinds).most_common(1)
+    example = reasons[kinds.index(kind)]
+    return example if len(reasons) == 1 else f"{count} {plural(count, 'time')} such as “{example}”"
+
+
+def _graph(summary: RunSummary) -> list[Finding]:
+    """Return the registered cameras that are linked to only one other, if there are at least four cameras."""
+    names, links = summary.poses.registered, summary.poses.links
+    if len(names) < 4 or not links:
+        return []
+    count = Counter(name for link in links if link.inliers for name in link[:2])
+    loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
+    if not loose:
+        return []
+    shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
+    mood = "fair" if len(loose) > len(names) / 4 else ""
+    sharing = plural(len(loose), "camera shares", "cameras share")
+    return [
+        Finding(
+            mood,
+            f"{len(loose)} {sharing} a verified geometry with only one other camera ({shown}): unless their "
+            "poses come from a file, nothing confirms them.",
+        )
+    ]
+
+
+def _imprecision(residual_px: float | None) -> list[Finding]:
+    if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
+        return []
+    text = f"The median reprojection residual is {significant(residual_px)} pixels: the poses are imprecise."
+    return [
+        Finding(
+            mood,
+            text,
+            "Check that the images are sharp, well stitched, and not edited individually; "
+            "add poses.refine after the solver if it is missing.",
+        )
+    ]
+
+
+def compares_views(summary: RunSummary) -> bool:
+    """Return whether any stage compared the views; otherwise, no pixel can be confirmed."""
+    compared = any("consistency" in stage.use for stage in summary.stages)
+    return compared or any(view.consistent for view in summary.views)
+
+
+def _views(summary: RunSummary) -> list[Finding]:
+    found = []
+    complete = median([view.completeness for view in summary.views])
+    consistent = median([view.consistent for view in summary.views])
+    if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
+        found.append(
+            Finding(
+                mood,
+                f"Half of the views have a range for less than {share(complete)} of their pixels.",
+                "Sky and masked areas have none; for other areas, look at the views in the report.",
+            )
+        )
+    if consistent is not None and not compares_views(summary):
+        found.append(
+            Finding(
+                "",
+                "No stage compared the views with each other, so it is unknown whether they agree.",
+                "Add filters.consistency.",
+            )
+        )
+    elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
+        found.append(
+            Finding(
+                mood,
+                f"Other views confirm only {share(consistent)} of the pixels in the median view.",
+                "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
+                "far apart or the poses are wrong.",
+            )
+        )
+    return found
+
+
+def _sides(summary: RunSummary) -> list[Finding]:
+    """Return whether most ranges above or below the cameras are unconfirmed, in half of the views."""
+    found = []
+    for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
+        confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
+        if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
+            found.append(
+                Finding(
+                    "fair",
+                    f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
+                    "the others may be wrong.",
+                    f"Plain {surface} cannot be matched. Previews show their ranges pale; leave them out by confidence "
+                    "(128 and more is confirmed) or by uncertainty, or use the preset quality.",
+                )
+            )
+    return found
+
+
+def _empty_cloud(summary: RunSummary) -> list[Finding]:
+    if summary.cloud.points == 0:
+        return [
+            Finding(
+                "bad",
+                "The cloud has no points: no two views agree on any surface.",
+                "Look at the range maps in the report: if they look right, the poses are wrong.",
+            )
+        ]
+    return []
+
+
+def _baseline(summary: RunSummary) -> list[Finding]:
+    """Return a finding for each branch that scores no better than a constant range."""
+    found = []
+    for stage, scores in summary.scores_by_stage.items():
+        views = scores.views.values()
+        ours = median([view.get("psnr_db") for view in views])
+        constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
+        if ours is not None and constant is not None and ours <= constant:
+            text = f"Compared with the ground truth ({stage}), a single constant range scores at least as well"
+            found.append(Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB."))
+    return found
+
+
+def _units(count: int) -> str:
+    return f"{figure(count)} further {plural(count, 'unit')}"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
+from pano_mvs.algorithms.filters.consistency import Agreement, view_doubts
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.paths import exists, is_file
@@ -14,7 +16,8 @@ from pano_mvs.engine.running.run import Run
 from pano_mvs.report.page import gather_report, write_page
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RUN_JSON, RunSummary
-from pano_mvs.session.dense_doubts import add_dense_doubts
+from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.sudden_exit import exit_text
 from pano_mvs.session.summarise import summarise
 
@@ -78,3 +81,39 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
 
 def _reason(error: BaseException) -> str:
     return exit_text(error) if isinstance(error, SystemExit) else str(error)
+
+
+_FIGURES = tuple(Agreement.__dataclass_fields__)
+
+
+def add_dense_doubts(run: Run) -> None:
+    """Mark views that other views contradict as doubtful, so that the run ends with exit code 3.
+
+    The figures of `Agreement` are used from the last stage of the range maps that reports them;
+    filters.consistency does. Cameras that are doubted already keep their reason.
+    """
+    poses = latest(run, Poses)
+    stage = _compared_stage(run)
+    if poses is not None and stage:
+        name, figures = stage
+        groups, centers = poses.groups, poses.centers
+        for group in range(len(poses.worlds)):
+            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
+            for image, reason in view_doubts(figures, inside).items():
+                run.result.doubts.setdefault(image, (name, reason))
+    if run.result.doubts and run.result.exit_code == 0:
+        run.result.exit_code = 3
+
+
+def _compared_stage(run: Run) -> tuple[str, Mapping[str, Agreement]] | None:
+    """Return the last stage of the range maps that compared the views, and what it found of each."""
+    metrics = {summary.name: summary.unit_metrics for summary in run.result.stages}
+    for name in reversed(chain_of(run.workflow, run.graph, RangeMap)):
+        found = {
+            view: Agreement(*(values[figure] for figure in _FIGURES))
+            for view, values in metrics.get(name, {}).items()
+            if all(figure in values for figure in _FIGURES)
+        }
+        if found:
+            return name, found
+    return None

@@ -15,14 +15,12 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.forecasting import forecast_run, remember_report
-from pano_mvs.session.observer import EventObserver
 from pano_mvs.session.outputs import (
     INTERRUPTED,
     earlier_files,
@@ -30,10 +28,11 @@ from pano_mvs.session.outputs import (
     write_outputs,
     write_outputs_after_error,
 )
+from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
-from pano_mvs.session.python_errors import names_arguments
+from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.session import Session, check_output, open_session
-from pano_mvs.session.settings import overrides_from_settings
+from pano_mvs.session.time_estimator import EventObserver
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 

@@ -29,9 +29,8 @@ from pydantic import ValidationError
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.process_state import ProcessState
-from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.stages.stage import StageSpec, spec_of
+from pano_mvs.engine.stages.stage import Cardinality, StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
 from pano_mvs.testing.contract_test import ContractTest

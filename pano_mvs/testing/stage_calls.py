@@ -17,8 +17,7 @@ from pano_mvs.core.errors import ContractError, PanoMvsError, UsageError
 from pano_mvs.core.paths import is_file, is_inside
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params
-from pano_mvs.engine.stages.ports import Cardinality, Names, Port
-from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage import Cardinality, Names, Port, StageSpec
 from pano_mvs.scene import Axis, FilePart, Files, Panorama, Record
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 

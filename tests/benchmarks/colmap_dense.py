@@ -19,7 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.engine.stages.ports import Names
+from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import read_ply_points
 from pano_mvs.scene import Files, Panorama, Poses, RangeMap

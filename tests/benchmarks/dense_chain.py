@@ -18,8 +18,7 @@ import typer
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Cardinality, Port
-from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry

@@ -21,7 +21,7 @@ import typer
 import pano_mvs
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.engine.cache.unit_times import FILE_NAME
-from pano_mvs.session import forecasting
+from pano_mvs.session import planning as forecasting
 
 TARGET = Path(forecasting.__file__).with_name("reference_times.json")
 _MAX_SAMPLES = 2

@@ -16,12 +16,17 @@ from typing import Any
 import pytest
 
 import pano_mvs
-from pano_mvs.cli.doctor import command, libraries, machine
-from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.cli.doctor import checks, command, libraries
+from pano_mvs.cli.doctor.checks import (
+    Finding,
+    folder_finding,
+    is_older,
+    kernel_cache_finding,
+    machine_findings,
+    package_findings,
+    plugin_findings,
+)
 from pano_mvs.cli.doctor.libraries import library_findings, run_probe
-from pano_mvs.cli.doctor.machine import folder_finding, kernel_cache_finding, machine_findings
-from pano_mvs.cli.doctor.packages import is_older, package_findings
-from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.session.session import presets_folder
@@ -148,9 +153,9 @@ def test_a_probe_that_dies_or_hangs_ends_nothing_else() -> None:
 
 
 def on_a_machine(monkeypatch: pytest.MonkeyPatch, *, memory_bytes: int) -> None:
-    monkeypatch.setattr(machine, "available_threads", lambda: 8)
+    monkeypatch.setattr(checks, "available_threads", lambda: 8)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(machine, "free_memory_bytes", lambda: memory_bytes)
+    monkeypatch.setattr(checks, "free_memory_bytes", lambda: memory_bytes)
 
 
 def test_the_machine_and_slips_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +183,7 @@ def test_every_variable_that_the_program_reads_is_known() -> None:
         if "doctor" not in path.parts
         for name in re.findall(r'"(PANO_MVS_[A-Z_]+)"', path.read_text(encoding="utf-8"))
     }
-    assert read <= set(machine.KNOWN_VARIABLES)
+    assert read <= set(checks.KNOWN_VARIABLES)
 
 
 def test_a_folder_for_kernels_that_cannot_be_written(tmp_path: Path) -> None:
@@ -232,7 +237,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
     answers: dict[str, object] = {"pyvista": "no libGL.so.1"}
     answering(monkeypatch, answers)
     on_a_machine(monkeypatch, memory_bytes=16 * 10**9)  # of this one it may warn, too
-    monkeypatch.setattr(machine, "machine_findings", partial(machine_findings, {}))
+    monkeypatch.setattr(checks, "machine_findings", partial(machine_findings, {}))
     result = pano_mvs("doctor", "--cache", "c", "--out", "o")
     assert result.code == 0, result.text
     assert "a run can work; 1 warning" in result.flat

@@ -79,13 +79,20 @@ print(sum(label_surfaces.stats.cache_misses.values()), count_compiled() > 0, com
 """
 
 
+@pytest.fixture
+def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """An environment with an empty cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="kernel files are not locked there")
-def test_processes_that_need_the_same_kernel_compile_it_once(tmp_path: Path) -> None:
+def test_processes_that_need_the_same_kernel_compile_it_once(environment: dict[str, str]) -> None:
     import fcntl
 
-    environment = {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
-    environment["XDG_CACHE_HOME"] = str(tmp_path)
-    with (kernel_cache.PACKAGE / "algorithms" / "filters" / "kernels_fill.py").open() as lock:
+    folder = kernel_cache.kernel_cache_folder() / "pano_mvs.algorithms.filters.kernels_fill"
+    folder.mkdir(parents=True)
+    with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         command = [sys.executable, "-c", COMPILE]
         started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
@@ -93,6 +100,37 @@ def test_processes_that_need_the_same_kernel_compile_it_once(tmp_path: Path) -> 
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
     assert sorted(process.communicate()[0] for process in started) == ["0 True True\n", "1 True True\n"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="another variable names the folder for caches")
+def test_copies_share_kernels_until_one_is_edited(tmp_path: Path, environment: dict[str, str]) -> None:
+    """Even where the edited copy inherits the folder of the other one, and the edit is in another file."""
+    shutil.copytree(kernel_cache.PACKAGE, tmp_path / "pano_mvs", ignore=shutil.ignore_patterns("__pycache__"))
+    edited = tmp_path / "pano_mvs" / "geometry" / "kernels_sphere.py"
+
+    def misses() -> str:
+        command = [sys.executable, "-c", COMPILE]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.split()[1]
+
+    subprocess.run([sys.executable, "-c", COMPILE], env=environment, capture_output=True, check=True)
+    assert misses() == "0"
+    environment[kernel_cache.VARIABLE] = str(kernel_cache.kernel_cache_folder())
+    edited.write_text(f"{edited.read_text(encoding='utf-8')}# edited\n", encoding="utf-8")
+    assert misses() == "1"
+
+
+def test_a_kernel_outside_the_package_is_compiled_again_after_an_edit(
+    tmp_path: Path, environment: dict[str, str]
+) -> None:
+    """The digest of the files of the package says nothing of it."""
+    for factor in ("2.0", "3.0"):
+        text = f"from pano_mvs.core.kernels import kernel\n@kernel\ndef scaled(x):\n    return {factor} * x\n"
+        (tmp_path / "outside.py").write_text(text)
+        command = [sys.executable, "-c", "import pano_mvs.algorithms, outside; print(outside.scaled(1.0))"]
+        paths = os.pathsep.join([str(tmp_path), str(kernel_cache.PACKAGE.parent)])
+        done = subprocess.run(command, env=environment | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, check=True)
+        assert float(done.stdout) == float(factor)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="permissions as POSIX has them")

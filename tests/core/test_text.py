@@ -6,12 +6,7 @@ import json
 
 import pytest
 
-from pano_mvs.core.text import json_without_controls, one_line, plural, shortened, without_controls
-
-
-def test_short_texts_stay_as_they_are() -> None:
-    assert shortened("a" * 2000) == "a" * 2000
-    assert without_controls("a\tb\nä – 🙂 [1]") == "a\tb\nä – 🙂 [1]"
+from pano_mvs.core.text import json_without_controls, one_line, shortened, without_controls
 
 
 def test_long_texts_keep_their_beginning_and_end() -> None:
@@ -43,9 +38,3 @@ def test_a_name_stays_on_its_line() -> None:
     """A file name with a newline could print a line of its own, such as "results in …"."""
     assert one_line("x\nresults in\there\x1b.jpg") == r"x\x0aresults in\x09here\x1b.jpg"
     assert one_line("räume/1.jpg") == "räume/1.jpg"
-
-
-@pytest.mark.parametrize(("count", "text"), [(0, "0 matches are"), (1, "1 match is"), (2, "2 matches are")])
-def test_a_word_has_the_form_that_goes_with_its_count(count: int, text: str) -> None:
-    assert f"{count} {plural(count, 'match', 'matches')} {plural(count, 'is', 'are')}" == text
-    assert plural(count, "unit") == ("unit" if count == 1 else "units")

@@ -15,7 +15,7 @@ from pano_mvs import api
 from pano_mvs.api import Context, RunStoppedError, TwoView
 from pano_mvs.cli.app import app
 from pano_mvs.cli.plugins.new import KINDS, rendered
-from pano_mvs.engine.stages.plugin_files import declared_names
+from pano_mvs.engine.stages.registry import declared_names
 from pano_mvs.scene import Record
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room, write_capture

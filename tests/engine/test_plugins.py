@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.engine.stages.plugin_files import declared_names, plugin_files_in, user_plugin_folders
-from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.registry import Registry, declared_names, plugin_files_in, user_plugin_folders
 from tests.engine.conftest import Toy, ran
 
 STAGE = """\

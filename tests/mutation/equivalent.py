@@ -7,7 +7,6 @@ EQUIVALENT = {
     "028cd36f": "canonical_text: any text will do that is equal for equal trees alone; this one is, with X between",
     "01390d36": "_write: likewise, with X after a list",
     "0c56e3aa": "_write: likewise, as a comma follows each item of a list",
-    "05b3ca1c": "CodeGraph._definition_node: the digest is set before the node is returned",
     "0625d3c6": "Resolver._input: a unit that cannot run does not wait, whatever is said of its waiting",
     # wiring
     "262a5645": "wiring_problems: the name of the workflow is not read",

@@ -13,11 +13,10 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import cloud_pictures
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.results.findings import findings, pictures_between
 from pano_mvs.results.records import NearestPair, PairLink, PoseGroup, PosesSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.results.verdict import verdict
+from pano_mvs.results.verdict import findings, pictures_between, verdict
 from pano_mvs.scene import PointCloud, Poses, Record
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
 from pano_mvs.session.summarise import nearest_pair

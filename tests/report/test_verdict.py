@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from pano_mvs.results.findings import findings
 from pano_mvs.results.records import Finding, Verdict
 from pano_mvs.results.residuals import Histogram, Residuals
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.results.verdict import verdict
+from pano_mvs.results.verdict import findings, verdict
 
 NAMES = [f"{number}.png" for number in range(10)]
 POSES: dict[str, Any] = {

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.results.camera_group import shortest_tree
 from pano_mvs.results.coverage import LonelyArea, ViewCoverage
-from pano_mvs.results.next_time import Suggestion, direction_words, marks_of, suggestions
+from pano_mvs.results.next_time import Suggestion, direction_words, marks_of, shortest_tree, suggestions
 from pano_mvs.results.summary import RunSummary
 
 

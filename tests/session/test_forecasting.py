@@ -9,8 +9,8 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.run import Run
-from pano_mvs.session import forecasting
-from pano_mvs.session.forecasting import expected_report_s, forecast_run, reference_times, remember_report
+from pano_mvs.session import planning as forecasting
+from pano_mvs.session.planning import expected_report_s, forecast_run, reference_times, remember_report
 from pano_mvs.session.progress import Event, Forecast, RunStarted
 from pano_mvs.session.session import open_session
 from tests.engine.conftest import Toy

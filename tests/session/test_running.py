@@ -17,8 +17,7 @@ from pano_mvs.session.progress import (
     UnitFailed,
     UnitFinished,
 )
-from pano_mvs.session.python_errors import arguments_from_options
-from pano_mvs.session.settings import overrides_from_settings
+from pano_mvs.session.python_calls import arguments_from_options, overrides_from_settings
 from tests.engine.conftest import Toy
 
 

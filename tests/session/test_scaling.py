@@ -19,7 +19,6 @@ from pano_mvs.results.run_output import load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Pose, RangeMap
 from pano_mvs.scene.pose_groups import join_groups
-from pano_mvs.session.camera_height import camera_height, height_note
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import (
     lost_scale,
@@ -29,7 +28,7 @@ from pano_mvs.session.scaling import (
     scaled_session,
 )
 from pano_mvs.session.session import Session, open_session
-from pano_mvs.session.summarise import _scale_notes
+from pano_mvs.session.summarise import _scale_notes, camera_height, height_note
 from pano_mvs.stages.filters import ScaleRangesParams, scale_ranges
 from pano_mvs.stages.frame import ScaleParams, scale
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud

@@ -10,8 +10,7 @@ import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.events import UnitStatus
-from pano_mvs.session import observer as observer_module
-from pano_mvs.session.observer import EventObserver
+from pano_mvs.session import time_estimator as observer_module
 from pano_mvs.session.progress import (
     Event,
     Forecast,
@@ -24,7 +23,7 @@ from pano_mvs.session.progress import (
     UnitFinished,
     UnitStarted,
 )
-from pano_mvs.session.time_estimator import Countdown, TimeEstimator
+from pano_mvs.session.time_estimator import Countdown, EventObserver, TimeEstimator
 
 
 @dataclass

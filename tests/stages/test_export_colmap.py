@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.engine.stages.ports import Names
+from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import angle_between, ray_grid
 from pano_mvs.io.colmap.workspace import read_colmap_map
 from pano_mvs.scene import FilePart, Panorama, Poses, RangeMap

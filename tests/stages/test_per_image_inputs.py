@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import Cardinality
 
 _WHOLE = {Cardinality.ALL, Cardinality.NAMES}
 _OF_A_UNIT = {Cardinality.EACH, Cardinality.NEAR}

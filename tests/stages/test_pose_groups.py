@@ -15,7 +15,7 @@ import pytest
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Names
+from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames

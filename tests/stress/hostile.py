@@ -29,7 +29,7 @@ import typer
 
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.session.session import open_session

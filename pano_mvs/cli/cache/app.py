@@ -35,20 +35,14 @@ def runs(cache: CacheOption = None) -> None:
 
 @cache_app.command("verify")
 @guarded
-def verify(
-    cache: CacheOption = None,
-    drop_unproven: Annotated[
-        bool,
-        typer.Option("--drop-unproven", help="Remove results of earlier versions that cannot be proven to be correct."),
-    ] = False,
-) -> None:
+def verify(cache: CacheOption = None) -> None:
     """Check every file and remove damaged ones, which the next run computes again.
 
-    Results of earlier versions are listed as not proven if their images may have changed during the run.
+    Results of early versions, which did not check the images that they read, are removed too.
     """
     from pano_mvs.cli.cache.command import open_cache, verify_cache
 
-    raise typer.Exit(verify_cache(open_cache(cache), Console(), drop_unproven=drop_unproven))
+    raise typer.Exit(verify_cache(open_cache(cache), Console()))
 
 
 @cache_app.command("gc")

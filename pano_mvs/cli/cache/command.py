@@ -25,10 +25,6 @@ from pano_mvs.results.summary import CACHE_VARIABLE
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 _FAILED_ITEMS = 3
-_UNPROVEN = (
-    "{} of an earlier version, which did not check the images that it read, {} not proven: images "
-    "were changed, moved or deleted since, perhaps while they were being read"
-)
 
 
 def cache_root(cache: Path | None) -> Path:
@@ -104,13 +100,12 @@ def show_runs(store: Store, console: Console) -> None:
     console.print(table)
 
 
-def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False) -> int:
+def verify_cache(store: Store, console: Console) -> int:
     """Check every file of the cache; return the exit code."""
-    damage = verify(store, drop_unproven=drop_unproven)
+    damage = verify(store)
     for what, paths in (
         ("removed, damaged", damage.removed),
         ("incomplete", damage.incomplete),
-        ("not proven", damage.unproven),
         ("not of the cache", damage.foreign),
         ("temporary", damage.temporary),
     ):
@@ -123,16 +118,9 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
         f"{plural(damage.blobs, 'blob')} are intact, {len(damage.removed)} damaged",
         highlight=False,
     )
-    if damage.unproven:
-        count = len(damage.unproven)
-        unproven = _UNPROVEN.format(f"{count} {plural(count, 'result')}", plural(count, "is", "are"))
-        console.print(unproven, highlight=False, soft_wrap=True)
-        removed, it = plural(count, "it was removed", "they were removed"), plural(count, "it", "them")
-        console.print(removed if drop_unproven else f"--drop-unproven removes {it}", highlight=False)
-    if not damage.removed and not damage.incomplete and not damage.unproven:
+    if not damage.removed and not damage.incomplete:
         return 0
-    if damage.removed or damage.incomplete or drop_unproven:
-        console.print("the next run computes the missing results again")
+    console.print("the next run computes the missing results again")
     return _FAILED_ITEMS
 
 

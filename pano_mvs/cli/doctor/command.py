@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.cli.doctor.checks import Finding
 from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import CacheOption, OutOption
 from pano_mvs.core.text import plural
@@ -49,10 +49,14 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         cache: the cache folder; by default that of a preset that is run in the current folder.
         out: the folder of the results, with the same default.
     """
+    from pano_mvs.cli.doctor.checks import (
+        folder_finding,
+        kernel_cache_finding,
+        machine_findings,
+        package_findings,
+        plugin_findings,
+    )
     from pano_mvs.cli.doctor.libraries import library_findings
-    from pano_mvs.cli.doctor.machine import folder_finding, kernel_cache_finding, machine_findings
-    from pano_mvs.cli.doctor.packages import package_findings
-    from pano_mvs.cli.doctor.plugins import plugin_findings
     from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.results.summary import CACHE_VARIABLE
     from pano_mvs.session.session import presets_folder

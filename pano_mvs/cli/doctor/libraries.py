@@ -8,18 +8,15 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-from pano_mvs.cli.doctor.finding import Finding, State
+from pano_mvs.cli.doctor.checks import Finding, State
 
 TIMEOUT_S = 180.0
 Answer: TypeAlias = Mapping[str, Any] | str
 """The JSON object that a probe printed last, or, if it failed, the reason."""
 
 _REINSTALL = "pip install --force-reinstall --no-deps"
-_finding = partial(Finding, "libraries")
-
 _NUMBA = """
 import json
 import numba, numpy
@@ -113,33 +110,39 @@ def library_findings() -> Iterator[Finding]:
         yield from findings_of(library, answer)
     if not has_torch_plugin:
         detail = "the sweep on PyTorch (for graphics cards) is not installed; it is optional"
-        yield _finding("torch", "note", detail, "pip install ./plugins/pano_mvs_torch in a checkout")
+        yield Finding("libraries", "torch", "note", detail, "pip install ./plugins/pano_mvs_torch in a checkout")
 
 
 def findings_of(library: Library, answer: Answer) -> Iterator[Finding]:
     """Yield what the answer of a probe means."""
     if isinstance(answer, str):
-        yield _finding(library.name, library.state_if_broken, f"{answer}{library.consequence}", library.remedy)
+        yield Finding(
+            "libraries", library.name, library.state_if_broken, f"{answer}{library.consequence}", library.remedy
+        )
         return
     if library.name == "numba" and answer["disabled"]:
-        yield _finding("numba", "warning", "compiles nothing: hundreds of times slower", "unset NUMBA_DISABLE_JIT")
+        yield Finding(
+            "libraries", "numba", "warning", "compiles nothing: hundreds of times slower", "unset NUMBA_DISABLE_JIT"
+        )
         return
     if library.name == "torch":
         yield _of_torch(answer)
         return
-    yield _finding(library.name, "ok", f"{answer['version']}, {library.success}")
+    yield Finding("libraries", library.name, "ok", f"{answer['version']}, {library.success}")
     if not answer.get("video", True):
-        yield _finding("OpenCV video", "warning", "reads no videos (no FFmpeg)", library.remedy)
+        yield Finding("libraries", "OpenCV video", "warning", "reads no videos (no FFmpeg)", library.remedy)
     if not answer.get("avif", True):
-        yield _finding("OpenCV AVIF", "note", "reads no AVIF images", "pip install -U opencv-python-headless")
+        yield Finding(
+            "libraries", "OpenCV AVIF", "note", "reads no AVIF images", "pip install -U opencv-python-headless"
+        )
 
 
 def _of_torch(answer: Mapping[str, Any]) -> Finding:
     if answer["devices"]:
-        return _finding("torch", "ok", f"{answer['version']}: {'; '.join(answer['devices'])}")
+        return Finding("libraries", "torch", "ok", f"{answer['version']}: {'; '.join(answer['devices'])}")
     build = "built without CUDA" if answer["built_for"] is None else f"built for CUDA {answer['built_for']}"
     detail = f"{answer['version']}, {build}, finds no graphics card: backend torch uses the CPU"
-    return _finding("torch", "note", detail, "install the card's driver and a build of torch with CUDA")
+    return Finding("libraries", "torch", "note", detail, "install the card's driver and a build of torch with CUDA")
 
 
 class Library(NamedTuple):

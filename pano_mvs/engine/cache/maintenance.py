@@ -27,7 +27,6 @@ from pano_mvs.engine.cache.blobs import SUFFIX
 from pano_mvs.engine.cache.latest_runs import RunEntry
 from pano_mvs.engine.cache.packs import ARRAY, JSON, RECORD, Packed
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
-from pano_mvs.engine.cache.unproven import Unproven
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
 _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
@@ -62,7 +61,6 @@ class Verification:
         incomplete: records with missing blobs, which runs ignore.
         foreign: files that do not belong to the cache.
         temporary: temporary files, each with the process that it belongs to, and unfinished packs.
-        unproven: records of earlier versions that may have been computed from other input files than their keys say.
     """
 
     records: int = 0
@@ -71,7 +69,6 @@ class Verification:
     incomplete: list[str] = field(default_factory=list)
     foreign: list[str] = field(default_factory=list)
     temporary: list[str] = field(default_factory=list)
-    unproven: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -133,19 +130,15 @@ def size_on_disk(store: Store) -> int:
     return sum(stat.st_size for stat in stats if stat is not None)
 
 
-def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
+def verify(store: Store) -> Verification:
     """Check every record and every blob against its digest, and remove damaged ones; foreign files are kept.
 
     Runs may use the cache at the same time.
 
-    Args:
-        store: the cache.
-        drop_unproven: also remove the records of earlier versions whose results cannot be proven, see `unproven`.
-
     Raises:
         StoreError: if a file cannot be read or removed.
     """
-    found, unproven = Verification(), Unproven()
+    found = Verification()
     intact: set[str] = set()
     _verify_names(store, found)
     for value in _blobs(store):
@@ -155,16 +148,10 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
             found.blobs += 1
         elif digest:
             _remove_damaged(store, value, found)
-    keys: dict[str, str] = {}
     for value in _records(store):
         data = _read(value.place)
-        record = _verify_record(store, value, data, found=found, intact=intact) if data is not None else None
-        if record is not None:
-            keys[value.name] = record.key
-            unproven.add(value.name, value.used_s, record)
-    found.unproven = list(unproven.paths(store.stat_cache))
-    for name in found.unproven if drop_unproven else ():
-        store.drop(keys[name])
+        if data is not None:
+            _verify_record(store, value, data, found=found, intact=intact)
     for path in store.blobs.packs.without_index():
         found.temporary.append(f"{path} (a pack that was not finished; collection removes it)")
     for entry in _sorted(store.blobs.temporary):
@@ -197,21 +184,18 @@ def _remove_damaged(store: Store, value: _Value, found: Verification) -> None:
     found.removed.append(value.name)
 
 
-def _verify_record(
-    store: Store, value: _Value, data: bytes, *, found: Verification, intact: set[str]
-) -> UnitRecord | None:
-    """Check a record and enter it into what was found; return it if it and all its blobs are intact."""
+def _verify_record(store: Store, value: _Value, data: bytes, *, found: Verification, intact: set[str]) -> None:
+    """Check a record and its blobs, and enter it into what was found."""
     record = record_from_bytes(data)
     if record is None or record.key != value.digest:
         _remove_damaged(store, value, found)
-        return None
+        return
     # A running workflow may have written other blobs after the blobs were checked.
     blobs = (ref for ref in record.own_blobs() if f"{ref.digest}{ref.suffix}" not in intact)
     if all(_digest(store.blobs.place(ref)) == ref.digest for ref in blobs):
         found.records += 1
-        return record
-    found.incomplete.append(value.name)
-    return None
+    else:
+        found.incomplete.append(value.name)
 
 
 def pack(store: Store) -> int:

@@ -56,19 +56,6 @@ class StatCache:
         except (OSError, ValueError):
             return None
 
-    def times_of_change(self) -> dict[str, float]:
-        """Return by digest when the latest of the known files with this digest last changed, in seconds.
-
-        Files that have changed since they were hashed are left out.
-        """
-        found: dict[str, float] = {}
-        for name, (size, changed, touched, inode, digest) in self._entries.items():
-            if self.state(Path(name)) == (size, changed, touched, inode):
-                assert isinstance(touched, int)
-                assert isinstance(changed, int)
-                found[str(digest)] = max(found.get(str(digest), 0.0), max(changed, touched) / 1e9)
-        return found
-
     def forget(self, path: Path) -> None:
         """Remove the entry of a file whose digest turned out to be wrong."""
         self._new.pop(str(resolved(path)), None)

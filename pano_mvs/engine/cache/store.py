@@ -12,10 +12,13 @@ of runs on several hosts can share a cache, also on a network file system.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from sys import intern
@@ -31,17 +34,99 @@ from pano_mvs.core.files import (
     read_regular,
     remove_whole,
     replacing,
+    temporary_prefix,
     write_text,
 )
 from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
-from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
-from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
+from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.latest_runs import RunHistory
-from pano_mvs.engine.cache.packed_refs import PackedRefs
 from pano_mvs.engine.cache.packs import RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
+
+_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
+_FULL_BELOW_BYTES = 1_000_000
+
+
+class DiskGuard:
+    """Watches the disk that holds a cache."""
+
+    def __init__(self, root: Path, *, min_free_bytes: int) -> None:
+        """Watch the disk of the folder `root`; no unit starts with less than `min_free_bytes` free."""
+        self._root = root
+        self._min_free_bytes = min_free_bytes
+
+    def require(self) -> None:
+        """Raise StoreError if there is too little free space to start a unit."""
+        free = self._free_bytes()
+        if free < self._min_free_bytes:
+            raise StoreError(
+                f"{free / 1e6:.0f} MB are free on the disk of the cache {self._root}, but "
+                f"{self._min_free_bytes / 1e6:.0f} MB must stay free (--min-free). Make room (`pano-mvs cache gc` "
+                "shows what can be deleted) and run the same command again: finished units stay in the cache"
+            )
+
+    @contextmanager
+    def scratch(self, parent: Path) -> Iterator[Path]:
+        """Yield an empty folder, removed afterwards.
+
+        Raises:
+            StoreError: if the disk is too full to start, or becomes full inside the context.
+        """
+        self.require()
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            folder = Path(tempfile.mkdtemp(dir=parent, prefix=temporary_prefix()))
+        except OSError as error:
+            raise self.cannot_write(error) from error
+        try:
+            yield folder
+            # A library that does not check its writes may have truncated a file on a full disk: keep nothing.
+            if self._is_full():
+                raise self._full()
+        except StoreError:
+            raise
+        except Exception as error:
+            # Libraries report a full disk in many ways: errors without a number, errors of their own, or not at all.
+            if is_full_disk(error) or self._is_full():
+                raise self._full() from error
+            raise
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def cannot_write(self, error: OSError) -> StoreError:
+        """Return the error for a cache that cannot be written."""
+        if is_full_disk(error):
+            return self._full()
+        return StoreError(
+            f"cache {self._root} cannot be written: {error.strerror or error}. Check its permissions, "
+            "or choose another cache with --cache DIR"
+        )
+
+    def _is_full(self) -> bool:
+        return self._free_bytes() < _FULL_BELOW_BYTES
+
+    def _free_bytes(self) -> int:
+        try:
+            return shutil.disk_usage(self._root).free
+        except OSError as error:
+            raise StoreError(
+                f"cache {self._root} cannot be read: {error.strerror}. Check its permissions, or choose another cache "
+                "with --cache DIR"
+            ) from error
+
+    def _full(self) -> StoreError:
+        return StoreError(
+            f"the disk of the cache {self._root} is full, or your quota is used up. Make room (`pano-mvs cache gc` "
+            "shows what can be deleted) and run the same command again: finished units stay in the cache"
+        )
+
+
+def is_full_disk(error: BaseException | None) -> bool:
+    """Return whether a system error means that the disk is full or a quota is used up."""
+    return isinstance(error, OSError) and error.errno in _FULL
+
 
 LAYOUT_VERSION = 2
 _FOLDER_DIGITS = {1: 2, 2: 3}
@@ -127,7 +212,6 @@ class UnitRecord:
         rejected: image name to the reason why the result leaves it out.
         doubts: image name to the reason why the result is doubtful there.
         seconds: computing time.
-        checked: whether the input files were compared with the digests in the key; early versions did not do this.
     """
 
     key: str
@@ -139,7 +223,6 @@ class UnitRecord:
     rejected: Mapping[str, str] = field(default_factory=dict)
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
-    checked: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a JSON value."""
@@ -153,7 +236,7 @@ class UnitRecord:
             "rejected": dict(self.rejected),
             "doubts": dict(self.doubts),
             "seconds": self.seconds,
-            "checked": self.checked,
+            "checked": True,
         }
 
     @staticmethod
@@ -170,6 +253,8 @@ class UnitRecord:
         seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a metric or a time is not finite")
+        if value.get("checked") is not True:
+            raise ValueError("of an early version, which did not compare what a unit read with the digests in its key")
         return UnitRecord(
             key=str(value["key"]),
             identity=identity,
@@ -180,7 +265,6 @@ class UnitRecord:
             rejected={str(name): str(reason) for name, reason in rejected.items()},
             doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
-            checked=value.get("checked") is True,
         )
 
     def blobs(self) -> Iterator[BlobRef]:

@@ -1,24 +1,38 @@
 """Follow code by name, from a function to everything that it may use in the modules of some packages.
 
-Nodes are definitions: the functions, classes and variables at the top level of a module. Names computed at run time
-(`getattr` on a module, imports by a computed name) are not followed; a module that is used as a value counts as a
-whole. What a module does when it is imported counts wherever the module is loaded.
+Nodes are the definitions at the top level of a module: functions, classes and variables. A definition uses what its
+names refer to in its module, also where a function has a local variable of the same name, which finds too much rather
+than too little. Names computed at run time (`getattr` on a module, imports by a computed name) are not followed; a
+module that is used as a value, or imported by a star, counts as a whole. What a module executes when it is imported
+counts wherever the module is loaded.
 """
 
 from __future__ import annotations
 
-import builtins
+import ast
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.engine.code.references import ABSOLUTE
-from pano_mvs.engine.code.sources import Sources
-from pano_mvs.engine.code.summary import Definition, ModuleSummary
+from pano_mvs.core.paths import is_file
+from pano_mvs.engine.code.canonical import canonical_text, strip
 
 _IMPORT, _WHOLE = "<import>", "<all>"
-_MAX_DEPTH = 50
+_AT_RUN_TIME = "/"
+"""Prefix of the paths that `import_module` and its like import."""
+
+_DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
+_STAGE_DECORATORS = frozenset(
+    f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")
+)
+"""These do not count: their arguments are already in the key of the stage, or cannot affect its result."""
+
+_PURE_DECORATORS = frozenset({"kernel", "inlined", "params_from", "checks_settings"})
+"""Decorators of followed packages that register nothing, unlike others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,166 +51,192 @@ class Reach:
 
 
 @dataclass(slots=True)
-class _Node:
-    digest: str
-    targets: set[str] = field(default_factory=set)
-    libraries: set[str] = field(default_factory=set)
+class _Definition:
+    """A top-level name, or all that a module executes on import: its statements, and the names that these use.
+
+    Attributes:
+        text: the statements, without what cannot affect results.
+        uses: dotted names.
+        annotations: dotted names in the annotations of functions.
+        bindings: names that imports inside of it bind, each to everything that it stands for; see `_Module.bindings`.
+        loads: dotted paths that it imports when it runs.
+    """
+
+    text: str = ""
+    uses: set[str] = field(default_factory=set)
+    annotations: set[str] = field(default_factory=set)
+    bindings: dict[str, set[tuple[str, str]]] = field(default_factory=dict)
+    loads: set[str] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class _Module:
+    """What a module holds.
+
+    Attributes:
+        package: from which relative imports start.
+        statements: those that define each name; `_IMPORT` has what is executed on import beside definitions.
+        effect_names: names that these define.
+        bindings: imported name to (module, name in it); the name is empty for a module.
+        loads: dotted paths that importing it imports.
+        stars: modules from which all names are imported.
+    """
+
+    package: str
+    statements: dict[str, list[ast.stmt]] = field(default_factory=dict)
+    effect_names: set[str] = field(default_factory=set)
+    bindings: dict[str, tuple[str, str]] = field(default_factory=dict)
+    loads: list[str] = field(default_factory=list)
+    stars: list[str] = field(default_factory=list)
+    _definitions: dict[int, _Definition] = field(default_factory=dict)
+
+    def definition(self, name: str) -> _Definition:
+        """Return what a name stands for."""
+        whole = _Definition()
+        for statement in self.statements.get(name, ()):
+            if id(statement) not in self._definitions:
+                self._definitions[id(statement)] = _definition(statement, self)
+            part = self._definitions[id(statement)]
+            whole.text += part.text
+            whole.uses |= part.uses
+            whole.annotations |= part.annotations
+            whole.loads |= part.loads
+            for own, places in part.bindings.items():
+                whole.bindings.setdefault(own, set()).update(places)
+        return whole
 
 
 class CodeGraph:
-    """The graph of definitions and the definitions that they use, built on demand.
+    """The graph of definitions and the definitions that they use, built on demand."""
 
-    Attributes:
-        sources: the modules that are followed.
-    """
-
-    def __init__(self, sources: Sources, *, left_out: Iterable[str] = (), kept: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        packages: Mapping[str, Path],
+        *,
+        texts: Mapping[str, tuple[str, bool]] | None = None,
+        left_out: Iterable[str] = (),
+        kept: Iterable[str] = (),
+    ) -> None:
         """Create an empty graph.
 
         Args:
-            sources: the modules that are followed; all others are libraries.
+            packages: the packages and modules that are followed, with their folders or files; all others are libraries.
+            texts: further modules by dotted name, or other texts of these: source, and whether it is a package.
             left_out: dotted names of packages and modules that are ignored.
             kept: modules inside these that count nevertheless.
         """
-        self.sources = sources
+        self._packages = dict(packages)
+        self._texts = texts or {}
+        self._tops = {*packages, *(name.partition(".")[0] for name in self._texts)}
         self._is_out = dict.fromkeys(left_out, True) | dict.fromkeys(kept, False)
-        self._nodes: dict[str, _Node] = {}
-        self._modules: dict[str, tuple[str, ...]] = {}
+        self._modules: dict[str, _Module | None] = {}
+        self._nodes: dict[str, tuple[str, set[str], set[str]]] = {}
 
-    def with_modules(self, known: Mapping[str, ModuleSummary]) -> CodeGraph:
-        """Return the graph of these modules and some others, which the present ones do not use."""
-        more = CodeGraph(self.sources.with_modules(known))
-        more._is_out, more._nodes, more._modules = dict(self._is_out), dict(self._nodes), dict(self._modules)
-        return more
-
-    def reach_of(self, paths: Iterable[str], *, with_annotations: bool = False) -> Reach:
-        """Return some definitions or modules and everything that they use.
+    def reach_of(self, paths: Iterable[str]) -> Reach:
+        """Return some definitions or modules, with the types in their annotations, and everything that they use.
 
         Args:
             paths: `package.module:name`, or `package.module:` for a whole module.
-            with_annotations: whether types in their annotations count too, as the kinds in those of a stage do.
         """
         libraries: set[str] = set()
         pending: set[str] = set()
         for path in paths:
-            targets = self._targets(path, libraries)
-            pending.update(targets)
-            for target in targets if with_annotations else ():
-                pending.update(self._annotations(target, libraries))
+            module, _, name = path.partition(":")
+            pending |= self._targets(module, [name] if name else [], libraries)
+            if (found := self._module(module)) is not None:
+                for own in [name] if name else found.statements:
+                    one = found.definition(own)
+                    pending.update(*(self._refer(module, one, use, libraries) for use in one.annotations))
         reached: dict[str, str] = {}
         while pending:
             name = pending.pop()
             if name not in reached:
-                node = self._node(name)
-                reached[name] = node.digest
-                libraries |= node.libraries
-                pending.update(node.targets - reached.keys())
+                if name not in self._nodes:
+                    self._nodes[name] = self._node(*name.split(":"))
+                reached[name], targets, used = self._nodes[name]
+                libraries |= used
+                pending |= targets - reached.keys()
         reached = {name: reached[name] for name in sorted(reached) if reached[name]}
-        digest = digest_from_value([f"{name} {digest}" for name, digest in reached.items()])
-        return Reach(digest, reached, frozenset(libraries))
+        return Reach(digest_from_value(reached), reached, frozenset(libraries))
 
-    def _node(self, name: str) -> _Node:
-        if name not in self._nodes:
-            module, _, what = name.partition(":")
-            summary = self.sources.summary(module)
-            assert summary is not None, name
-            if what == _IMPORT:
-                self._nodes[name] = self._import_node(module, summary)
-            elif what == _WHOLE:
-                self._nodes[name] = _Node("", {f"{module}:{one}" for one in (_IMPORT, *summary.definitions)})
-            else:
-                self._nodes[name] = self._definition_node(module, summary, summary.definitions[what])
-        return self._nodes[name]
-
-    def _definition_node(self, module: str, summary: ModuleSummary, definition: Definition) -> _Node:
-        node = _Node("", {f"{module}:{_IMPORT}"})
-        edges: list[list[str]] = []
-        for reference in definition.uses:
-            path = _absolute(reference, module, summary)
-            if path:
-                targets = self._targets(path, node.libraries)
-                node.targets.update(targets)
-                edges.append([reference, *(sorted(targets) or [path])])
-        for path in definition.loads:
-            node.targets.update(self._imports(path))
+    def _node(self, module: str, what: str) -> tuple[str, set[str], set[str]]:
+        """Return the digest of a node, the nodes that it uses, and the libraries."""
+        found = self._module(module)
+        assert found is not None, module
+        if what == _WHOLE:
+            return "", {f"{module}:{name}" for name in (_IMPORT, *found.statements)}, set()
+        libraries: set[str] = set()
+        definition = found.definition(what)
+        uses = {use: self._refer(module, definition, use, libraries) for use in sorted(definition.uses)}
+        targets = {f"{module}:{_IMPORT}"}.union(*uses.values())
+        targets = targets.union(*map(self._imports, definition.loads))
+        if what == _IMPORT:
+            libraries.clear()  # what a module only loads does not depend on the version of a library
+            targets.update(*map(self._imports, (module, *found.loads)))
+            for star in found.stars:
+                targets |= self._targets(star, [], libraries)
         # Include what names refer to: another import of the same name changes what is called.
-        node.digest = digest_from_value([definition.digest, edges])
-        return node
+        edges = {use: sorted(found_by) or self._paths(module, definition, use) for use, found_by in uses.items()}
+        return digest_from_value([definition.text, edges]) if definition.text else "", targets, libraries
 
-    def _import_node(self, module: str, summary: ModuleSummary) -> _Node:
-        """Return the node for the import of a module: the statements that it executes, and its own imports."""
-        node = _Node("")
-        if summary.effects is not None:
-            node = self._definition_node(module, summary, summary.effects)
-            node.libraries.clear()  # what a module only loads does not depend on the version of a library
-        for path in (module, *summary.loads):
-            node.targets.update(self._imports(path))
-        return node
+    def _refer(self, module: str, definition: _Definition, use: str, libraries: set[str]) -> set[str]:
+        """Return the nodes to which a dotted name in a definition refers; none for builtins and unknown names."""
+        if use.startswith(_AT_RUN_TIME):
+            return self._targets(use[1:], [], libraries)
+        found = self._module(module)
+        assert found is not None, module
+        name, *further = use.split(".")
+        targets: set[str] = set()
+        for home, inner in definition.bindings.get(name, ()):
+            targets |= self._targets(home, [*filter(None, [inner]), *further], libraries)
+        if name in found.statements or name in found.effect_names or name in found.bindings:
+            targets |= self._targets(module, [name, *further], libraries)
+        return targets
 
-    def _imports(self, path: str) -> list[str]:
-        """Return the import nodes of the modules on a dotted path."""
-        modules = self._modules_on(path) if path in self.sources else ()
-        return [f"{module}:{_IMPORT}" for module in modules if not self._is_left_out(module)]
+    def _paths(self, module: str, definition: _Definition, use: str) -> list[str]:
+        """Return the paths of a name that leads out of the packages."""
+        found = self._module(module)
+        assert found is not None, module
+        name, dot, rest = use.partition(".")
+        own = [found.bindings[name]] if name in found.bindings else []
+        return sorted(f"{home}.{inner}{dot}{rest}" for home, inner in {*definition.bindings.get(name, ()), *own})
 
-    def _annotations(self, target: str, libraries: set[str]) -> set[str]:
-        module, _, name = target.partition(":")
-        summary = self.sources.summary(module)
-        if summary is None:
-            return set()
-        found = [one for own, one in summary.definitions.items() if name in (own, _WHOLE)]
-        paths = (_absolute(reference, module, summary) for one in found for reference in one.annotations)
-        return {one for path in paths if path for one in self._targets(path, libraries)}
-
-    def _modules_on(self, path: str) -> tuple[str, ...]:
-        """Return the modules on a dotted path, from the top down."""
-        if path not in self._modules:
-            above, _, _ = path.rpartition(".")
-            modules = self._modules_on(above) if above else ()
-            is_next = (modules[-1] if modules else "") == above
-            found = is_next and self.sources.summary(path) is not None
-            self._modules[path] = (*modules, path) if found else modules
-        return self._modules[path]
-
-    def _targets(self, path: str, libraries: set[str], depth: int = 0) -> tuple[str, ...]:
-        """Return the nodes that a path refers to; if it leads out of the packages, add the library instead."""
-        top = path.replace(":", ".").partition(".")[0]
-        if top not in self.sources:
-            if top and top not in sys.stdlib_module_names:
-                libraries.add(top)
-            return ()
-        module, _, rest = path.partition(":") if ":" in path else path.partition(".")
-        while (summary := self.sources.summary(module)) is not None:
+    def _targets(self, module: str, names: list[str], libraries: set[str]) -> set[str]:
+        """Return the nodes of a name in a module; if it leads out of the packages, add the library instead."""
+        seen = set()
+        top = module.partition(".")[0]
+        while top in self._tops:
+            found = self._module(module)
+            if found is None:
+                libraries.add(top)  # such as compiled modules
+                return set()
             if self._is_left_out(module):
-                return ()
-            if not rest:
-                return (f"{module}:{_WHOLE}",)
-            name, _, further = rest.partition(".")
-            if name in summary.definitions:
-                return (f"{module}:{name}",)
-            bound = summary.bindings.get(name, "")
-            if bound and bound != f"{module}:{name}" and depth < _MAX_DEPTH:
-                return self._targets(_joined(bound, further), libraries, depth + 1)
-            if self.sources.summary(f"{module}.{name}") is None:
-                return self._targets_of_unbound(module, summary, name, libraries=libraries, depth=depth)
-            module, rest = f"{module}.{name}", further
-        libraries.add(top)  # such as compiled modules
-        return ()
+                return set()
+            if not names:
+                return {f"{module}:{_WHOLE}"}
+            name, *further = names
+            bound = found.bindings.get(name)
+            if name in found.statements:
+                return {f"{module}:{name}"}
+            if bound is not None and bound != (module, name) and (module, name) not in seen:
+                seen.add((module, name))
+                module, names = bound[0], [*filter(None, [bound[1]]), *further]
+                top = module.partition(".")[0]
+            elif name in found.effect_names:
+                return {f"{module}:{_IMPORT}"}
+            elif self._module(f"{module}.{name}") is None:
+                return {f"{module}:{_WHOLE}"}  # it may come by a star, or at run time
+            else:
+                module, names = f"{module}.{name}", further
+        if top and top not in sys.stdlib_module_names:
+            libraries.add(top)
+        return set()
 
-    def _targets_of_unbound(
-        self, module: str, summary: ModuleSummary, name: str, *, libraries: set[str], depth: int
-    ) -> tuple[str, ...]:
-        """Return the nodes of a name that a module neither defines nor imports explicitly."""
-        if name in summary.effect_names:
-            return (f"{module}:{_IMPORT}",)
-        for star in summary.stars:
-            if star not in self.sources:
-                libraries.add(star.partition(".")[0])
-                continue
-            other = self.sources.summary(star)
-            known = other is not None and (name in other.definitions or name in other.bindings or other.stars)
-            if known and depth < _MAX_DEPTH:
-                return self._targets(f"{star}:{name}", libraries, depth + 1)
-        return () if name in vars(builtins) else (f"{module}:{_WHOLE}",)
+    def _imports(self, path: str) -> set[str]:
+        """Return the import nodes of the modules on a dotted path."""
+        parts = path.split(".")
+        above = [".".join(parts[: depth + 1]) for depth in range(len(parts))] if parts[0] in self._tops else []
+        return {f"{one}:{_IMPORT}" for one in above if self._module(one) is not None and not self._is_left_out(one)}
 
     def _is_left_out(self, module: str) -> bool:
         if module not in self._is_out:
@@ -204,18 +244,186 @@ class CodeGraph:
             self._is_out[module] = bool(above) and self._is_left_out(above)
         return self._is_out[module]
 
+    def _module(self, module: str) -> _Module | None:
+        """Return what a module holds, or None if it does not exist or cannot be read."""
+        if module not in self._modules:
+            text, is_package = self._texts.get(module) or self._read(module)
+            package = module if is_package else module.rpartition(".")[0]
+            try:
+                self._modules[module] = None if text is None else _analysed(text, package, frozenset(self._tops))
+            except (SyntaxError, ValueError):
+                self._modules[module] = None
+        return self._modules[module]
 
-def _absolute(reference: str, module: str, summary: ModuleSummary) -> str:
-    """Return the path of a reference; empty for builtins."""
-    if reference.startswith(ABSOLUTE):
-        return reference[len(ABSOLUTE) :]
-    root, _, rest = reference.partition(".")
-    if root in summary.definitions or root in summary.effect_names:
-        return f"{module}:{reference}"
-    if root in summary.bindings:
-        return _joined(summary.bindings[root], rest)
-    return f"{module}:{reference}" if summary.stars else ""
+    def _read(self, module: str) -> tuple[bytes | None, bool]:
+        top, *below = module.split(".")
+        root = self._packages.get(top)
+        if root is None:
+            return None, False
+        folder = root.joinpath(*below)
+        file = folder.with_name(f"{folder.name}.py")
+        places = [folder / "__init__.py", *([file] if below else [])] if root.suffix != ".py" else [root][len(below) :]
+        path = next(filter(is_file, places), None)
+        try:
+            return (None if path is None else path.read_bytes()), path == folder / "__init__.py"
+        except OSError:
+            return None, False
 
 
-def _joined(path: str, rest: str) -> str:
-    return f"{path}.{rest}" if rest else path
+@cache
+def _analysed(text: str | bytes, package: str, followed: frozenset[str]) -> _Module:
+    """Return what a module holds.
+
+    Args:
+        text: the source.
+        package: from which relative imports start.
+        followed: the packages that are followed, whose decorators may register something.
+
+    Raises:
+        SyntaxError: if the text is not Python.
+        ValueError: if it contains a null character.
+    """
+    module = _Module(package)
+    for statement in ast.parse(text).body:
+        names, is_effect = _sorted(statement, module, followed)
+        for name in [*names, *([_IMPORT] if is_effect else [])]:
+            module.statements.setdefault(name, []).append(statement)
+    return module
+
+
+def _definition(statement: ast.stmt, module: _Module) -> _Definition:
+    """Return what a top-level statement means; it is stripped."""
+    found = _Definition()
+    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
+        statement.decorator_list = [
+            one for one in statement.decorator_list if ".".join(_decorator(one, module)) not in _STAGE_DECORATORS
+        ]
+    for node in ast.walk(statement):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.loads.update(_loaded(node, module.package))
+            for name, place in _bound(node, module.package):
+                found.bindings.setdefault(name, set()).add(place)
+        elif isinstance(node, ast.arg | ast.FunctionDef | ast.AsyncFunctionDef):
+            annotation = node.annotation if isinstance(node, ast.arg) else node.returns
+            found.annotations.update(() if annotation is None else _names_of_annotation(annotation))
+    whole = ast.Module([statement], [])
+    strip(whole)
+    found.text = canonical_text(whole) if whole.body else ""
+    found.uses.update(_names_in(whole))
+    return found
+
+
+def _sorted(statement: ast.stmt, module: _Module, followed: frozenset[str]) -> tuple[list[str], bool]:
+    """Return the names that a top-level statement defines, and whether it does more; enter imports into the module."""
+    match statement:
+        case ast.Import() | ast.ImportFrom():
+            _bind(statement, module)
+            return [], False
+        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+            made = [_decorator(one, module) for one in statement.decorator_list]
+            registers = [
+                one
+                for one in made
+                if ".".join(one) not in _STAGE_DECORATORS
+                and one[0].partition(".")[0] in {"", *followed}
+                and one[1].rpartition(".")[2] not in _PURE_DECORATORS
+            ]
+            known = {"", *module.statements, *module.effect_names}  # other names are builtins
+            return [statement.name], any(home or name.partition(".")[0] in known for home, name in registers)
+        case ast.Assign() | ast.AnnAssign() | ast.AugAssign() if names := _assigned_names(statement):
+            return names, False
+        case ast.If(test=ast.Name(id="TYPE_CHECKING") | ast.Attribute(attr="TYPE_CHECKING")):
+            for inner in ast.walk(statement):
+                if isinstance(inner, ast.Import | ast.ImportFrom):
+                    module.bindings |= dict(_bound(inner, module.package))
+            return [], False
+        case ast.Pass() | ast.Expr(value=ast.Constant()):
+            return [], False
+    for inner in ast.walk(statement):
+        if isinstance(inner, ast.Import | ast.ImportFrom):
+            _bind(inner, module)
+        elif isinstance(inner, ast.Name) and isinstance(inner.ctx, ast.Store):
+            module.effect_names.add(inner.id)
+        elif isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            module.effect_names.add(inner.name)
+    return [], True
+
+
+def _bind(statement: ast.Import | ast.ImportFrom, module: _Module) -> None:
+    for name, (home, inner) in _bound(statement, module.package):
+        if inner == "*":
+            module.stars.append(home)
+        else:
+            module.bindings[name] = home, inner
+    module.loads.extend(_loaded(statement, module.package))
+
+
+def _loaded(statement: ast.Import | ast.ImportFrom, package: str) -> Iterator[str]:
+    """Yield the dotted paths that an import imports; the last part may be a name in a module."""
+    if isinstance(statement, ast.Import):
+        yield from (alias.name for alias in statement.names)
+    else:
+        yield from (f"{home}.{inner}".removesuffix(".*") for _, (home, inner) in _bound(statement, package))
+
+
+def _bound(statement: ast.Import | ast.ImportFrom, package: str) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield the names that an import binds, each with the module, and the name in it."""
+    for alias in statement.names:
+        if isinstance(statement, ast.ImportFrom):
+            base = statement.module or ""
+            if statement.level:
+                parts = package.split(".")
+                base = ".".join([*parts[: len(parts) - statement.level + 1], *filter(None, [base])])
+            yield alias.asname or alias.name, (base, alias.name)
+        else:
+            top = alias.name.partition(".")[0]
+            yield (alias.asname or top), (alias.name if alias.asname else top, "")
+
+
+def _decorator(decorator: ast.expr, module: _Module) -> tuple[str, str]:
+    """Return the module and the name of a decorator, resolved with the imports of the module."""
+    chain = _dotted(decorator.func if isinstance(decorator, ast.Call) else decorator)
+    root, _, rest = chain.partition(".")
+    home, name = module.bindings.get(root, ("", root))
+    return home, ".".join(filter(None, [name, rest]))
+
+
+def _assigned_names(statement: ast.Assign | ast.AnnAssign | ast.AugAssign) -> list[str]:
+    """Return the names that an assignment defines; none if it also sets an attribute or an element."""
+    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    inner = [node for target in targets for node in ast.walk(target)]
+    if any(isinstance(node, ast.Attribute | ast.Subscript) for node in inner):
+        return []
+    return [node.id for node in inner if isinstance(node, ast.Name)]
+
+
+def _names_in(node: ast.AST) -> Iterator[str]:
+    """Yield the dotted names in code, and `_AT_RUN_TIME` with a path for an import at run time."""
+    if isinstance(node, ast.expr) and (chain := _dotted(node)):
+        yield chain
+        return
+    if isinstance(node, ast.Call) and _dotted(node.func).rpartition(".")[2] in _DYNAMIC_IMPORTS and node.args:
+        if isinstance(name := node.args[0], ast.Constant) and isinstance(name.value, str):
+            yield f"{_AT_RUN_TIME}{name.value}"
+    elif isinstance(node, ast.AnnAssign):
+        yield from _names_of_annotation(node.annotation)
+    for child in ast.iter_child_nodes(node):
+        yield from _names_in(child)
+
+
+def _names_of_annotation(node: ast.expr) -> Iterator[str]:
+    """Yield the dotted names in an annotation, also in strings."""
+    yield from _names_in(node)
+    for inner in ast.walk(node):
+        if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
+            with suppress(SyntaxError):  # not an expression, as in Annotated[int, "of the grid"]
+                yield from _names_in(ast.parse(inner.value, mode="eval"))
+
+
+def _dotted(node: ast.expr) -> str:
+    """Return `a.b.c` for an expression of this form, otherwise an empty string."""
+    names: list[str] = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return ".".join([node.id, *reversed(names)]) if isinstance(node, ast.Name) else ""

@@ -7,10 +7,46 @@ import os
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.processes import ProcessExecutor
-from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads, share_cores
+
+
+class SerialExecutor:
+    """Computes each job when `wait` is called."""
+
+    name = "serial"
+    capacity = 1
+    enforces_timeouts = False
+
+    def __init__(self, store: Store, *, threads: int = 0) -> None:
+        self.threads = self.cores = threads or available_threads()
+        self._store = store
+        self._jobs: list[Job] = []
+
+    def submit(self, job: Job) -> None:
+        """Keep a job for `wait`."""
+        self._jobs.append(job)
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        """Compute the submitted job; the timeout does not limit its time."""
+        if not self._jobs or timeout_s == 0:
+            return None
+        job = self._jobs.pop(0)
+        return job.number, unit_outcome(job.unit, self._store, threads=job.threads, log=job.log)
+
+    def free_memory_bytes(self) -> int:
+        """Return the free memory of this host."""
+        return free_memory_bytes()
+
+    def cancel(self) -> None:
+        """Forget the job."""
+        self._jobs.clear()
+
+    def close(self) -> None:
+        """Do nothing."""
+
 
 VARIABLE = "PANO_MVS_EXECUTOR"
 _WORKER_BYTES = 3_000_000_000

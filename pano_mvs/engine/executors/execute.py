@@ -1,27 +1,48 @@
-"""Run one unit: load its inputs, call the stage, store the result."""
+"""Compute one unit in this process: load its inputs, call the stage, store the result, or state why it failed.
+
+All executors end in `unit_outcome`.
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable
+import traceback
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from pano_mvs.core import kernel_cache
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import ChangedFileError, ContractError, PluginError
+from pano_mvs.core.errors import (
+    ChangedFileError,
+    ContractError,
+    InputError,
+    PanoMvsError,
+    PluginError,
+    RunStoppedError,
+    StoreError,
+    UsageError,
+)
 from pano_mvs.core.process_state import Changes, ProcessState, has_plugins
+from pano_mvs.core.text import shortened
+from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
-from pano_mvs.engine.executors.lazy_mapping import LazyMapping
+from pano_mvs.engine.executors.capture import captured
+from pano_mvs.engine.executors.protocol import JobOutcome
+from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Cardinality, Names, Port
+from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.stage import Cardinality, Names, Port
 from pano_mvs.scene import Axis
 from pano_mvs.scene.pairs_and_views import pair_from_name
+from pano_mvs.scene.record import changed_text, vanished_text
 
 # A process may open only about a thousand files, and a stage may read several kinds.
 _MAX_OPEN_FILES = 128
@@ -67,7 +88,6 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         context.rejected,
         value.doubted(),
         max(0.0, time.perf_counter() - started - (kernel_cache.compilation_time.seconds - compiling_s)),
-        checked=True,
     )
     store.put(record)
     return record
@@ -146,3 +166,153 @@ def _check_kind(value: object, unit: Unit) -> None:
             f"stage {spec.name} ({spec.origin}) returned {type(value).__name__} for {unit.label}, "
             f"it declares {spec.output.kind_name()}"
         )
+
+
+Key = TypeVar("Key")
+Ref = TypeVar("Ref")
+Value = TypeVar("Value")
+
+
+class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
+    """A mapping that loads values on access and keeps only the latest ones, so that not all need fit into memory.
+
+    Iteration over keys, length and membership load nothing.
+
+    Args:
+        refs: key to the reference that `load` takes, in the order of iteration.
+        load: reads one value; its exceptions are raised by the access.
+        max_kept: number of values to keep.
+    """
+
+    def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value], *, max_kept: int = 64) -> None:
+        """Create the mapping; nothing is loaded yet."""
+        self._max_kept = max_kept
+        self._refs = refs
+        self._load = load
+        self._latest: OrderedDict[Key, Value] = OrderedDict()
+
+    def __getitem__(self, key: Key) -> Value:
+        """Return a value, loading it unless it is among the latest ones."""
+        if key in self._latest:
+            self._latest.move_to_end(key)
+            return self._latest[key]
+        value = self._latest[key] = self._load(self._refs[key])
+        if len(self._latest) > self._max_kept:
+            self._latest.popitem(last=False)
+        return value
+
+    def __contains__(self, key: object) -> bool:
+        """Return whether a key exists, without loading its value."""
+        return key in self._refs
+
+    def __iter__(self) -> Iterator[Key]:
+        """Iterate over the keys."""
+        return iter(self._refs)
+
+    def __len__(self) -> int:
+        """Return the number of items."""
+        return len(self._refs)
+
+
+def changed_items(unit: Unit, store: Store) -> dict[str, str]:
+    """Return the files of a capture that a unit reads and that have changed since they were listed, with the reasons.
+
+    Files whose size, time stamps and inode are unchanged are not read.
+    """
+    listed = {store.blobs.path(ref): ref.digest for ref in unit.input_blobs() if ref.external}
+    if unit.source is not None:
+        listed |= {unit.source.files[role]: digest for role, digest in unit.source.digests.items()}
+    found = {path: _reason(path, digest, store) for path, digest in listed.items()}
+    return {str(path): reason for path, reason in found.items() if reason}
+
+
+def changed_settings(unit: Unit, store: Store) -> list[str]:
+    """Return a reason for each file in a unit's settings that has changed since the key was made."""
+    digests = unit.identity["params"]
+    pairs = [
+        pair
+        for name, paths in key_fields(unit.entry.params)[1].items()
+        for pair in zip(paths, digests[name], strict=True)
+    ]
+    return [reason for path, digest in pairs if (reason := _reason(path, digest, store))]
+
+
+def _reason(path: Path, digest: str, store: Store) -> str:
+    try:
+        if store.stat_cache.digest(path) == digest:
+            return ""
+        store.stat_cache.forget(path)  # its entry may be damaged
+        return "" if store.stat_cache.digest(path) == digest else changed_text(path)
+    except InputError:
+        return vanished_text(path)
+
+
+_MAX_TRACE_CHARACTERS = 20_000
+
+
+def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
+    """Return what went wrong, and the traceback if the code failed.
+
+    The messages of our own errors are used as they are; for other errors the line that raised them is added.
+    """
+    notes = shortened("".join(f" ({note})" for note in getattr(error, "__notes__", [])))
+    if isinstance(error, PanoMvsError):
+        return f"{shortened(str(error))}{notes}", ""
+    frames = traceback.extract_tb(error.__traceback__)
+    # For a plugin, name the line in the plugin; otherwise the line that raised the error.
+    own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
+    if own and isinstance(error, ModuleNotFoundError):
+        notes += " (a plugin imports the files beside it at its top, not inside functions)"
+    frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
+    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
+    return cause, shortened("".join(traceback.format_exception(error)), _MAX_TRACE_CHARACTERS)
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return shortened(str(error))
+    except Exception as second:  # a plugin's exception may fail to make its text
+        return f"(its message cannot be shown: {type(second).__name__})"
+
+
+def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
+    """Run a unit with its output in `log`, store its result, and return how it ended."""
+    started = time.perf_counter()
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.touch()
+    except OSError as error:
+        return JobOutcome("stopped", cause=str(store.cannot_write(error)), error="StoreError", exit_code=4)
+    try:
+        with captured(log):
+            bound_threads(threads)
+            record = execute_unit(unit, store, threads=threads)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a unit has also failed if its stage exits, or raises other than Exception
+        return replace(_failed(unit, store, error), seconds=time.perf_counter() - started)
+    return JobOutcome("done", record, seconds=record.seconds)
+
+
+def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
+    if isinstance(error, StoreError | RunStoppedError) and not isinstance(error, DamagedBlobError):
+        kind = StoreError if isinstance(error, StoreError) else RunStoppedError
+        return JobOutcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
+    if isinstance(error, ChangedStateError):
+        return JobOutcome("failed", cause=str(error), died=True)  # the process cannot be used any more
+    changed = changed_items(unit, store)
+    if isinstance(error, ChangedFileError) and error.path is not None:
+        store.stat_cache.forget(error.path)
+        changed.setdefault(str(error.path), str(error))  # its content may have been restored
+    if changed and unit.source is None:
+        return JobOutcome("changed", cause="\n".join(changed.values()), changed=changed)
+    if reasons := [*changed.values(), *changed_settings(unit, store)]:
+        return JobOutcome("failed", cause=reasons[0])
+    if isinstance(error, DamagedBlobError):
+        return JobOutcome("damaged", cause=str(error))
+    gone = next((ref for ref in unit.input_blobs() if not store.blobs.exists(ref)), None)
+    if gone is not None:  # garbage collection deleted it before the stage read it
+        return JobOutcome("damaged", cause=str(store.blobs.discard(gone, "is missing")))
+    cause, trace = cause_of(unit, error)
+    exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
+    return JobOutcome("failed", cause=cause, trace=trace, exit_code=exit_code)

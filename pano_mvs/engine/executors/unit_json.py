@@ -18,8 +18,7 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.stages.params import Params
-from pano_mvs.engine.stages.ports import Cardinality
-from pano_mvs.engine.stages.stage import SourceItem, StageSpec
+from pano_mvs.engine.stages.stage import Cardinality, SourceItem, StageSpec
 from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry

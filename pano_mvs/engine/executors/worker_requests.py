@@ -15,9 +15,9 @@ from pano_mvs.core.paths import is_inside
 from pano_mvs.core.process_state import ProcessState, has_plugins
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
+from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.unit_json import unit_from_json
-from pano_mvs.engine.executors.unit_outcome import unit_outcome
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 

@@ -1,18 +1,179 @@
-"""Plan a run: which units are cached, which are computed and why, and which are decided later."""
+"""Plan a run by its options: which units are cached, which are computed and why, and which are decided later."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
-from pano_mvs.engine.cache.store import Store, UnitRecord
-from pano_mvs.engine.planning.reasons import reason_to_run
-from pano_mvs.engine.planning.resolve import resolve
-from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
-from pano_mvs.engine.planning.source_listing import SourceListing
-from pano_mvs.engine.planning.units import StageState, Unit
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.planning.resolve import SourceListing, resolve
+from pano_mvs.engine.planning.units import OF_CODE, StageState, Unit
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """The options of one run.
+
+    Attributes:
+        until: the run ends after these stages; empty to run all.
+        only: units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
+        refresh: stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached.
+        accept_code: reuse results that differ from what is needed only in the code or the libraries that computed them.
+        keep_going: go on after a failed unit even if its stage says `on_error: stop`.
+        isolate: compute each unit of a plugin's stage in a process of its own.
+    """
+
+    until: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
+    refresh: tuple[str, ...] = ()
+    accept_code: bool = False
+    keep_going: bool = False
+    isolate: bool = False
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether the run is limited to some stages or units."""
+        return bool(self.until or self.only)
+
+    def applied_to(self, workflow: Workflow, graph: Graph) -> tuple[Workflow, Graph]:
+        """Return the workflow and the graph with the options applied.
+
+        Raises:
+            UsageError: if an option names a stage that the workflow does not have.
+        """
+        for name in (*self.until, *(_stage(unit) for unit in (*self.only, *self.refresh))):
+            if name not in graph.edges:
+                raise UsageError(f"there is no stage {name!r} in this workflow; it has: {', '.join(graph.order)}")
+        if self.keep_going:
+            stages = {
+                name: dataclasses.replace(entry, policy=entry.policy.model_copy(update={"on_error": "skip"}))
+                for name, entry in workflow.stages.items()
+            }
+            workflow = dataclasses.replace(workflow, stages=stages)
+        ends = {*self.until, *(_stage(unit) for unit in self.only)}
+        return workflow, graph.limited_to(ends, _items_by_stage(self.only)) if ends else graph
+
+    def refreshes(self, unit: Unit) -> bool:
+        """Return whether a unit is computed again even if it is cached."""
+        return unit.entry.name in self.refresh or f"{unit.entry.name}:{unit.item}" in self.refresh
+
+    def accepted(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
+        """Return what `acceptable` returns, and store it under the new key, so that the next run finds it."""
+        record = self.acceptable(unit, last_key, store)
+        if record is not None:
+            store.put(record)
+        return record
+
+    def acceptable(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
+        """Return the record of the last run for a unit if only code or libraries changed and `accept_code` is set."""
+        last = store.find(last_key) if self.accept_code and last_key else None
+        if last is None or not only_the_code_differs(last.identity, unit.identity):
+            return None
+        return dataclasses.replace(last, key=unit.key, identity=unit.identity)
+
+
+DEFAULT_OPTIONS = RunOptions()
+
+
+def _stage(unit: str) -> str:
+    return unit.partition(":")[0]
+
+
+def _items_by_stage(units: Iterable[str]) -> Mapping[str, frozenset[str]]:
+    found: dict[str, set[str]] = {}
+    for unit in units:
+        stage, _, item = unit.partition(":")
+        found.setdefault(stage, set()).add(item)
+    return {stage: frozenset(items) for stage, items in found.items() if "" not in items}
+
+
+_SHOWN = 3
+
+
+def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
+    """Return why a unit is not in the cache.
+
+    Args:
+        unit: the unit.
+        last_key: its key in the latest run of this workflow; None if it was not part of that run.
+        store: the cache, which may still have the record of that run.
+    """
+    if last_key is None:
+        return "new"
+    if last_key == unit.key:
+        return "its cached result is missing or damaged, or it did not finish"
+    last = store.read_record(last_key)
+    if last is None:
+        return "changed (the record of the last run is missing)"
+    before, now = last.identity, unit.identity
+    if before.get("schema") != now["schema"]:
+        return "this version makes its key differently"
+    differences = [
+        *_differences("param", before.get("params", {}), now["params"]),
+        *_inputs(unit, before.get("inputs", {}), now["inputs"]),
+    ]
+    if before.get("stage") != now["stage"]:
+        differences.insert(0, f"stage {before.get('stage')} → {now['stage']}")
+    elif before.get("version") != now["version"]:
+        differences.insert(0, f"version of {now['stage']} {before.get('version')} → {now['version']}")
+    if before.get("code") != now["code"]:
+        file = f" ({unit.entry.spec.origin.rpartition(':')[0]})" if unit.entry.spec.code_digest else ""
+        differences.insert(0, f"code of {now['stage']} changed{file}")
+    differences.extend(_upgrades(before.get("libraries"), now["libraries"]))
+    differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
+    return "; ".join(differences) or "this version makes its key differently"
+
+
+def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Return whether two identities differ, and only in the code or the libraries."""
+    parts = {*before, *now} - OF_CODE
+    return before != now and all(name in before and name in now and before[name] == now[name] for name in parts)
+
+
+def _upgrades(before: object, now: Mapping[str, str]) -> list[str]:
+    """Return the changed versions of the libraries that both identities name."""
+    if not isinstance(before, Mapping):
+        return []
+    return [f"{name} {before[name]} → {now[name]}" for name in sorted({*before} & {*now}) if before[name] != now[name]]
+
+
+def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{what} {name} {before.get(name)!r} → {now.get(name)!r}"
+        for name in sorted({*before, *now})
+        if before.get(name) != now.get(name)
+    ]
+
+
+def _inputs(unit: Unit, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    changed: list[str] = []
+    if unit.source is not None and before.get("name") != now["name"]:
+        return [f"renamed from {before.get('name')}"]
+    for port in sorted({*before, *now}):
+        old, new = before.get(port), now.get(port)
+        if old == new:
+            continue
+        if unit.source is not None:
+            changed.extend(f"input {path.name}" for path in unit.source.files.values())
+        else:
+            changed.append(f"input {port}: {_changed_items(unit, port, old=old, new=new)}")
+    return changed
+
+
+def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
+    value = unit.inputs.get(port)
+    if value is None or isinstance(value, ItemRef):
+        return unit.item or "changed"
+    known = {str(entry) for entry in old or []}
+    names = [name for name, entry in zip(value, new, strict=True) if str(entry) not in known]
+    if not names:
+        return "fewer items" if len(new) < len(old or []) else "another order"
+    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 
 
 @dataclass(slots=True)

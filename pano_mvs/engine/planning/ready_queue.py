@@ -14,11 +14,9 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.planning.resolve import Resolver, resolve_source
-from pano_mvs.engine.planning.source_listing import SourceListing
+from pano_mvs.engine.planning.resolve import Resolver, SourceListing, resolve_source
 from pano_mvs.engine.planning.units import WHOLE, StageState, Unit
-from pano_mvs.engine.stages.ports import Cardinality
-from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality
 from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 

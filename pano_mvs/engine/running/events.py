@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -134,8 +134,8 @@ class RunResult:
         return sum(stage.cached for stage in self.stages)
 
 
-class Observer(Protocol):
-    """Is notified of what a run does, as the progress bars of the command line are.
+class Observer:
+    """Is notified of what a run does, as the progress bars of the command line are; this one ignores everything.
 
     Stages overlap. If a damaged file is found in the cache, the run makes another pass and its stages start again.
     """
@@ -160,28 +160,3 @@ class Observer(Protocol):
 
     def warn(self, text: str) -> None:
         """There is a warning for the user; the run goes on."""
-
-
-class SilentObserver:
-    """An observer that ignores all events."""
-
-    def stage_started(self, name: str, units: int) -> None:
-        """Do nothing."""
-
-    def unit_started(self, name: str, item: str) -> None:
-        """Do nothing."""
-
-    def unit_failed(self, failure: Failure) -> None:
-        """Do nothing."""
-
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        """Do nothing."""
-
-    def stage_finished(self, summary: StageSummary) -> None:
-        """Do nothing."""
-
-    def waiting(self) -> None:
-        """Do nothing."""
-
-    def warn(self, text: str) -> None:
-        """Do nothing."""

@@ -27,17 +27,16 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.maintenance import pack
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import Sample
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.forecast import settings_digest
+from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.planning.ready_queue import ReadyQueue
-from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
-from pano_mvs.engine.planning.source_listing import SourceListing
+from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
-from pano_mvs.engine.running.events import Failure, Observer, RunResult, SilentObserver, consequence_of
-from pano_mvs.engine.running.file_claims import NameClashError
-from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.engine.running.events import Failure, Observer, RunResult, consequence_of
+from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
@@ -100,7 +99,7 @@ class Run:
         self.options = options
         self.store = store
         self.out = out
-        self.observer = observer or SilentObserver()
+        self.observer = observer or Observer()
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
         if options.isolate and not self.executor.enforces_timeouts:

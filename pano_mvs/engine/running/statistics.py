@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from struct import Struct
 from types import MappingProxyType
 
 from pano_mvs.core.errors import InputError, RunStoppedError
@@ -14,7 +15,6 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
-from pano_mvs.engine.running.packed_figures import PackedFigures
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -226,3 +226,38 @@ def _check_thresholds(entry: StageEntry, summary: StageSummary) -> None:
             raise RunStoppedError(
                 f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, but `gate` requires {objection}"
             )
+
+
+_positions: dict[tuple[str, ...], tuple[dict[str, int], Struct]] = {}
+
+
+class PackedFigures(Mapping[str, float]):
+    """Figures by name; equal to a dict with the same entries."""
+
+    __slots__ = ("_form", "_packed")
+
+    def __init__(self, figures: Mapping[str, float]) -> None:
+        """Pack figures; those with the same names share the names."""
+        names = tuple(figures)
+        if names not in _positions:
+            _positions[names] = {name: idx for idx, name in enumerate(names)}, Struct(f"{len(names)}d")
+        self._form = _positions[names]
+        self._packed = self._form[1].pack(*figures.values())
+
+    def __getitem__(self, name: str) -> float:
+        """Return one figure."""
+        positions, layout = self._form
+        figures: tuple[float, ...] = layout.unpack(self._packed)
+        return figures[positions[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self._form[0])
+
+    def __len__(self) -> int:
+        """Return the number of figures."""
+        return len(self._form[0])
+
+    def __repr__(self) -> str:
+        """Return the figures as a dict prints them."""
+        return repr(dict(self))

@@ -4,18 +4,83 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params
-from pano_mvs.engine.stages.ports import Cardinality, Port, port_from_annotation
 from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
+
+
+class Cardinality(StrEnum):
+    """The number of items of a kind that one unit of work reads."""
+
+    ONE = "One"
+    EACH = "Each"
+    NEAR = "Near"
+    ALL = "All"
+    NAMES = "Names"
+
+
+K = TypeVar("K")
+
+One: TypeAlias = Annotated[K, Cardinality.ONE]
+Each: TypeAlias = Annotated[K, Cardinality.EACH]
+Near: TypeAlias = Annotated[Sequence[K], Cardinality.NEAR]
+All: TypeAlias = Annotated[Mapping[Any, K], Cardinality.ALL]
+"""By image name; by (first, second) image names for kinds of the pair axis."""
+
+
+class Names(tuple[str, ...], Generic[K]):
+    """The names of all items of a kind, in the capture's order."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """One typed input of a stage."""
+
+    name: str
+    kind: type[Record]
+    cardinality: Cardinality
+    optional: bool = False
+
+    def __str__(self) -> str:
+        """Return the port as it is annotated in code."""
+        return f"{self.name}: {self.cardinality}[{self.kind.kind_name()}]{' | None' if self.optional else ''}"
+
+
+def port_from_annotation(name: str, annotation: Any) -> Port | None:
+    """Return the port that an annotation declares, or None if it does not declare one."""
+    optional = False
+    if get_origin(annotation) in (Union, types.UnionType):
+        inner = [part for part in get_args(annotation) if part is not type(None)]
+        if len(inner) != 1:
+            return None
+        annotation, optional = inner[0], True
+    if get_origin(annotation) is Names:
+        (kind,) = get_args(annotation)
+        return Port(name, kind, Cardinality.NAMES, optional)
+    if get_origin(annotation) is not Annotated:
+        return None
+    value_type, *marks = get_args(annotation)
+    cardinality = next((mark for mark in marks if isinstance(mark, Cardinality)), None)
+    if cardinality is None:
+        return None
+    if cardinality in (Cardinality.NEAR, Cardinality.ALL):
+        value_type = get_args(value_type)[-1]
+    if not (isinstance(value_type, type) and issubclass(value_type, Record)):
+        return None
+    return Port(name, value_type, cardinality, optional)
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _ATTRIBUTE = "__pano_mvs_stage__"

@@ -8,8 +8,7 @@ from difflib import get_close_matches
 from graphlib import CycleError, TopologicalSorter
 
 from pano_mvs.core.errors import WorkflowError
-from pano_mvs.engine.stages.ports import Cardinality, Port
-from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
 

@@ -13,9 +13,9 @@ from unittest.mock import patch
 from pano_mvs.cli.app import main
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.execute import execute_unit
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 
 STOP_VARIABLE = "SIMULATED_STOP_AFTER"
 """After so many units the run is interrupted."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import Cardinality
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Features, Panorama, Poses, TwoView
 from pano_mvs.session.session import open_session

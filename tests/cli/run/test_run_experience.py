@@ -25,7 +25,6 @@ from tests.engine.conftest import (  # noqa: F401 (toy is a fixture)
 )
 from tests.engine.running.test_resume import (
     BEFORE_MEANS,
-    deliverables,
     hold_means,
     wait_for_means,
 )
@@ -229,16 +228,6 @@ def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:  
     assert "3.txt.log" in out
     assert "thirteen is unlucky" in out
     assert "just before" not in [line.strip() for line in out.splitlines()], "units do not print among our lines"
-
-
-@pytest.mark.slow
-def test_serial_and_processes_leave_the_same_files(toy: Toy) -> None:  # noqa: F811
-    assert finish(start(toy, "--executor", "serial"))[0] == 0
-    first = deliverables(toy)
-    toy.edit("wf.yaml", lambda text: text + "# another\n")
-    toy.folder.joinpath("cache").rename(toy.folder / "old")
-    assert finish(start(toy, "--workers", "2"))[0] == 0
-    assert deliverables(toy) == first
 
 
 @ON_POSIX

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.cli.inspect import text as inspect_text
+from pano_mvs.cli import inspect_command as inspect_text
 from pano_mvs.cli.run import printing
 from pano_mvs.evaluation.ranges import tables as depth_tables
 from pano_mvs.results.figures import figure

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
-from pano_mvs.engine.cache import disk_guard
+from pano_mvs.engine.cache import store as disk_guard
 from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.session.running import MIN_FREE_VARIABLE

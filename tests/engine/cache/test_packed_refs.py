@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable
-
 import pytest
 
-from pano_mvs.engine.cache.blobs import BlobRef
-from pano_mvs.engine.cache.packed_refs import PackedRefs
+from pano_mvs.engine.cache.blobs import BlobRef, PackedRefs
 from pano_mvs.engine.cache.store import ItemRef
 
 PARTS = {
@@ -55,15 +51,3 @@ def test_a_reference_has_what_it_was_made_of() -> None:
     for wrong in ("", "0f", "0F" * 16, "0f" * 17, "none" * 8):
         with pytest.raises(ValueError, match="not a digest"):
             ItemRef("Kind", wrong, PARTS)
-
-
-def test_packed_references_take_a_third_of_the_memory_of_a_dict() -> None:
-    def bytes_of(make: Callable[[dict[str, BlobRef]], object]) -> int:
-        tracemalloc.start()
-        held = [make({name: BlobRef(f"{idx:032x}", 1000 + idx, ".npy") for name in PARTS}) for idx in range(100)]
-        found, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert len(held) == 100
-        return found
-
-    assert 3 * bytes_of(PackedRefs) < bytes_of(dict)

@@ -21,9 +21,8 @@ from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.core.processes import process_place
 from pano_mvs.engine.cache import store as store_module
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
-from pano_mvs.engine.cache.disk_guard import DiskGuard
 from pano_mvs.engine.cache.stat_cache import StatCache
-from pano_mvs.engine.cache.store import MIN_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, DiskGuard, ItemRef, Store, UnitRecord, record_from_bytes
 from pano_mvs.scene import FilePart, Part, Record
 from tests.engine.conftest import settle
 
@@ -48,7 +47,7 @@ class Later(Pair):
 def record_of(store: Store, key: str = KEY) -> UnitRecord:
     first, second = (store.put_value(Pair(np.arange(number), ("a",))) for number in (3, 4))
     metrics, notes, rejected, doubts = {"share": 0.25}, ("a note",), {"b": "blurred"}, {"a": "far"}
-    return UnitRecord(key, {"stage": "s"}, first, {"a": second}, metrics, notes, rejected, doubts, 1.5, True)
+    return UnitRecord(key, {"stage": "s"}, first, {"a": second}, metrics, notes, rejected, doubts, 1.5)
 
 
 def test_a_record_is_found_as_it_was_put_from_any_store_of_the_folder(tmp_path: Path) -> None:
@@ -110,19 +109,16 @@ def signed(value: object) -> bytes:
 
 def test_records_of_earlier_versions_are_read() -> None:
     old = record_json()
-    del old["doubts"], old["checked"]
+    del old["doubts"]
     record = record_from_bytes(signed(old))
     assert record is not None
     assert record.doubts == {}
-    assert record.checked is False
     assert type(record.seconds) is float
 
 
 @pytest.mark.parametrize("checked", [1, "yes", None, False])
-def test_only_a_plain_yes_says_that_files_were_checked(checked: object) -> None:
-    record = record_from_bytes(signed(record_json(checked=checked)))
-    assert record is not None
-    assert record.checked is False
+def test_records_of_versions_that_did_not_check_what_they_read_are_not(checked: object) -> None:
+    assert record_from_bytes(signed(record_json(checked=checked))) is None
 
 
 @pytest.mark.parametrize(

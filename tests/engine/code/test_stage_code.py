@@ -11,23 +11,15 @@ import pytest
 
 import pano_mvs
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.kernel_cache import user_cache_folder
-from pano_mvs.engine.code.libraries import library_versions
 from pano_mvs.engine.code.reach import Reach
-from pano_mvs.engine.code.sources import Sources
-from pano_mvs.engine.code.summary import summarize_module
 from pano_mvs.engine.executors.unit_json import require_same_code
+from pano_mvs.engine.stages import stage_code as stage_code_module
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.engine.stages.stage_code import code_graph, reach_of_function, stage_code
+from pano_mvs.engine.stages.stage_code import code_graph, library_versions, reach_of_function, stage_code
 from tests.engine.code.package_copy import copied_package
 
 PACKAGE = Path(pano_mvs.__file__).parent
 SWEEPS = {"depth.sweep", "poses.scaled_translation", "poses.verify"}
-
-
-@cache
-def sources() -> Sources:
-    return Sources({"pano_mvs": PACKAGE}, user_cache_folder() / "pano-mvs" / "code")
 
 
 @cache
@@ -39,11 +31,8 @@ def functions() -> Mapping[str, tuple[str, str]]:
 
 def reaches(edited: Mapping[str, str] | None = None) -> dict[str, Reach]:
     """Return what each built-in stage reaches in a package in which some modules have other texts."""
-    known = {module: summarize_module(text, module) for module, text in (edited or {}).items()}
-    graph = code_graph(sources().with_modules(known))
-    found = {name: reach_of_function(*place, graph) for name, place in functions().items()}
-    sources().save()
-    return found
+    graph = code_graph({"pano_mvs": PACKAGE}, {module: (text, False) for module, text in (edited or {}).items()})
+    return {name: reach_of_function(*place, graph) for name, place in functions().items()}
 
 
 @cache
@@ -158,7 +147,7 @@ def test_the_key_is_that_of_the_installed_package() -> None:
 
 @pytest.mark.slow
 def test_a_copy_elsewhere_has_the_same_keys(tmp_path: Path) -> None:
-    graph = code_graph(Sources({"pano_mvs": copied_package(tmp_path)}))
+    graph = code_graph({"pano_mvs": copied_package(tmp_path)})
     for name in ("poses.unit_translations", "filters.speckle"):
         assert reach_of_function(*functions()[name], graph) == as_it_is()[name]
 
@@ -179,3 +168,26 @@ def test_a_library_that_is_not_there_and_one_under_another_name() -> None:
     assert library_versions(["cv2", "pydantic", "no_such_module"])["no_such_module"] == "not installed"
     assert set(library_versions(["cv2", "pydantic", "pillow_heif"])) == {"OpenCV"}
     assert library_versions(["ruamel"])["ruamel"][0].isdigit()
+
+
+def test_what_is_known_of_code_is_kept_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_code_module, "user_cache_folder", lambda: tmp_path / "kept")
+    (tmp_path / "alone.py").write_text("def f(): ...\n")
+    calls: list[int] = []
+
+    def known() -> tuple[str, tuple[str, ...]]:
+        stage_code_module._sources_of.cache_clear()
+        return stage_code_module._known(tmp_path / "alone.py", "f", found)
+
+    def found() -> Reach:
+        calls.append(len(calls))
+        return Reach(f"{len(calls)}", {}, frozenset({"numpy"}))
+
+    assert [known(), known()] == [("1", ("numpy",))] * 2
+    (tmp_path / "alone.py").write_text("def f(): return 1\n")
+    assert [known(), known()] == [("2", ("numpy",))] * 2
+    for damage in ("{", "[]", '{"sources": 1}'):
+        next((tmp_path / "kept").rglob("*.json")).write_text(damage)
+        assert known()[0] == str(len(calls))
+    assert len(calls) == 5
+    stage_code_module._sources_of.cache_clear()

@@ -10,7 +10,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
 from pano_mvs.engine.planning.forecast import StageForecast, forecast, makespan, settings_digest
 from pano_mvs.engine.planning.plan import make_plan
-from pano_mvs.engine.planning.source_listing import SourceListing
+from pano_mvs.engine.planning.resolve import SourceListing
 from tests.engine.conftest import Toy, toy
 
 __all__ = ["toy"]

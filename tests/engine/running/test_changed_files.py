@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.digest import digest_from_bytes
-from pano_mvs.engine.cache import stat_cache
-from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.running.events import RunResult, SilentObserver
+from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
 from tests.engine.toy import NUMBERS
@@ -100,7 +94,7 @@ def texts(toy: Toy) -> Toy:
     return toy
 
 
-class Meddler(SilentObserver):
+class Meddler(Observer):
     """Does something once, when a unit has been computed."""
 
     def __init__(self, stage: str, item: str, meddle: Callable[[], object]) -> None:
@@ -117,9 +111,7 @@ class Meddler(SilentObserver):
         self.warnings.append(text)
 
 
-def run(
-    toy: Toy, observer: SilentObserver | None = None, *, executor: str = "serial", cache: str = "cache"
-) -> RunResult:
+def run(toy: Toy, observer: Observer | None = None, *, executor: str = "serial", cache: str = "cache") -> RunResult:
     session = toy.session(cache=toy.folder / cache)
     store = Store(session.store_root)
     made: Executor
@@ -262,60 +254,3 @@ def test_file_of_the_settings_that_changes_fails_what_reads_it(texts: Toy, chang
     path.write_text("1000")
     assert run(texts).exit_code == 0
     assert (texts.folder / "out" / "2.out").read_text() == str(20.0 + 300 + 1000)
-
-
-def as_of_an_earlier_version(store: Store, *, age_s: float) -> None:
-    """Make a store's records what versions wrote that did not check what they read, so long ago."""
-    for path in (store.root / "records").rglob("*.json"):
-        record = json.loads(path.read_bytes().partition(b"\n")[2])
-        record.pop("checked")
-        body = json.dumps(record, sort_keys=True)
-        path.write_text(f"{digest_from_bytes(body.encode())}\n{body}")
-        os.utime(path, (time.time() - age_s, time.time() - age_s))
-
-
-def unproven(store: Store) -> list[str]:
-    """Return the stages of which a verification cannot prove some results."""
-    keys = [Path(path).stem for path in verify(Store(store.root)).unproven]
-    records = [store.read_record(key) for key in keys]
-    return sorted(str(record.identity["stage"]) for record in records if record is not None)
-
-
-def test_verify_finds_what_earlier_versions_may_have_poisoned(texts: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stat_cache, "_SETTLE_S", -1.0)
-    path = texts.folder / "truth.txt"
-    path.write_text("1000")
-    texts.edit("wf.yaml", lambda text: text.replace("  late:", "  add:    {use: toy.add, file: truth.txt}\n  late:"))
-    run(texts)
-    store = Store(texts.folder / "cache")
-    assert verify(store).unproven == [], "what this version computes is checked"
-    as_of_an_earlier_version(store, age_s=-3600)
-    assert unproven(store) == [], "no file was touched since"
-    image = texts.folder / "capture" / "2.txt"
-    image.write_text("77")
-    image.write_text("20")
-    assert unproven(store) == ["toy.first", "toy.late", "toy.source", "toy.total"]
-    path.write_text("1000")
-    assert unproven(store) == ["toy.add", "toy.first", "toy.late", "toy.source", "toy.total"]
-    assert run(texts).computed == 0
-    assert unproven(store) == [], "the same bytes, since before the results were computed"
-
-
-def test_what_is_not_proven_can_be_dropped(texts: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole story: a wrong result of an earlier version is found, dropped and computed again."""
-    run(texts)
-    expected = delivered(texts)
-    shutil.rmtree(texts.folder / "cache")
-    path = texts.folder / "capture" / "2.txt"
-    with monkeypatch.context() as earlier_version:
-        earlier_version.setattr("pano_mvs.engine.executors.execute.changed_items", lambda unit, store: {})
-        run(texts, Meddler("total", "", lambda: path.write_text("77")))  # `late` reads the path, and so other bytes
-    path.write_text("20")
-    assert run(texts).computed == 0
-    assert delivered(texts) != expected
-    store = Store(texts.folder / "cache")
-    as_of_an_earlier_version(store, age_s=0)
-    assert verify(store, drop_unproven=True).unproven
-    assert unproven(store) == []
-    assert run(texts).exit_code == 0
-    assert delivered(texts) == expected

@@ -17,9 +17,9 @@ import pytest
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
-from pano_mvs.engine.executors import dask_cluster, dask_task
+from pano_mvs.engine.executors import dask_cluster
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.stages import stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
@@ -153,12 +153,12 @@ def test_other_versions_and_a_store_that_is_not_seen_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = Store(tmp_path)
-    ours = dask_task.versions()
+    introduce = dask_cluster.introduce
+    theirs = dask_cluster.versions() | {"numpy": "0.1"}
     with monkeypatch.context() as patch:
-        patch.setattr(dask_cluster, "versions", lambda: ours | {"numpy": "0.1"})
-        with pytest.raises(UsageError, match=r"numpy is .* there and 0\.1 here"):
+        patch.setattr(dask_cluster, "introduce", lambda root, token: introduce(root, token) | {"versions": theirs})
+        with pytest.raises(UsageError, match=r"numpy is 0\.1 there and .* here"):
             DaskExecutor(store, workers=1, threads=1)
-    introduce = dask_task.introduce
     with monkeypatch.context() as patch:
         patch.setattr(dask_cluster, "introduce", lambda root, token: introduce(str(tmp_path / "elsewhere"), token))
         with pytest.raises(UsageError, match="does not see the cache"):

@@ -13,10 +13,9 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.processes import ProcessExecutor
-from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.executors.worker_process import WorkerProcess
-from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.executors.choose import SerialExecutor
+from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
+from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import Make, files_below, run_with, told, two_processes

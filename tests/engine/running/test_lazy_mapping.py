@@ -6,8 +6,7 @@ import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
-from pano_mvs.engine.executors.execute import max_kept_items
-from pano_mvs.engine.executors.lazy_mapping import LazyMapping
+from pano_mvs.engine.executors.execute import LazyMapping, max_kept_items
 
 
 @pytest.fixture

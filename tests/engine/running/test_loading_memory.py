@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher
 from pano_mvs.engine.stages.stage import SourceItem, spec_of

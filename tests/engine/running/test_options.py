@@ -8,8 +8,7 @@ import pytest
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import execute
-from pano_mvs.engine.planning.plan import make_plan
-from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.planning.plan import RunOptions, make_plan
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages import stage_code

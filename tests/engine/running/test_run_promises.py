@@ -7,9 +7,9 @@ import pytest
 from pano_mvs.core.errors import InputError, RunStoppedError, StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.protocol import JobOutcome
-from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running import run as module
-from pano_mvs.engine.running.events import RunResult, SilentObserver
+from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Pairs, Record
 from tests.engine.conftest import Toy
@@ -18,7 +18,7 @@ from tests.engine.running.test_run_pass import Shelf, run_with, shelf
 __all__ = ["shelf"]  # a fixture
 
 
-class Warned(SilentObserver):
+class Warned(Observer):
     """Notes the warnings."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Interrupted(Shelf):
         super().cancel()
 
 
-def make_run(toy: Toy, shelf: Shelf, observer: SilentObserver, *overrides: str) -> Run:
+def make_run(toy: Toy, shelf: Shelf, observer: Observer, *overrides: str) -> Run:
     session = toy.session(*overrides)
     store = Store(session.store_root)
     return Run(session.workflow, session.graph, store, out=session.out, executor=shelf, observer=observer)
@@ -120,7 +120,7 @@ def test_what_is_damaged_again_after_each_repair_ends_the_run(toy: Toy, shelf: S
 
 
 def test_values_of_a_run_are_loaded_by_stage_and_item(toy: Toy, shelf: Shelf) -> None:
-    run = make_run(toy, shelf, SilentObserver())
+    run = make_run(toy, shelf, Observer())
     run.execute()
     pairs = run.load("pairs", Pairs)
     assert isinstance(pairs, Pairs)
@@ -178,7 +178,7 @@ def test_an_error_forgets_nothing(toy: Toy, shelf: Shelf) -> None:
 
 def test_files_of_earlier_runs_are_removed_or_named(toy: Toy, shelf: Shelf) -> None:
     def result_of(*overrides: str) -> RunResult:
-        return make_run(toy, shelf, SilentObserver(), *overrides).execute(earlier_files=first.published)
+        return make_run(toy, shelf, Observer(), *overrides).execute(earlier_files=first.published)
 
     first = toy.run()
     assert first.written == sorted(first.published) != []

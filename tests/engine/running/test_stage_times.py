@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import pytest
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import JobOutcome
-from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.units import PENDING, StageState
 from pano_mvs.engine.running import run as run_module
-from pano_mvs.engine.running.events import Failure, RunResult, SilentObserver
+from pano_mvs.engine.running.events import Failure, Observer, RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.scene import Axis
@@ -31,7 +31,7 @@ def test_a_stage_takes_the_time_in_which_its_units_are_computed(toy: Toy, monkey
         pass
 
     result = RunResult()
-    counts = RunStatistics(result, SilentObserver(), states=lambda _name: state, name_items=ignore)
+    counts = RunStatistics(result, Observer(), states=lambda _name: state, name_items=ignore)
     counts.stage_opened(entry)
 
     def at(time_s: float) -> None:
@@ -72,7 +72,7 @@ class Patient(SerialExecutor):
         return super().wait(timeout_s) if len(self.waits) % 2 == 0 else None
 
 
-class Waiting(SilentObserver):
+class Waiting(Observer):
     """Counts how often it learns that a run waits."""
 
     def __init__(self) -> None:

@@ -11,8 +11,7 @@ from pydantic import Field, ValidationError
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.settings import Setting, check_settings, checks_settings, setting, settings_of
-from pano_mvs.engine.stages.params import Params
-from pano_mvs.engine.stages.settings import arguments_from, params_from, settings_from
+from pano_mvs.engine.stages.params import Params, arguments_from, params_from, settings_from
 
 ANIMALS = NamedRegistry("animal", {"cat": 1, "dog": 2})
 

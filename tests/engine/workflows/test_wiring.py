@@ -212,6 +212,10 @@ def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired: Wire
             SOURCE + "  t: {use: toy.total}\n  e: {use: toy.each_total}\n",
             "stage 'e' needs total: Each[Total], but no earlier stage produces Total",
         ),
+        (
+            SOURCE + "  p: {use: toy.pairs}\n  a: {use: toy.scale, in: {x: p}}\n",
+            "port x: Each[Number] cannot be fed by 'p', which produces Pairs",
+        ),
         ("  a: {use: toy.scale}\n" + SOURCE, "produces Number (i below does: move it up or name it in `in:`)"),
         (SOURCE + "  s: {use: toy.scale, in: {x: j}}\n", "port 'x': there is no stage 'j'; stages: i, s"),
         (SCALED + "  t: {use: toy.total, in: {xs: sss}}\n", "there is no stage 'sss'; did you mean 's'?"),

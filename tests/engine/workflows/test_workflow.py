@@ -4,13 +4,11 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pano_mvs.core.errors import InputError, PluginError, UsageError, WorkflowError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import wire
-from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow, load_workflow
+from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
 from pano_mvs.engine.workflows.yaml_text import parse_yaml
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.session import presets_folder
@@ -26,7 +24,6 @@ def problems(toy: Toy, text: str) -> list[str]:
 
 
 HEAD = "pano_mvs: 1\nplugins: [plug.py]\nstages:\n"
-SOURCE = "  i: {use: toy.source, path: capture}\n"
 
 
 def test_every_mistake_is_found_in_one_go_with_its_place(toy: Toy) -> None:
@@ -88,71 +85,6 @@ def test_mistakes_of_form(toy: Toy, text: str, place: str, what: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stages", "what"),
-    [
-        ("  a: {use: toy.scale}\n", "stage 'a' needs x: Each[Number], but no earlier stage produces Number"),
-        (SOURCE + "  a: {use: toy.scale, in: {y: i}}\n", "has no port 'y'; its ports: x"),
-        (SOURCE + "  a: {use: toy.scale, in: {x: j}}\n", "there is no stage 'j'; stages: i, a"),
-        (SOURCE + "  p: {use: toy.pairs}\n  a: {use: toy.scale, in: {x: p}}\n", "'p', which produces Pairs"),
-        (SOURCE + "  a: {use: toy.difference}\n", "needs an index index: One[Pairs]"),
-        ("  a: {use: toy.scale, in: {x: b}}\n  b: {use: toy.scale, in: {x: a}}\n", "in a cycle: "),
-        (
-            SOURCE + "  a: {use: toy.scale}\n  b: {use: toy.scale, in: {x: i}}\n  c: {use: toy.scale}\n",
-            "could be fed by a, b; choose with `in: {x: …}`",
-        ),
-        ("  i: {use: toy.source, path: capture, to: ../up}\n", "inside the output folder"),
-    ],
-)
-def test_mistakes_of_wiring(toy: Toy, stages: str, what: str) -> None:
-    found = problems(toy, HEAD + stages)
-    assert any(what in line for line in found), found
-    assert all(line.startswith("wf.yaml:") for line in found)
-
-
-def test_an_input_is_wired_to_the_nearest_earlier_stage_of_a_chain(toy: Toy) -> None:
-    text = (
-        HEAD
-        + "  i: {use: toy.source, path: capture}\n  a: {use: toy.scale}\n  b: {use: toy.scale}\n  c: {use: toy.scale}\n"
-    )
-    (toy.folder / "wf.yaml").write_text(text)
-    edges = toy.session().graph.edges
-    assert [edges[name]["x"].producer for name in "abc"] == ["i", "a", "b"]
-
-
-def test_a_stage_named_in_in_may_stand_below(toy: Toy) -> None:
-    text = HEAD + "  a: {use: toy.scale, in: {x: i}}\n  i: {use: toy.source, path: capture}\n"
-    (toy.folder / "wf.yaml").write_text(text)
-    assert toy.session().graph.order == ("i", "a")
-
-
-def test_collections_feed_ports_that_want_their_items(toy: Toy) -> None:
-    text = HEAD + "  i: {use: toy.source, path: capture}\n  s: {use: toy.shifted}\n  a: {use: toy.scale}\n"
-    (toy.folder / "wf.yaml").write_text(text)
-    edge = toy.session().graph.edges["a"]["x"]
-    assert (edge.producer, edge.exploded) == ("s", True)
-
-
-@pytest.mark.parametrize(
-    ("override", "what"),
-    [
-        ("scaled", "write STAGE.PARAM=VALUE"),
-        ("scald.by=1", "no stage 'scald'. Did you mean 'scaled'"),
-        ("scaled.bye=1", "unknown setting 'bye'. Did you mean 'by'?"),
-        ("scaled.by=[", "--set scaled.by:1:"),
-        ("scaled.by=.inf", "finite"),
-    ],
-)
-def test_overrides_that_cannot_be_used(toy: Toy, override: str, what: str) -> None:
-    with pytest.raises(WorkflowError) as caught:
-        toy.session(override)
-    assert what in str(caught.value)
-
-
-def test_overrides_are_yaml(toy: Toy) -> None:
-    assert toy.session("scaled.by=2.5").workflow.stages["scaled"].params.model_dump() == {"by": 2.5}
-
-
-@pytest.mark.parametrize(
     ("code", "what"),
     [
         ("import no_such_module", r"plug.py:1: ModuleNotFoundError"),
@@ -204,20 +136,6 @@ def test_yaml_is_version_1_2() -> None:
         12,
         "1:30",
     ]
-
-
-@given(st.text(max_size=200))
-def test_any_text_gives_a_list_of_problems(text: str) -> None:
-    with pytest.raises(WorkflowError) as caught:  # no stage is registered, so no text can be a sound workflow
-        wire(WorkflowReader("t", Path(), Registry()).read(text))
-    assert caught.value.problems
-
-
-def test_wiring_is_checked_beside_wrong_settings(toy: Toy) -> None:
-    found = problems(toy, HEAD + SOURCE + "  a: {use: toy.scale, by: many, in: {y: i}}\n")
-    assert len(found) == 2
-    assert any("by:" in line for line in found)
-    assert any("no port 'y'" in line for line in found)
 
 
 def test_paths_that_do_not_exist_are_found_before_anything_runs(toy: Toy) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.session.merging.split import Division, split_images
+from pano_mvs.session.merging.block_runs import Division, split_images
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""`pano-mvs schema`: write the JSON Schema of workflows for editors."""
+"""`pano-mvs show` and `schema`: print a workflow, or the JSON Schema of workflows for editors."""
 
 from __future__ import annotations
 
@@ -10,12 +10,40 @@ from rich.markup import escape
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.paths import exists
+from pano_mvs.core.text import without_controls
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.extends import read_text
+from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
 from pano_mvs.engine.workflows.yaml_text import Located
-from pano_mvs.session.session import presets_folder
+from pano_mvs.session.session import Session, presets_folder
+
+
+def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None:
+    """Write the text of a workflow and of the files that it extends, or one file with all settings.
+
+    Args:
+        session: the workflow.
+        out: the file; None for the standard output.
+        resolved: whether to write one file with all settings.
+
+    Raises:
+        UsageError: if the file exists, or cannot be written.
+    """
+    text = resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text
+    text = without_controls(text).rstrip("\n")
+    if out is None:
+        print(text)
+        return
+    if exists(out):
+        raise UsageError(f"--out {out}: there is such a file already. Give a new name, or remove the file")
+    try:
+        write_text(out, f"{text}\n")
+    except StoreError as error:
+        raise UsageError(f"--out {error}") from error
+    print(f"written to {out}")
 
 
 def show_schema(workflow: str | None, out: Path | None) -> None:

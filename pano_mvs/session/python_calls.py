@@ -1,13 +1,15 @@
-"""Errors of calls from Python: messages name options of the command line, and here become the arguments' names."""
+"""Calls from Python: settings as values, and errors that name arguments in place of the options of the command line."""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
+from pathlib import PurePath
 from typing import ParamSpec, TypeVar
 
-from pano_mvs.core.errors import PanoMvsError, WorkflowError
+from pano_mvs.core.errors import PanoMvsError, UsageError, WorkflowError
 
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
@@ -46,3 +48,40 @@ def arguments_from_options(message: str) -> str:
     message = _SETTING.sub(r"settings['\1']", message)
     message = _ALONE.sub(r"\1", _WITH_VALUE.sub(r"\1=", message))
     return _MIN_FREE.sub("$PANO_MVS_MIN_FREE", message)
+
+
+def overrides_from_settings(settings: Mapping[str, object]) -> list[str]:
+    """Return settings as `STAGE.PARAM=VALUE`, the value in YAML.
+
+    >>> overrides_from_settings({"images.nadir_deg": 30, "depth.cost": "census", "views": None})
+    ['images.nadir_deg=30', 'depth.cost=census', 'views=null']
+
+    Args:
+        settings: `STAGE.PARAM` to its value: a string is taken as YAML, as on the command line; other values may be
+            numbers, booleans, None, paths, and lists and mappings of these.
+
+    Raises:
+        UsageError: if a value is of another type.
+    """
+    return [f"{name}={_yaml(name, value)}" for name, value in settings.items()]
+
+
+def _yaml(name: str, value: object) -> str:
+    if isinstance(value, str):
+        return value
+    try:
+        return json.dumps(value, ensure_ascii=False, default=_plain)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"setting {name}: {error}. Give a number, a text, a boolean, None, a path or a list"
+        ) from error
+
+
+def _plain(value: object) -> object:
+    """Return a path as text and a scalar of numpy as a number."""
+    if isinstance(value, PurePath):
+        return str(value)
+    item = getattr(value, "item", None)
+    if callable(item):
+        return item()
+    raise TypeError(f"{type(value).__name__} is not a value of a setting")

@@ -1,1 +1,0 @@
-"""`pano-mvs inspect`: print the analysis of one pixel."""

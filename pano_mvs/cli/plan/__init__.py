@@ -1,1 +1,0 @@
-"""`pano-mvs plan` and `status`: what a run would compute, and why."""

@@ -1,0 +1,239 @@
+"""`pano-mvs plan` and `status`: what a run would compute, one unit of it, and what the latest run did."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.cli.cache.command import size_text
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.run.printing import print_verdict
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.core.text import duration_text, plural, shortened_list
+from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
+from pano_mvs.engine.planning.units import Unit, UnitInput
+from pano_mvs.results.summary import RUN_JSON, RunSummary
+from pano_mvs.session.commands import reopen, run_command
+from pano_mvs.session.planning import RunPlan, plan_session
+from pano_mvs.session.running import Execution
+from pano_mvs.session.session import Session, check_output
+
+_SHOWN_REASONS = 5
+
+
+def show_dry_run(session: Session, execution: Execution, console: Console, *, as_json: bool) -> None:
+    """Print the plan of a run, for its number of workers.
+
+    Raises:
+        UsageError: if the output folder cannot be used, or JSON is requested.
+    """
+    if as_json:
+        raise UsageError("--dry-run prints a table, not events: leave out --json")
+    check_output(session)
+    workers = 1 if execution.executor == "serial" else execution.workers
+    show_plan(session, console, workers=workers, threads=execution.threads)
+
+
+def show_plan(session: Session, console: Console, *, workers: int = 0, threads: int = 0) -> RunPlan:
+    """Print for each stage the units that are cached and that would or may run, with reasons, times and sizes.
+
+    Args:
+        session: the session.
+        console: where to print.
+        workers: number of units at a time, for the times; 0 for the default.
+        threads: of each worker; 0 for the default.
+    """
+    run_plan = plan_session(session, workers=workers, threads=threads)
+    is_blocked = any(plan.blocked for plan in run_plan.stages)
+    table = Table("stage", "use", "cached", "run", "may run", *(["cannot run"] if is_blocked else []), "time", "disk")
+    for plan, forecast in zip(run_plan.stages, run_plan.forecasts, strict=True):
+        counts = [str(len(plan.cached) or ""), str(len(plan.run) or ""), _may_run(plan, forecast)]
+        counts += [str(len(plan.blocked) or "")] if is_blocked else []
+        table.add_row(plan.name, plan.use, *counts, *_expected(forecast, run_plan.workers))
+    console.print(table)
+    for plan in run_plan.stages:
+        _print_reasons(plan, console)
+    _print_total(run_plan, console)
+    return run_plan
+
+
+def _may_run(plan: StagePlan, forecast: StageForecast) -> str:
+    """Return the number of units that depend on others; of a stage whose units are not known yet, the expected one."""
+    if not plan.open:
+        return str(len(plan.may_run) or "")
+    return "all" if forecast.units is None else f"about {forecast.units}"
+
+
+def _expected(forecast: StageForecast, workers: int) -> tuple[str, str]:
+    """Return the expected time and disk space of a stage as text; empty if it computes nothing."""
+    if forecast.units == 0:
+        return "", ""
+    if forecast.seconds is None or forecast.stored_bytes is None:
+        return "unknown", "unknown"
+    at_a_time = max(1, min(workers, forecast.units or 1))
+    return duration_text(forecast.seconds / at_a_time), size_text(round(forecast.stored_bytes))
+
+
+def _print_total(run_plan: RunPlan, console: Console) -> None:
+    """Print the number of units, and the expected time and disk space of all stages."""
+    if not run_plan.units and not run_plan.may_follow:
+        console.print("nothing to compute", highlight=False)
+        return
+    units = f"{run_plan.units} {plural(run_plan.units, 'unit')} would run"
+    if run_plan.may_follow:
+        count, known = run_plan.may_run
+        units += f", and up to {count} more may" if known else ", and more may follow"
+    console.print(units, highlight=False)
+    unknown, workers = run_plan.unknown, f"{run_plan.workers} {plural(run_plan.workers, 'worker')}"
+    if len(unknown) == sum(forecast.units != 0 for forecast in run_plan.forecasts):
+        text = "time and disk space: unknown, because no earlier run with this cache computed these stages"
+    else:
+        bound = "at least" if unknown else "about"
+        size = size_text(round(run_plan.stored_bytes))
+        text = f"{bound} {duration_text(run_plan.seconds)} with {workers}, and {size} in the cache, by earlier runs"
+        text += f"; unknown: {shortened_list(unknown)}" if unknown else ""
+    console.print(escape(text), highlight=False, soft_wrap=True)
+
+
+def _print_reasons(plan: StagePlan, console: Console) -> None:
+    by_reason = Counter(plan.run.values())
+    for reason, count in by_reason.most_common(_SHOWN_REASONS):
+        items = [item for item, why in plan.run.items() if why == reason and item]
+        which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
+        console.print(escape(f"{plan.name}{which}: {reason}"), highlight=False, soft_wrap=True)
+    if len(by_reason) > _SHOWN_REASONS:
+        more = len(by_reason) - _SHOWN_REASONS
+        console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
+    for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
+        console.print(escape(f"{plan.name}:{item}: cannot run: {reason}"), highlight=False, soft_wrap=True)
+
+
+_SHOWN = 8
+
+
+def explain_unit(session: Session, label: str, console: Console) -> None:
+    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit.
+
+    Raises:
+        UsageError: if there is no such stage or unit.
+    """
+    stage, _, item = label.partition(":")
+    workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
+    store = Store(session.store_root, for_reading=True)
+    found: list[tuple[Unit, UnitRecord | None, str]] = []
+
+    def look(unit: Unit, record: UnitRecord | None, reason: str) -> None:
+        if (unit.entry.name, unit.item) == (stage, item):
+            found.append((unit, record, reason))
+
+    plan = make_plan(workflow, graph, store, visit=look)[-1]
+    if not found:
+        console.print(escape(f"{label}: {_why_not(plan, item)}"), highlight=False, soft_wrap=True)
+        return
+    for line in _lines(*found[0], store=store):
+        console.print(escape(line), highlight=False, soft_wrap=True)
+
+
+def _why_not(plan: StagePlan, item: str) -> str:
+    if item in plan.blocked:
+        return f"cannot run: {plan.blocked[item]}"
+    if item in plan.may_run or plan.open:
+        return "waits for outputs that are not computed yet; run what it needs first"
+    known = [*plan.cached, *plan.run]
+    shown = ", ".join(known[:_SHOWN]) + (" …" if len(known) > _SHOWN else "")
+    raise UsageError(f"{plan.name} has no unit {item!r}; it has: {shown or 'none'}")
+
+
+def _lines(unit: Unit, record: UnitRecord | None, reason: str, *, store: Store) -> list[str]:
+    spec = unit.entry.spec
+    lines = [
+        f"{unit.label}: {'cached' if record is not None else f'would run: {reason}'}",
+        f"stage    {spec.name} version {spec.version}, {spec.origin}",
+        f"key      {unit.key}",
+        f"code     {unit.identity['code']}",
+    ]
+    lines += [f"library  {name} {version}" for name, version in sorted(unit.identity["libraries"].items())]
+    lines += [f"setting  {name}: {value!r}" for name, value in sorted(unit.identity["params"].items())]
+    lines += [f"file     {role}: {path}" for role, path in (unit.source.files.items() if unit.source else ())]
+    lines += [f"reads    {port}: {_read(value)}" for port, value in unit.inputs.items()]
+    if record is None:
+        return lines
+    lines.append(f"took     {record.seconds:.2f} s")
+    lines += [f"figure   {name}: {value:z.6g}" for name, value in record.metrics.items()]
+    lines += [f"note     {note}" for note in record.notes]
+    for name, ref in record.output.parts.items():
+        place = store.blobs.place(ref)
+        where = place if isinstance(place, Path) else place.name
+        lines.append(f"result   {record.output.kind}.{name}: {where} ({ref.size_bytes} bytes)")
+    return lines
+
+
+def _read(value: UnitInput) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, ItemRef):
+        return f"{value.kind} {value.digest}"
+    names = [f"{name} ({ref.digest[:8]})" if ref.digest else name for name, ref in value.items()]
+    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+
+
+def show_status(
+    target: str,
+    out: Path | None,
+    *,
+    overrides: Sequence[str],
+    images: Path | None,
+    cache: Path | None,
+    console: Console,
+) -> None:
+    """Print the outcome of the latest run into an output folder, then what its workflow would compute now.
+
+    Args:
+        target: a workflow, or an output folder, whose run.json states workflow, settings, images and cache.
+        out: output folder of a workflow; None for the default.
+        overrides: settings.
+        images: folder of panoramas.
+        cache: folder of the cache.
+        console: where to print.
+
+    Raises:
+        InputError: if an output folder has no run.json, or its workflow is missing.
+    """
+    if is_folder(Path(target)):
+        _print_latest(Path(target), console)
+    session = reopen(target, overrides=overrides, images=images, cache=cache)
+    session = session if out is None else replace(session, out=out)
+    if not is_folder(Path(target)):
+        _print_latest(session.out, console)
+    run_plan = show_plan(session, console)
+    if run_plan.units:
+        console.print("to compute this:", highlight=False)
+        console.print(f"  {escape(run_command(session))}", highlight=False, soft_wrap=True)
+
+
+def _print_latest(out: Path, console: Console) -> None:
+    if not is_file(out / RUN_JSON):
+        console.print(f"no finished run in {escape(str(out))}", highlight=False)
+        return
+    try:
+        latest = RunSummary.read(out)
+    except InputError as error:
+        console.print(escape(str(error)), highlight=False, soft_wrap=True)
+        return
+    units = latest.units
+    text = f"exit code {latest.exit_code}, {units.run} computed, {units.cached} cached, {units.failed} failed"
+    console.print(f"latest run {latest.started}: {text}", highlight=False)
+    for failure in latest.failures:
+        console.print(escape(f"  {failure.label}: {failure.cause}"), highlight=False, soft_wrap=True)
+    if latest.stopped:
+        console.print(escape(f"  stopped: {latest.stopped}"), highlight=False, soft_wrap=True)
+    if latest.verdict is not None:
+        print_verdict(latest.verdict, console)
