@@ -144,8 +144,9 @@ def with_unconfirmed_doubts(
 
     Networks also match equal doors, posters and windows of different rooms, and a false pair looks as good as a true
     one. Where matches are so few that networks are asked too, and find nothing, other pairs are often false as well: of
-    16 such pairs in a real tour and six rendered houses, four were. If removing such a pair divides the group, no third
-    image confirms it; the smaller part is doubtful, or both parts of equal size.
+    17 such pairs in a real tour and six rendered houses, four were, and most in a house of equal offices. If removing
+    such a pair divides the group, no third image confirms it; the smaller part is doubtful, or both parts of equal
+    size.
 
     Args:
         poses: the poses.
