@@ -8,17 +8,19 @@ import os
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.doctor.checks import Finding
 from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import CacheOption, OutOption
 from pano_mvs.core.text import plural
+
+if TYPE_CHECKING:
+    from pano_mvs.cli.doctor.checks import Finding
 
 _COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "failed": "red"}
 _EXIT_FAILED = 2

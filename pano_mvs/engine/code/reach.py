@@ -146,7 +146,7 @@ class CodeGraph:
             if (found := self._module(module)) is not None:
                 for own in [name] if name else found.statements:
                     one = found.definition(own)
-                    pending.update(*(self._refer(module, one, use, libraries) for use in one.annotations))
+                    pending.update(*(self._refer(module, one, use, libraries=libraries) for use in one.annotations))
         reached: dict[str, str] = {}
         while pending:
             name = pending.pop()
@@ -167,7 +167,7 @@ class CodeGraph:
             return "", {f"{module}:{name}" for name in (_IMPORT, *found.statements)}, set()
         libraries: set[str] = set()
         definition = found.definition(what)
-        uses = {use: self._refer(module, definition, use, libraries) for use in sorted(definition.uses)}
+        uses = {use: self._refer(module, definition, use, libraries=libraries) for use in sorted(definition.uses)}
         targets = {f"{module}:{_IMPORT}"}.union(*uses.values())
         targets = targets.union(*map(self._imports, definition.loads))
         if what == _IMPORT:
@@ -179,7 +179,7 @@ class CodeGraph:
         edges = {use: sorted(found_by) or self._paths(module, definition, use) for use, found_by in uses.items()}
         return digest_from_value([definition.text, edges]) if definition.text else "", targets, libraries
 
-    def _refer(self, module: str, definition: _Definition, use: str, libraries: set[str]) -> set[str]:
+    def _refer(self, module: str, definition: _Definition, use: str, *, libraries: set[str]) -> set[str]:
         """Return the nodes to which a dotted name in a definition refers; none for builtins and unknown names."""
         if use.startswith(_AT_RUN_TIME):
             return self._targets(use[1:], [], libraries)
