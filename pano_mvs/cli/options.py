@@ -37,7 +37,7 @@ ImagesOption = Annotated[
         "--images",
         parser=_given_path,
         metavar="PATH",
-        help="Folder of panoramas, or a video; default: that of the workflow.",
+        help="Folder of panoramas or of a virtual tour, or a video; default: that of the workflow.",
     ),
 ]
 SetOption = Annotated[

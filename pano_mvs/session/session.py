@@ -15,7 +15,7 @@ from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
-from pano_mvs.io.images.captures import VIDEO_SUFFIXES
+from pano_mvs.io.images.captures import VIDEO_SUFFIXES, is_tour
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 
@@ -31,7 +31,7 @@ class Session:
     run_options: RunOptions = DEFAULT_OPTIONS
 
 
-_VIDEO_SOURCE = "source.video"
+_VIDEO_SOURCE, _TOUR_SOURCE = "source.video", "source.tour"
 
 
 def presets_folder() -> Path:
@@ -64,6 +64,8 @@ def open_session(
 ) -> Session:
     """Find, validate and wire a workflow.
 
+    If `images` holds a virtual tour, its stage of images becomes source.tour, unless `overrides` name another one.
+
     The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
     preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
 
@@ -78,6 +80,8 @@ def open_session(
         raise InputError("--images: the name of the folder is empty. Give the folder that holds the panoramas")
     images = None if images is None else Path(images)
     mistake = None if images is None else _images_mistake(images)
+    if images is not None and is_folder(images) and is_tour(images):
+        overrides = [f"images.use={_TOUR_SOURCE}", *overrides]  # before the user's own, which prevail
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())

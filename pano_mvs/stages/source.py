@@ -191,6 +191,7 @@ def list_tour(params: TourParams) -> Iterator[SourceItem]:
     scenes = list_scenes(params.path, notes)
     if len(scenes) < 2:
         raise InputError(f"{params.path}: contains only one scene ({scenes[0].name}); depth needs two or more")
+    notes.append(f"{len(scenes)} scenes of a virtual tour are read from the faces of their cubes")
     for scene in scenes:
         files = {f"{face}_{row}_{column}": path for (face, row, column), path in scene.tiles.items()}
         yield SourceItem(f"{scene.name}.png", files, notes=tuple(notes))

@@ -11,7 +11,8 @@ from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid
-from pano_mvs.io.images.captures import list_scenes
+from pano_mvs.io.images.captures import is_tour, list_scenes
+from pano_mvs.session.session import open_session
 from pano_mvs.stages.source import TourParams, list_tour, tour
 from tests.io.images.tours import LAYOUTS, NAMES, color_of, face_of, write, write_tour
 
@@ -69,3 +70,24 @@ def test_tiles_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
     (tmp_path / "scratch").mkdir()
     with pytest.raises(InputError, match=r"do not fit together|not squares of one size"):
         tour(next(iter(list_tour(params))), params, Context(np.random.default_rng(0), tmp_path / "scratch", 1))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_preset_reads_the_scenes_of_a_tour_that_it_is_given(tmp_path: Path, layout: str) -> None:
+    folder = write_tour(tmp_path / "tour", layout)
+    write(folder / "img/expand.png", face_of("f"))
+    session = open_session("quickstart", images=folder)
+    stage = session.workflow.stages["images"]
+    assert stage.spec.name == "source.tour"
+    notes = next(iter(list_tour(stage.params))).notes
+    assert notes == ("2 scenes of a virtual tour are read from the faces of their cubes",)
+
+
+def test_a_named_source_and_plain_pictures_are_not_taken_for_a_tour(tmp_path: Path) -> None:
+    folder = write_tour(tmp_path / "tour", "Marzipano")
+    session = open_session("quickstart", images=folder, overrides=["images.use=source.folder"])
+    assert session.workflow.stages["images"].spec.name == "source.folder"
+    for face in CUBE:
+        write(tmp_path / f"faces/hall_{face}.png", face_of(face))
+    assert not is_tour(tmp_path / "faces")
+    assert not is_tour(tmp_path / "nothing")

@@ -223,13 +223,13 @@ FACES = "frblud"
 _NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top": "u", "down": "d", "bottom": "d"}
 _FACE = "|".join([*_NAMES, *FACES])
 # Scene, level, face, row and column in the path of a tile without its extension.
-_LAYOUTS = (
+_TILES = (
     re.compile(r"(?P<scene>.*?)/?(?P<level>\d+)/(?P<face>[frblud])/(?P<row>\d+)/(?P<column>\d+)"),  # Marzipano
     re.compile(r"(?P<scene>.*?)/?(?P<level>\d+)/(?P<face>[frblud])(?P<row>\d+)_(?P<column>\d+)"),  # Pannellum
     re.compile(r"(?P<scene>.*?)(?:/[frblud]|/mres_[frblud])?/l(?P<level>\d+)(?:/[frblud])?/(?:\d+/)?"
                r"l\d+_(?P<face>[frblud])_(?P<row>\d+)_(?P<column>\d+)"),  # krpano
-    re.compile(rf"(?P<scene>.*?)[/_.-]?(?P<face>{_FACE})", re.IGNORECASE),  # six files
 )  # fmt: skip
+_SIX_FILES = (re.compile(rf"(?P<scene>.*?)[/_.-]?(?P<face>{_FACE})", re.IGNORECASE),)
 
 
 @dataclass(frozen=True)
@@ -255,10 +255,11 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
         InputError: if there is no complete scene.
     """
     found: dict[str, dict[int, dict[tuple[str, int, int], Path]]] = {}
-    for path in files_below(folder, notes):
-        place = path.relative_to(folder).with_suffix("").as_posix()
-        match = next((match for layout in _LAYOUTS if (match := layout.fullmatch(place))), None)
-        if match is None or path.suffix.lower() not in PICTURE_SUFFIXES:
+    pictures = [path for path in files_below(folder, notes) if path.suffix.lower() in PICTURE_SUFFIXES]
+    layouts = _TILES if any(_tile(folder, path, _TILES) for path in pictures) else _SIX_FILES
+    for path in pictures:
+        match = _tile(folder, path, layouts)
+        if match is None:
             continue
         groups = match.groupdict()
         face = _NAMES.get(groups["face"].lower(), groups["face"].lower())
@@ -275,6 +276,19 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
     shared = os.path.commonpath([str(PurePosixPath(name).parent) for name in scenes]) if scenes else ""
     named = {_below(name, shared) or folder.name: tiles for name, tiles in scenes.items()}
     return [TourScene(name, named[name]) for name in sorted(named, key=natural_key)]
+
+
+def is_tour(folder: Path) -> bool:
+    """Return whether a folder holds tiles of a virtual tour's cubes; six files for each scene do not count."""
+    try:
+        return any(_tile(folder, path, _TILES) for path in files_below(folder, []))
+    except InputError:
+        return False
+
+
+def _tile(folder: Path, path: Path, layouts: Sequence[re.Pattern[str]]) -> re.Match[str] | None:
+    place = path.relative_to(folder).with_suffix("").as_posix()
+    return next((match for layout in layouts if (match := layout.fullmatch(place))), None)
 
 
 def _below(name: str, shared: str) -> str:
