@@ -31,7 +31,7 @@ from pano_mvs.results import coverage as view_coverage
 from pano_mvs.results.coverage import ViewCoverage, coverage, coverage_from_fact, coverage_key
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.next_time import Suggestion, marks_of, suggestions
-from pano_mvs.results.pictures import Picture, picture, preview_panels
+from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_panels
 from pano_mvs.results.records import PairLink, PosesSummary, ScoresSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
@@ -166,7 +166,7 @@ def thumbnails(
     out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, *, kept: EarlierPage
 ) -> dict[str, Picture]:
     """Return small images of at most 1,000 evenly spaced views, by name."""
-    chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]
+    chosen = evenly_spaced(views, MAX_THUMBNAILS)
     with ThreadPoolExecutor(_THREADS) as pool:
         found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept=kept), chosen)
         return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
@@ -175,8 +175,8 @@ def thumbnails(
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
     """Return the shares of the sphere of at most 1,000 evenly spaced views, by name; the sky does not count."""
     found: dict[str, Shares] = {}
-    for idx in _evenly(len(views), MAX_MEASURED):
-        name = views[idx].name
+    for view in evenly_spaced(views, MAX_MEASURED):
+        name = view.name
         key = key_of(results, name, "s", version=_VERSION)
         shares = shares_from_fact(kept.fact(key)) if key else None
         if shares is None and key:
@@ -188,10 +188,6 @@ def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: E
         if shares is not None:
             found[name] = shares
     return found
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    return sorted({round(at) for at in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept: EarlierPage) -> Picture | None:

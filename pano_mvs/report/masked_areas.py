@@ -14,7 +14,7 @@ from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import InputError
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.results.pictures import Picture, picture, resized
+from pano_mvs.results.pictures import Picture, evenly_spaced, picture, resized
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama
 from pano_mvs.scene.masking import inside_crop
@@ -79,10 +79,9 @@ class MaskedAreas:
 def masked_areas(values: StoredValues, kept: EarlierPage) -> MaskedAreas:
     """Return what is masked in the panoramas of a run; without their values, nothing."""
     names = list(values.refs.get("images", {}))
-    examined = [names[round(at)] for at in np.linspace(0, len(names) - 1, min(len(names), MAX_EXAMINED))]
     shares: dict[str, Mapping[str, float]] = {}
     masks = values.static_masks if names else None
-    for name in examined:
+    for name in evenly_spaced(names, MAX_EXAMINED):
         found = _shares(values, kept, name, masks=masks)
         if found is not None:
             shares[name] = found
@@ -109,8 +108,7 @@ def chosen_pictures(shares: Mapping[str, Mapping[str, float]], most: int = MAX_P
     ]
     chosen = dict.fromkeys(first[:most])
     rest = [name for name in masked if name not in chosen]
-    for at in np.linspace(0, len(rest) - 1, min(len(rest), most - len(chosen))):
-        chosen[rest[round(at)]] = None
+    chosen |= dict.fromkeys(evenly_spaced(rest, most - len(chosen)))
     return [name for name in masked if name in chosen]
 
 

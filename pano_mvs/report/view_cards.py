@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, scale_ticks
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.results.pictures import Picture, picture, preview_panels, resized
+from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_panels, resized
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
@@ -210,8 +210,7 @@ def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always:
         return everything
     by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, _quality(views[idx]), idx))
     worst, rest = by_quality[: most // 3], sorted(by_quality[most // 3 :])
-    evenly = [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(worst))]
-    return sorted({*worst, *evenly})
+    return sorted({*worst, *evenly_spaced(rest, most - len(worst))})
 
 
 def view_cards(

@@ -1,10 +1,12 @@
-"""Images embedded in a page: JPEG files of limited size, as data URIs."""
+"""Images embedded in a page: which are chosen, and JPEG files of limited size, as data URIs."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +17,8 @@ from pano_mvs.core.file_names import file_inside
 _QUALITIES = (82, 70, 55, 40)
 _MIN_PX = 32
 _LINE_PX = 4
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,16 @@ def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str =
                 size_hw = int(shown.shape[0]), int(shown.shape[1])
                 return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}", size_hw, key)
         shown = resized(shown, shown.shape[1] * 3 // 4)
+
+
+def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
+    """Return at most `most` items, evenly spaced, with the first and the last.
+
+    >>> evenly_spaced("abcde", 3)
+    ['a', 'c', 'e']
+    """
+    places = np.linspace(0, len(items) - 1, min(len(items), most)) if items else ()
+    return [items[round(place)] for place in places]
 
 
 def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:

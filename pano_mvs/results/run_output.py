@@ -1,9 +1,10 @@
-"""The output of a run as Python objects, which are loaded on first access."""
+"""The output of a run as Python objects, which are loaded on first access, and as HTML for notebooks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
+from html import escape
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -14,9 +15,12 @@ from pano_mvs.core.file_names import file_inside, item_problem
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_groups
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
+from pano_mvs.results.figures import duration, figure
+from pano_mvs.results.pictures import Picture, evenly_spaced, picture
 from pano_mvs.results.records import Verdict, ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary, cache_of
@@ -107,8 +111,6 @@ class RunOutput:
 
     def _repr_html_(self) -> str:
         """Return the run for a notebook: the verdict, pictures of some views, and the stages."""
-        from pano_mvs.results.notebook import run_html
-
         return run_html(self)
 
 
@@ -210,6 +212,67 @@ class RunView:
         """Return the exported file of the view, which has the image's extension in its name if that is necessary."""
         candidates = (f"{folder}/{self.name}{suffix}", f"{folder}/{PurePosixPath(self.name).with_suffix(suffix)}")
         return next((self._run.out / name for name in candidates if self._run.has_file(name)), None)
+
+
+_MAX_VIEWS = 6
+_WIDTH = 320
+_MAX_BYTES = 40_000
+_COLORS = {"good": "#1a7f37", "fair": "#9a6700", "bad": "#cf222e", "": "inherit"}
+
+
+def run_html(run: RunOutput) -> str:
+    """Return the verdict, images of some views, and a table of the stages, as self-contained HTML."""
+    verdict = run.verdict
+    title = f"<b>{escape(run.summary.workflow.name or 'pano-mvs')}</b>: {escape(verdict.outcome)}."
+    judgement = f'<b style="color:{_COLORS[verdict.mood]}">{escape(verdict.judgement)}</b>'
+    tiles = " · ".join(f"<b>{escape(tile.value)}</b> {escape(tile.label)}" for tile in verdict.tiles)
+    findings = "".join(f"<li>{escape(found.text)} {escape(found.remedy)}</li>" for found in verdict.findings)
+    parts = [
+        f"<p>{title} {judgement} {escape(verdict.sentence)}</p>",
+        f"<p>{tiles}</p>" if tiles else "",
+        f"<ul>{findings}</ul>" if findings else "",
+        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), _MAX_VIEWS)),
+        _stages_html(run),
+        f"<p>{escape(str(run.out))}</p>",
+    ]
+    return f"<div>{''.join(parts)}</div>"
+
+
+def _view_html(view: RunView) -> str:
+    pictures = _pictures(view)
+    if not pictures:
+        return ""
+    shown = "".join(
+        f'<img src="{small.uri}" width="{small.size_hw[1]}" height="{small.size_hw[0]}" alt="{what}">'
+        for what, small in pictures
+    )
+    return (
+        f'<figure style="display:inline-block;margin:4px">{shown}<figcaption>{escape(view.name)}</figcaption></figure>'
+    )
+
+
+def _pictures(view: RunView) -> Iterable[tuple[str, Picture]]:
+    found = []
+    if view.image is not None:
+        found.append(("panorama", picture(view.image, width=_WIDTH, most_bytes=_MAX_BYTES)))
+    if view.range_map is not None:
+        colors = color_mapped(view.range_map, *range_limits(view.range_map))
+        if view.confidence is not None:
+            colors = mark_unconfirmed(colors, view.confidence)
+        found.append(("range map", picture(colors, width=_WIDTH, most_bytes=_MAX_BYTES)))
+    return found
+
+
+def _stages_html(run: RunOutput) -> str:
+    names = ("run", "cached", "failed", "blocked")
+    head = "".join(f"<th>{name}</th>" for name in ("stage", "use", *names, "time"))
+    rows = "".join(
+        f"<tr><td>{escape(stage.name)}</td><td>{escape(stage.use)}</td>"
+        + "".join(f"<td>{figure(getattr(stage, name))}</td>" for name in names)
+        + f"<td>{duration(stage.seconds)}</td></tr>"
+        for stage in run.summary.stages
+    )
+    return f"<table><tr>{head}</tr>{rows}</table>" if rows else ""
 
 
 def load(out: str | Path, *, cache: str | Path | None = None) -> RunOutput:

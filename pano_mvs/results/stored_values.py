@@ -15,11 +15,18 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
+from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView
 from pano_mvs.scene.panorama import StaticMasks
 
-ROLES = ("images", "pairs", "poses", "ranges", "cloud", "static")
-"""The final values of a run by role; run.json says which stage made each."""
+ROLES: Mapping[str, type[Record]] = {
+    "images": Panorama,
+    "pairs": TwoView,
+    "poses": Poses,
+    "ranges": RangeMap,
+    "cloud": PointCloud,
+    "static": StaticMasks,
+}
+"""The kinds of the final values of a run by role; run.json says which stage made each."""
 
 _Kind = TypeVar("_Kind", bound=Record)
 

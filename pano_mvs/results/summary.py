@@ -34,6 +34,9 @@ RUN_JSON = "run.json"
 CACHE_VARIABLE = "PANO_MVS_CACHE"
 SCHEMA = 1
 
+FAILED_ITEMS, INTERRUPTED = 3, 130
+"""Exit codes of a run with failed or doubtful items, and of one that was interrupted."""
+
 
 class RunSummary(Entry):
     """What a run did and what it found; immutable. `to_json` and `from_json` convert to and from run.json.

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from pano_mvs.core.text import plural
 from pano_mvs.results.figures import degrees, figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary, Tile, Verdict
 from pano_mvs.results.residuals import Residuals
-from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RunSummary
 
-_SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {
     0: ("good", "Finished"),
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
-    _SOME_FAILED: ("fair", "Finished, with failed items"),
+    FAILED_ITEMS: ("fair", "Finished, with failed items"),
     4: ("bad", "Stopped by a quality threshold or a safety check"),
-    _INTERRUPTED: ("fair", "Interrupted"),
+    INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {
     "good": "The result looks reliable.",
@@ -39,7 +38,7 @@ def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_wi
     """
     code = summary.exit_code
     mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
-    if code == _SOME_FAILED and not summary.failures:
+    if code == FAILED_ITEMS and not summary.failures:
         parts = {"panoramas left out": summary.rejected, "doubtful cameras": summary.doubts}
         outcome = f"Finished, with {' and '.join(text for text, found in parts.items() if found) or 'failed items'}"
     residual_deg = residuals.overall.median_deg if residuals else None
@@ -56,7 +55,7 @@ def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_wi
     overall = _worst(moods)
     judged = any(tile.mood for tile in tiles) or overall == "bad"
     judgement = _JUDGEMENTS[overall] if judged else ""
-    if code == _INTERRUPTED and overall != "bad":
+    if code == INTERRUPTED and overall != "bad":
         judgement = "Not finished."
     return Verdict(overall, outcome, judgement, _sentence(summary), tuple(tiles), found)
 
@@ -191,54 +190,45 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
     return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
 
 
-def _stopped(summary: RunSummary) -> list[Finding]:
-    stopped = summary.stopped
-    if not stopped:
-        return []
-    if stopped == "interrupted":
-        return [
-            Finding(
-                "fair",
-                "The run was interrupted. This report shows what it had finished.",
-                "Run the same command again to continue.",
-            )
-        ]
-    stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
-    return [Finding("bad", f"The run stopped early: {stopped}", "Correct this and run the same command again.")]
+def _stopped(summary: RunSummary) -> Iterator[Finding]:
+    if summary.stopped == "interrupted":
+        yield Finding(
+            "fair",
+            "The run was interrupted. This report shows what it had finished.",
+            "Run the same command again to continue.",
+        )
+    elif summary.stopped:
+        text = f"The run stopped early: {summary.stopped}"
+        text += "" if text.endswith((".", "!", "?")) else "."
+        yield Finding("bad", text, "Correct this and run the same command again.")
 
 
-def _failures(summary: RunSummary) -> list[Finding]:
+def _failures(summary: RunSummary) -> Iterator[Finding]:
     failures, blocked = summary.failures, summary.blocked
     if not failures:
-        return []
+        return
     stages = Counter(failure.stage for failure in failures)
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
     more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
     verb = plural(len(failures), "unit of work failed", "units of work failed")
-    return [
-        Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
-    ]
+    yield Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
 
 
-def _registration(summary: RunSummary) -> list[Finding]:
+def _registration(summary: RunSummary) -> Iterator[Finding]:
     registered, rejected = len(summary.poses.registered), summary.poses.rejected
     total = registered + len(rejected)
     if not total or not rejected:
-        return []
+        return
     mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
     text = (
         f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
         f"{_commonest(list(rejected.values()))}."
     )
     if mood == "good":
-        return [Finding("", text)]
-    return [
-        Finding(
-            mood,
-            text,
-            "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well.",
-        )
-    ]
+        yield Finding("", text)
+    else:
+        remedy = "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well."
+        yield Finding(mood, text, remedy)
 
 
 def doubt_mood(poses: PosesSummary) -> str:
@@ -246,30 +236,28 @@ def doubt_mood(poses: PosesSummary) -> str:
     return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
 
 
-def _doubts(summary: RunSummary) -> list[Finding]:
+def _doubts(summary: RunSummary) -> Iterator[Finding]:
     doubts, poses = summary.doubtful_images, summary.poses
     if not doubts:
-        return []
+        return
     reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
     more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
     what = "camera" if poses.doubts else "image"
     count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
     them = plural(len(reasons), "it and its", "them and their")
     mood = doubt_mood(poses) if poses.doubts else "fair"
-    return [
-        Finding(
-            mood,
-            f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
-            f"Take panoramas between {them} neighbours that show something unique, or leave "
-            f"{plural(len(reasons), 'it', 'these images')} out.",
-        )
-    ]
+    yield Finding(
+        mood,
+        f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+        f"Take panoramas between {them} neighbours that show something unique, or leave "
+        f"{plural(len(reasons), 'it', 'these images')} out.",
+    )
 
 
-def _groups(summary: RunSummary) -> list[Finding]:
+def _groups(summary: RunSummary) -> Iterator[Finding]:
     groups = summary.poses.groups
     if len(groups) < 2:
-        return []
+        return
     sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
     more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
     largest = len(groups[0].images)
@@ -278,7 +266,7 @@ def _groups(summary: RunSummary) -> list[Finding]:
         f"largest has {largest} {plural(largest, 'panorama')}; "
         f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}. They may also be different places."
     )
-    return [Finding("fair", text, pictures_between(groups))]
+    yield Finding("fair", text, pictures_between(groups))
 
 
 def _named(group: PoseGroup) -> str:
@@ -312,39 +300,33 @@ def _commonest(reasons: Sequence[str]) -> str:
     return example if len(reasons) == 1 else f"{count} {plural(count, 'time')} such as “{example}”"
 
 
-def _graph(summary: RunSummary) -> list[Finding]:
-    """Return the registered cameras that are linked to only one other, if there are at least four cameras."""
+def _graph(summary: RunSummary) -> Iterator[Finding]:
+    """Yield a finding on registered cameras that are linked to only one other, if there are at least four cameras."""
     names, links = summary.poses.registered, summary.poses.links
     if len(names) < 4 or not links:
-        return []
+        return
     count = Counter(name for link in links if link.inliers for name in link[:2])
     loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
     if not loose:
-        return []
+        return
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
     mood = "fair" if len(loose) > len(names) / 4 else ""
     sharing = plural(len(loose), "camera shares", "cameras share")
-    return [
-        Finding(
-            mood,
-            f"{len(loose)} {sharing} a verified geometry with only one other camera ({shown}): unless their "
-            "poses come from a file, nothing confirms them.",
-        )
-    ]
+    yield Finding(
+        mood,
+        f"{len(loose)} {sharing} a verified geometry with only one other camera ({shown}): unless their "
+        "poses come from a file, nothing confirms them.",
+    )
 
 
-def _imprecision(residual_px: float | None) -> list[Finding]:
-    if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
-        return []
-    text = f"The median reprojection residual is {significant(residual_px)} pixels: the poses are imprecise."
-    return [
-        Finding(
+def _imprecision(residual_px: float | None) -> Iterator[Finding]:
+    if residual_px is not None and (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) != "good":
+        yield Finding(
             mood,
-            text,
+            f"The median reprojection residual is {significant(residual_px)} pixels: the poses are imprecise.",
             "Check that the images are sharp, well stitched, and not edited individually; "
             "add poses.refine after the solver if it is missing.",
         )
-    ]
 
 
 def compares_views(summary: RunSummary) -> bool:
@@ -353,79 +335,62 @@ def compares_views(summary: RunSummary) -> bool:
     return compared or any(view.consistent for view in summary.views)
 
 
-def _views(summary: RunSummary) -> list[Finding]:
-    found = []
+def _views(summary: RunSummary) -> Iterator[Finding]:
     complete = median([view.completeness for view in summary.views])
     consistent = median([view.consistent for view in summary.views])
     if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
-        found.append(
-            Finding(
-                mood,
-                f"Half of the views have a range for less than {share(complete)} of their pixels.",
-                "Sky and masked areas have none; for other areas, look at the views in the report.",
-            )
+        yield Finding(
+            mood,
+            f"Half of the views have a range for less than {share(complete)} of their pixels.",
+            "Sky and masked areas have none; for other areas, look at the views in the report.",
         )
     if consistent is not None and not compares_views(summary):
-        found.append(
-            Finding(
-                "",
-                "No stage compared the views with each other, so it is unknown whether they agree.",
-                "Add filters.consistency.",
-            )
+        yield Finding(
+            "",
+            "No stage compared the views with each other, so it is unknown whether they agree.",
+            "Add filters.consistency.",
         )
     elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
-        found.append(
-            Finding(
-                mood,
-                f"Other views confirm only {share(consistent)} of the pixels in the median view.",
-                "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
-                "far apart or the poses are wrong.",
-            )
+        yield Finding(
+            mood,
+            f"Other views confirm only {share(consistent)} of the pixels in the median view.",
+            "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
+            "far apart or the poses are wrong.",
         )
-    return found
 
 
-def _sides(summary: RunSummary) -> list[Finding]:
-    """Return whether most ranges above or below the cameras are unconfirmed, in half of the views."""
-    found = []
+def _sides(summary: RunSummary) -> Iterator[Finding]:
+    """Yield a finding if most ranges above or below the cameras are unconfirmed, in half of the views."""
     for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
         confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
         if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
-            found.append(
-                Finding(
-                    "fair",
-                    f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
-                    "the others may be wrong.",
-                    f"Plain {surface} cannot be matched. Previews show their ranges pale; leave them out by confidence "
-                    "(128 and more is confirmed) or by uncertainty, or use the preset quality.",
-                )
+            yield Finding(
+                "fair",
+                f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
+                "the others may be wrong.",
+                f"Plain {surface} cannot be matched. Previews show their ranges pale; leave them out by confidence "
+                "(128 and more is confirmed) or by uncertainty, or use the preset quality.",
             )
-    return found
 
 
-def _empty_cloud(summary: RunSummary) -> list[Finding]:
+def _empty_cloud(summary: RunSummary) -> Iterator[Finding]:
     if summary.cloud.points == 0:
-        return [
-            Finding(
-                "bad",
-                "The cloud has no points: no two views agree on any surface.",
-                "Look at the range maps in the report: if they look right, the poses are wrong.",
-            )
-        ]
-    return []
+        yield Finding(
+            "bad",
+            "The cloud has no points: no two views agree on any surface.",
+            "Look at the range maps in the report: if they look right, the poses are wrong.",
+        )
 
 
-def _baseline(summary: RunSummary) -> list[Finding]:
-    """Return a finding for each branch that scores no better than a constant range."""
-    found = []
+def _baseline(summary: RunSummary) -> Iterator[Finding]:
+    """Yield a finding for each branch that scores no better than a constant range."""
     for stage, scores in summary.scores_by_stage.items():
         views = scores.views.values()
         ours = median([view.get("psnr_db") for view in views])
         constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
             text = f"Compared with the ground truth ({stage}), a single constant range scores at least as well"
-            found.append(Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB."))
-    return found
+            yield Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB.")
 
 
 def _units(count: int) -> str:
