@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TypeVar
 
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
-from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView
-from pano_mvs.scene.panorama import StaticMasks
-
-_ROLES: Mapping[str, type[Record]] = {
-    "images": Panorama,
-    "pairs": TwoView,
-    "poses": Poses,
-    "ranges": RangeMap,
-    "cloud": PointCloud,
-    "static": StaticMasks,
-}
+from pano_mvs.results.stored_values import ROLES
+from pano_mvs.scene import Record
 
 _Kind = TypeVar("_Kind", bound=Record)
 
@@ -55,7 +45,7 @@ def final_stages(run: Run) -> dict[str, str]:
     If the run ended early, a stage that had hardly begun does not replace the one before it.
     """
     found: dict[str, str] = {}
-    for role, kind in _ROLES.items():
+    for role, kind in ROLES.items():
         chain = chain_of(run.workflow, run.graph, kind)
         made = {name: len(run.states[name].items) for name in chain if name in run.states and run.states[name].items}
         least = max(made.values(), default=0) / 2 if run.result.stopped else 0

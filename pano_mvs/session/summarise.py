@@ -19,7 +19,7 @@ import pano_mvs
 from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.running.events import Failure, RunResult, StageSummary
+from pano_mvs.engine.running.events import Failure, StageSummary
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.results.records import (
@@ -57,7 +57,11 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
     """
     workflow, result = run.workflow, run.result
     scores = _scores(run)
-    blocked = tuple(_blocked(failure) for failure in result.failures if failure.blocked)
+    blocked = tuple(
+        BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause)
+        for failure in result.failures
+        if failure.blocked
+    )
     results = final_stages(run)
     poses = _poses(run, blocked)
     return RunSummary(
@@ -74,7 +78,12 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         seconds=round(seconds, 3),
         exit_code=result.exit_code,
         stopped=result.stopped,
-        units=_counts(result),
+        units=UnitCounts(
+            run=result.computed,
+            cached=result.cached,
+            failed=sum(stage.failed for stage in result.stages),
+            blocked=sum(stage.blocked for stage in result.stages),
+        ),
         stages=tuple(_stage(summary, workflow) for summary in result.stages),
         failures=tuple(_failed(failure) for failure in result.failures if not failure.blocked),
         blocked=blocked,
@@ -92,15 +101,6 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         versions=_versions(),
         files=dict(sorted(result.published.items())),
         left_over=dict(sorted(result.left_over.items())),
-    )
-
-
-def _counts(result: RunResult) -> UnitCounts:
-    return UnitCounts(
-        run=result.computed,
-        cached=result.cached,
-        failed=sum(stage.failed for stage in result.stages),
-        blocked=sum(stage.blocked for stage in result.stages),
     )
 
 
@@ -127,10 +127,6 @@ def _failed(failure: Failure) -> FailedUnit:
     return FailedUnit(**{name: getattr(failure, name) for name in names})
 
 
-def _blocked(failure: Failure) -> BlockedUnit:
-    return BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause)
-
-
 def _reasons(found: Mapping[str, tuple[str, str]]) -> dict[str, ImageReason]:
     return {image: ImageReason(stage=stage, reason=reason) for image, (stage, reason) in found.items()}
 
@@ -139,13 +135,12 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
     poses, result = latest(run, Poses), run.result
     if poses is None:
         return PosesSummary()
-    links = _links(run)
     return poses_summary(
         poses,
         blocked=blocked,
         rejected={image: why for image, (_, why) in result.rejected.items()},
         doubts={image: result.doubts[image][1] for image in poses.names if image in result.doubts},
-        links=links,
+        links=_links(run),
         heights=_camera_heights(split_groups(poses), latest(run, PointCloud)),
     )
 

@@ -20,7 +20,6 @@ from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
 from pano_mvs.results.records import (
     CloudSummary,
-    FailedUnit,
     ImageReason,
     MergedSummary,
     PairLink,
@@ -28,10 +27,9 @@ from pano_mvs.results.records import (
     WorkflowSummary,
 )
 from pano_mvs.results.stored_values import StoredValues
-from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.summary import FAILED_ITEMS, RunSummary
 from pano_mvs.scene import Poses
-from pano_mvs.session.merging.block import Block, load_blocks
-from pano_mvs.session.merging.files import MergeFiles
+from pano_mvs.session.merging.files import Block, MergeFiles, load_blocks
 from pano_mvs.session.summarise import poses_summary
 
 BLOCKS = "blocks"
@@ -150,7 +148,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
         workflow=WorkflowSummary(name=_STAGE),
         merged=MergedSummary(blocks=tuple(str(resolved(block.run.out)) for block in blocks), images=_images(blocks)),
         version=pano_mvs.__version__,
-        exit_code=3 if doubts or rejected or warnings else 0,
+        exit_code=FAILED_ITEMS if doubts or rejected or warnings else 0,
         rejected={name: ImageReason(stage=_STAGE, reason=why) for name, why in rejected.items()},
         doubts=doubts,
         warnings=warnings,
@@ -158,7 +156,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
         poses=poses_summary(poses, rejected=rejected, doubts=poses.doubts, links=_links(blocks)),
         views=tuple[ViewSummary, ...](views),
         cloud=CloudSummary(points=points or None),
-        versions=dict(_latest_versions(blocks)),
+        versions=dict(max((block.run.summary for block in blocks), key=lambda summary: summary.started).versions),
     )
 
 
@@ -167,13 +165,13 @@ def _rejected(blocks: Sequence[Block], poses: Poses) -> dict[str, str]:
     found, registered = dict(poses.rejected), {*poses.names}
     for block in blocks:
         why = dict.fromkeys(block.left_out, f"it is in a smaller group of the poses of {block.name}")
-        why |= {unit.item: unit.cause for unit in block.run.summary.failures if _is_image(unit)}
+        why |= {
+            unit.item: unit.cause
+            for unit in block.run.summary.failures
+            if unit.item and PAIR_SEPARATOR not in unit.item
+        }
         found |= {name: reason for name, reason in why.items() if name not in registered and name not in found}
     return dict(sorted(found.items(), key=lambda item: natural_key(item[0])))
-
-
-def _is_image(unit: FailedUnit) -> bool:
-    return bool(unit.item) and PAIR_SEPARATOR not in unit.item
 
 
 def _disagreements(blocks: Sequence[Block], alignment: BlockAlignment) -> list[str]:
@@ -233,10 +231,6 @@ def _links(blocks: Sequence[Block]) -> tuple[PairLink, ...]:
         for link in block.run.summary.poses.links:
             found.setdefault((link.first, link.second), link)
     return tuple(found.values())
-
-
-def _latest_versions(blocks: Sequence[Block]) -> Mapping[str, str]:
-    return max((block.run.summary for block in blocks), key=lambda summary: summary.started).versions
 
 
 # As shares of the distance between neighbouring cameras, and in degrees: medians over the common cameras of two blocks.

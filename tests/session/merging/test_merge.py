@@ -18,8 +18,7 @@ from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.merging.block import load_blocks
-from pano_mvs.session.merging.files import MergeFiles
+from pano_mvs.session.merging.files import MergeFiles, load_blocks
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
 from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
