@@ -14,6 +14,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunOutput
+from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
@@ -44,8 +45,6 @@ def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rig
     origin = np.median(centers, axis=0) if len(centers) else np.zeros(3)
     return Rigid3(rotation, -rotation @ origin)
 
-
-_INTERRUPTED = 130
 
 Progress = Callable[[int, int], None]
 """Receives the number of panoramas that are written, and of all."""
@@ -115,15 +114,16 @@ def share_run(
             "panoramas with --images DIR"
         )
     notes = [] if cloud is not None else ["the run has no cloud; the page shows the panoramas alone"]
-    if run.summary.exit_code == _INTERRUPTED:
+    if run.summary.exit_code == INTERRUPTED:
         notes.append("the run was interrupted; the page shows what it had finished")
-    if len(run.summary.poses.by_group()) > 1:
+    largest, *others = run.summary.poses.by_group()
+    if others:
         notes.append("the page shows the largest group of panoramas; each group has a frame of its own")
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
-    frame = page_from_world(cameras, is_level=states_y_down(run.summary.poses.by_group()[0].frame))
+    frame = page_from_world(cameras, is_level=states_y_down(largest.frame))
     page = PageFolder(folder)
     title = options.title or resolved(run.out).name
-    scene: dict[str, Any] = {"title": title, "unit": "m" if _is_metric(run) else "units", "ranges": list(RANGES_HW)}
+    scene: dict[str, Any] = {"title": title, "unit": "m" if largest.metric else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
     geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
     scene |= geometry
@@ -169,10 +169,6 @@ def _put_geometry(
     notes.append(note)
     described["maps"] = put_maps(page, shown, plans, centers=centers)
     return described, [note for note in notes if note]
-
-
-def _is_metric(run: RunOutput) -> bool:
-    return bool(run.summary.poses.by_group()[0].metric)
 
 
 def _put_cameras(

@@ -116,13 +116,15 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
             f"{path}: contains no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
             "folder of a run; its report.html shows what happened"
         )
+    up, ahead = _frame(cameras, is_level=states_y_down(chosen.frame))
     return ShownScene(
         name=resolved(path).name,
         cloud=cloud,
         mesh=mesh_file,
         cameras=cameras,
         unit="m" if chosen.metric else "scene units",
-        **dict(zip(("up", "ahead"), _frame(cameras, is_level=states_y_down(chosen.frame)), strict=True)),
+        up=up,
+        ahead=ahead,
         notes=tuple(notes),
     )
 
