@@ -23,14 +23,8 @@ from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.evaluate.app import evaluate_app
 from pano_mvs.cli.options import (
     AcceptOption,
-    BlockLoopOption,
-    BlockOverlapOption,
-    BlockPosesOption,
-    BlockSizeOption,
     CacheOption,
-    DurableOption,
     ImagesOption,
-    MinFreeOption,
     OnlyOption,
     OutOption,
     RefreshOption,
@@ -117,15 +111,51 @@ def run(
     isolate: Annotated[
         bool, typer.Option("--isolate", help="Compute each unit of a plugin's stage in a process of its own.")
     ] = False,
-    min_free: MinFreeOption = "",
-    durable: DurableOption = False,
+    min_free: Annotated[
+        str,
+        typer.Option(
+            "--min-free",
+            metavar="SIZE",
+            help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
+            show_default=False,
+        ),
+    ] = "",
+    durable: Annotated[
+        bool,
+        typer.Option("--durable", help="Flush each result to disk, for machines that may lose power."),
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
     ] = False,
-    block_size: BlockSizeOption = 0,
-    block_overlap: BlockOverlapOption = 0,
-    block_loop: BlockLoopOption = False,
-    block_poses: BlockPosesOption = None,
+    block_size: Annotated[
+        int,
+        typer.Option(
+            "--block-size",
+            metavar="N",
+            min=0,
+            help="Run overlapping blocks of at most N images one after the other, and merge them; default: no blocks.",
+            show_default=False,
+        ),
+    ] = 0,
+    block_overlap: Annotated[
+        int,
+        typer.Option(
+            "--block-overlap",
+            metavar="N",
+            min=0,
+            help="Images that consecutive blocks share; default: a quarter of the block size, 3 to 100.",
+            show_default=False,
+        ),
+    ] = 0,
+    block_loop: Annotated[
+        bool, typer.Option("--block-loop", help="The path ends where it began: the last block overlaps the first.")
+    ] = False,
+    block_poses: Annotated[
+        Path | None,
+        typer.Option(
+            "--block-poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
+        ),
+    ] = None,
 ) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import division_of, run_in_blocks
@@ -392,7 +422,7 @@ def split_capture(
     ] = None,
 ) -> None:
     """Divide a capture into overlapping blocks: folders of links to its images."""
-    from pano_mvs.cli.merge_command import split_command
+    from pano_mvs.cli.blocks_command import split_command
     from pano_mvs.session.merging.block_runs import Division
 
     split_command(images, to, Division(size, overlap, loop, poses), console=Console())
@@ -406,7 +436,7 @@ def merge_runs(
     cache: CacheOption = None,
 ) -> None:
     """Merge runs over overlapping blocks of a capture: poses, points, cloud and range maps."""
-    from pano_mvs.cli.merge_command import merge_blocks_command
+    from pano_mvs.cli.blocks_command import merge_blocks_command
 
     raise typer.Exit(merge_blocks_command(tuple(outs), to, cache=cache, console=Console()))
 

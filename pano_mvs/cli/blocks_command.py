@@ -1,7 +1,8 @@
-"""`pano-mvs run --block-size`: run a workflow block by block, and merge the blocks."""
+"""`pano-mvs run --block-size`, `split` and `merge`: divide a capture into blocks, run them, and merge them."""
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,18 +11,18 @@ from pathlib import Path
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.merge_command import merge_blocks_command
 from pano_mvs.cli.plan_commands import show_dry_run
 from pano_mvs.cli.run.command import interrupted_by_termination, run_shown
 from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.core.text import plural
+from pano_mvs.results.summary import FAILED_ITEMS
 from pano_mvs.session.commands import run_command
-from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, open_blocks
-from pano_mvs.session.merging.merge import BLOCKS
+from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, open_blocks, split_images
+from pano_mvs.session.merging.merge import BLOCKS, merge_outputs
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
 _MIN_SIZE = 7
-_FAILED_ITEMS = 3
 _SAME_COMMAND = "give the same command again; finished results are reused"
 
 
@@ -87,15 +88,13 @@ def run_in_blocks(
 
 def _is_early(code: int) -> bool:
     """Return whether a run with an exit code ended before it was finished."""
-    return code not in (0, _FAILED_ITEMS)
+    return code not in (0, FAILED_ITEMS)
 
 
 def _print_heading(run: BlockRun, number: int, count: int, *, console: Console) -> None:
-    console.print(
+    console.say(
         f"\n[bold]block {number} of {count}[/]: {len(run.names)} images, "
-        f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}",
-        highlight=False,
-        soft_wrap=True,
+        f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}"
     )
 
 
@@ -107,12 +106,10 @@ def _run_block(run: BlockRun, execution: Execution, console: Console) -> int:
     except PanoMvsError as error:
         code, reason = error.exit_code, str(error)
     if _is_early(code):
-        Console(stderr=True).print(
+        Console(stderr=True).say(
             f"[red]error:[/] {run.name}: {escape(reason)}\n"
             f"To continue, remove the cause and {_SAME_COMMAND}. This block alone:\n"
-            f"  {escape(run_command(run.session))}",
-            highlight=False,
-            soft_wrap=True,
+            f"  {escape(run_command(run.session))}"
         )
     return code
 
@@ -123,12 +120,10 @@ def _merge(session: Session, runs: Sequence[BlockRun], console: Console) -> int:
     try:
         return merge_blocks_command(outs, session.out, cache=session.store_root, console=console)
     except PanoMvsError as error:
-        Console(stderr=True).print(
+        Console(stderr=True).say(
             f"[red]error:[/] {escape(str(error))}\nAll blocks have run; their results are in "
             f"{escape(str(outs[0].parent))}. Look at their reports; other settings or a larger --block-overlap may "
-            f"help. To continue, {_SAME_COMMAND}",
-            highlight=False,
-            soft_wrap=True,
+            f"help. To continue, {_SAME_COMMAND}"
         )
         return error.exit_code
 
@@ -142,3 +137,48 @@ def _show_dry_run(
             shown = replace(run, session=replace(run.session, out=session.out / BLOCKS / run.name))
             _print_heading(shown, number, len(blocks), console=console)
             show_dry_run(shown.session, execution, console, as_json=False)
+
+
+def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:
+    """Write the blocks of a capture, and print them and the commands that follow.
+
+    Raises:
+        UsageError: if a setting or a folder cannot be used.
+        InputError: if there are no images, or the poses are of other images.
+        StoreError: if a link cannot be made.
+    """
+    blocks = split_images(images, to, division)
+    outs = [f"out/{block.folder.name}" for block in blocks]
+    for block, out in zip(blocks, outs, strict=True):
+        console.say(
+            f"{escape(str(block.folder))}: {len(block.names)} images\n"
+            f"  pano-mvs run WORKFLOW --images {escape(shlex.quote(str(block.folder)))} --out {out}"
+        )
+    console.say(f"then: pano-mvs merge {' '.join(outs)} --out out/merged")
+
+
+def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None, console: Console) -> int:
+    """Merge output folders, print how well they agree and what was written, and return the exit code.
+
+    Raises:
+        UsageError: if the folders cannot be used.
+        InputError: if the blocks cannot be merged.
+        StoreError: if a file cannot be written.
+    """
+    with console.status("merging"):
+        summary = merge_outputs(outs, to, cache=cache).summary
+    for text in summary.notes:
+        console.say(escape(text))
+    for text in summary.warnings:
+        console.say(f"warning: {escape(text)}")
+    if count := len(summary.rejected):
+        name, why = next(iter(summary.rejected.items()))
+        text = f"{count} {plural(count, 'image')} without a pose, such as {name}: {why.reason}"
+        console.say(escape(text))
+    points = f", cloud of {summary.cloud.points:,} points" if summary.cloud.points else ""
+    console.say(
+        f"{len(summary.poses.registered)} cameras, {summary.poses.points:,} sparse points, {len(summary.views)} range "
+        f"maps{points}\nreport: {escape(str(to / 'report.html'))}\n"
+        f"next:\n  {escape(shlex.join(['pano-mvs', 'view', str(to)]))}"
+    )
+    return summary.exit_code

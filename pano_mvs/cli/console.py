@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 
 import rich.console
 from rich.console import ConsoleOptions, RenderableType
@@ -23,3 +24,12 @@ class Console(rich.console.Console):
                 yield segment
             else:
                 yield Segment(shortened(without_controls(segment.text), _MAX_LINE), segment.style)
+
+    def say(self, text: str) -> None:
+        """Print text with markup, without wrapping it and without colours of numbers and paths."""
+        self.print(text, highlight=False, soft_wrap=True)
+
+
+def print_json(values: Mapping[str, object]) -> None:
+    """Print one JSON object to the standard output."""
+    print(json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False))

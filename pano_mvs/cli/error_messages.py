@@ -30,29 +30,27 @@ def guarded(command: Command) -> Command:
             command(*args, **kwargs)
         except PanoMvsError as error:
             for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
-                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+                errors.say(f"[red]error:[/] {escape(problem)}")
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
             errors.print(
                 "interrupted; finished results are kept. To continue, run the same command again:", highlight=False
             )
-            errors.print(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}", highlight=False, soft_wrap=True)
+            errors.say(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}")
             raise typer.Exit(130) from None
         except typer.Exit:
             raise
         except SystemExit as end:  # a plugin's code; ours raises typer.Exit
             traceback.print_exc()
-            errors.print(
+            errors.say(
                 f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
-                "finished results are kept",
-                highlight=False,
-                soft_wrap=True,
+                "finished results are kept"
             )
             raise typer.Exit(1) from None
         except Exception as error:
             if isinstance(error, OSError) and error.filename is not None:  # no more specific message exists
                 problem = f"{error.filename}: {reason_of(error)}. Correct its permissions, or choose another path"
-                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+                errors.say(f"[red]error:[/] {escape(problem)}")
                 raise typer.Exit(StoreError.exit_code) from None
             traceback.print_exc()
             errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.evaluation.inputs import read_truth
+from pano_mvs.evaluation.tables import finite_or_none
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import confidence_name
@@ -63,11 +63,11 @@ def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Pa
     if plot is not None:
         _write_plot(plot, found)
     if as_json:
-        print(json.dumps(as_json_value(found), indent=1, allow_nan=False, ensure_ascii=False))
+        print_json(as_json_value(found))
         return
     print_inspection(found, console)
     if plot is not None:
-        console.print(f"plot in {escape(str(plot))}", highlight=False, soft_wrap=True)
+        console.say(f"plot in {escape(str(plot))}")
 
 
 @dataclass
@@ -177,10 +177,10 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
         "ray_in_world": found.ray_in_world.tolist(),
         "center_in_world": found.center_in_world.tolist(),
         "stages": [
-            {"stage": one.stage, "use": one.use, "range": _number(one.range), "confidence": one.confidence}
+            {"stage": one.stage, "use": one.use, "range": finite_or_none(one.range), "confidence": one.confidence}
             for one in found.stages
         ],
-        "true_range": _number(found.true_range),
+        "true_range": finite_or_none(found.true_range),
         "sources": [
             {
                 "name": one.name,
@@ -189,7 +189,7 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
                 "pixel_px": list(one.pixel_px),
                 "color_rgb": list(one.color_rgb),
                 "masked": one.masked,
-                "cost": _number(one.cost),
+                "cost": finite_or_none(one.cost),
             }
             for one in found.sources
         ],
@@ -199,12 +199,12 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
             "raw": curve.raw.tolist(),
             "aggregated": None if curve.aggregated is None else curve.aggregated.tolist(),
             "by_source": {
-                one.name: [_number(cost) for cost in costs]
+                one.name: [finite_or_none(cost) for cost in costs]
                 for one, costs in zip(found.sources, curve.by_source.tolist(), strict=True)
             },
             "winner": curve.winner,
             "runner_up": curve.runner_up,
-            "range": _number(curve.range),
+            "range": finite_or_none(curve.range),
             "confidence": curve.confidence,
             "uniqueness": curve.uniqueness,
         },
@@ -212,15 +212,11 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
     }
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def print_inspection(found: Inspection, console: Console) -> None:
     """Print an inspection, with its curve drawn as text."""
 
     def say(text: str) -> None:
-        console.print(escape(text), highlight=False, soft_wrap=True)
+        console.say(escape(text))
 
     say(
         f"{found.image}, pixel ({found.column}, {found.row}) of {found.size_hw[1]}×{found.size_hw[0]}: "

@@ -75,48 +75,6 @@ RefreshOption = Annotated[
         autocompletion=complete_stage,
     ),
 ]
-MinFreeOption = Annotated[
-    str,
-    typer.Option(
-        "--min-free",
-        metavar="SIZE",
-        help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
-        show_default=False,
-    ),
-]
-DurableOption = Annotated[
-    bool,
-    typer.Option("--durable", help="Flush each result to disk, for machines that may lose power."),
-]
 AcceptOption = Annotated[
     bool, typer.Option("--accept-code", help="Reuse results that were computed before code or libraries changed.")
-]
-BlockSizeOption = Annotated[
-    int,
-    typer.Option(
-        "--block-size",
-        metavar="N",
-        min=0,
-        help="Run overlapping blocks of at most N images one after the other, and merge them; default: no blocks.",
-        show_default=False,
-    ),
-]
-BlockOverlapOption = Annotated[
-    int,
-    typer.Option(
-        "--block-overlap",
-        metavar="N",
-        min=0,
-        help="Images that consecutive blocks share; default: a quarter of the block size, 3 to 100.",
-        show_default=False,
-    ),
-]
-BlockLoopOption = Annotated[
-    bool, typer.Option("--block-loop", help="The path ends where it began: the last block overlaps the first.")
-]
-BlockPosesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--block-poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
-    ),
 ]

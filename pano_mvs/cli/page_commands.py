@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
@@ -33,7 +33,7 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     values = StoredValues() if summary.merged is not None else _stored_values(out, summary, cache)
     with output_lock(out):
         write_report(out, summary, values)
-    console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)
+    console.say(escape(f"{out / 'report.html'} is written"))
 
 
 def _stored_values(out: Path, summary: RunSummary, cache: Path | None) -> StoredValues:
@@ -65,14 +65,12 @@ def share_output(
             progress=lambda done, total: status.update(f"panoramas {done}/{total}"),
         )
     for note in shared.notes:
-        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+        console.say(f"note: {escape(note)}")
     surface = f", {shared.triangles:,} {plural(shared.triangles, 'triangle')}" if shared.triangles else ""
-    console.print(
+    console.say(
         f"{shared.points:,} {plural(shared.points, 'point')}{surface} and {shared.panoramas} "
         f"{plural(shared.panoramas, 'panorama')}, {shared.total_bytes / 1e6:.1f} MB\n"
-        f"page: {escape(str(shared.page))} (send or upload the whole folder)",
-        highlight=False,
-        soft_wrap=True,
+        f"page: {escape(str(shared.page))} (send or upload the whole folder)"
     )
     if shared.single_file is not None:
-        console.print(f"one file: {escape(str(shared.single_file))}", highlight=False, soft_wrap=True)
+        console.say(f"one file: {escape(str(shared.single_file))}")

@@ -100,7 +100,7 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
         size = size_text(round(run_plan.stored_bytes))
         text = f"{bound} {duration_text(run_plan.seconds)} with {workers}, and {size} in the cache, by earlier runs"
         text += f"; unknown: {shortened_list(unknown)}" if unknown else ""
-    console.print(escape(text), highlight=False, soft_wrap=True)
+    console.say(escape(text))
 
 
 def _print_reasons(plan: StagePlan, console: Console) -> None:
@@ -108,12 +108,12 @@ def _print_reasons(plan: StagePlan, console: Console) -> None:
     for reason, count in by_reason.most_common(_SHOWN_REASONS):
         items = [item for item, why in plan.run.items() if why == reason and item]
         which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
-        console.print(escape(f"{plan.name}{which}: {reason}"), highlight=False, soft_wrap=True)
+        console.say(escape(f"{plan.name}{which}: {reason}"))
     if len(by_reason) > _SHOWN_REASONS:
         more = len(by_reason) - _SHOWN_REASONS
         console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
     for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
-        console.print(escape(f"{plan.name}:{item}: cannot run: {reason}"), highlight=False, soft_wrap=True)
+        console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
 
 
 _SHOWN = 8
@@ -136,10 +136,10 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
 
     plan = make_plan(workflow, graph, store, visit=look)[-1]
     if not found:
-        console.print(escape(f"{label}: {_why_not(plan, item)}"), highlight=False, soft_wrap=True)
+        console.say(escape(f"{label}: {_why_not(plan, item)}"))
         return
     for line in _lines(*found[0], store=store):
-        console.print(escape(line), highlight=False, soft_wrap=True)
+        console.say(escape(line))
 
 
 def _why_not(plan: StagePlan, item: str) -> str:
@@ -216,7 +216,7 @@ def show_status(
     run_plan = show_plan(session, console)
     if run_plan.units:
         console.print("to compute this:", highlight=False)
-        console.print(f"  {escape(run_command(session))}", highlight=False, soft_wrap=True)
+        console.say(f"  {escape(run_command(session))}")
 
 
 def _print_latest(out: Path, console: Console) -> None:
@@ -226,14 +226,14 @@ def _print_latest(out: Path, console: Console) -> None:
     try:
         latest = RunSummary.read(out)
     except InputError as error:
-        console.print(escape(str(error)), highlight=False, soft_wrap=True)
+        console.say(escape(str(error)))
         return
     units = latest.units
     text = f"exit code {latest.exit_code}, {units.run} computed, {units.cached} cached, {units.failed} failed"
     console.print(f"latest run {latest.started}: {text}", highlight=False)
     for failure in latest.failures:
-        console.print(escape(f"  {failure.label}: {failure.cause}"), highlight=False, soft_wrap=True)
+        console.say(escape(f"  {failure.label}: {failure.cause}"))
     if latest.stopped:
-        console.print(escape(f"  stopped: {latest.stopped}"), highlight=False, soft_wrap=True)
+        console.say(escape(f"  stopped: {latest.stopped}"))
     if latest.verdict is not None:
         print_verdict(latest.verdict, console)

@@ -63,7 +63,7 @@ def scale_output(
         height_m = chosen.camera_height * measurement.factor
         doubt = "" if _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1] else "; is the distance right?"
         lines.insert(1, f"the cameras are then {height_m:.3g} m above the floor{doubt}")
-    console.print("\n".join(map(escape, lines)), highlight=False, soft_wrap=True)
+    console.say("\n".join(map(escape, lines)))
     return run_workflow(session, Execution())
 
 
@@ -89,5 +89,5 @@ def _print_guess(run: RunOutput, group: int, console: Console) -> int:
         text = height_note(chosen.camera_height)
     else:
         text = "lengths are in scene units, and no floor was found below the cameras. Measure a distance: A B 3.42m"
-    console.print(text, highlight=False, soft_wrap=True)
+    console.say(text)
     return 0

@@ -9,8 +9,7 @@ import select
 import sys
 from typing import TYPE_CHECKING, TextIO
 
-from rich.console import Console
-
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import StoreError
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ class StreamState:
         """Return the exit code of a command that would end with `code`, reporting a failed standard output."""
         if self.failure:
             text = f"the standard output cannot be written: {self.failure}. The command went on without it"
-            Console(stderr=True).print(f"[red]error:[/] {text}", highlight=False, soft_wrap=True)
+            Console(stderr=True).say(f"[red]error:[/] {text}")
             return code or StoreError.exit_code
         return CLOSED_PIPE if self.reader_left and not self.reader_may_leave and not code else code
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour
@@ -80,7 +80,7 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
         quiet_vtk()
     window = SceneWindow(tour, size_wh=size_wh, off_screen=options.screenshot is not None, budget=options.points)
     for note in scene.notes:
-        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+        console.say(f"note: {escape(note)}")
     if options.screenshot is None:
         require_window(window.plotter.render_window.GetClassName())
         window.run()
@@ -88,7 +88,7 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
     picture = window.picture()
     window.close()
     _write(options.screenshot, picture)
-    console.print(f"picture in {escape(str(options.screenshot))}", highlight=False, soft_wrap=True)
+    console.say(f"picture in {escape(str(options.screenshot))}")
 
 
 def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> Tour:

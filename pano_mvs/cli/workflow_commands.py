@@ -67,7 +67,7 @@ def show_schema(workflow: str | None, out: Path | None) -> None:
     except StoreError as error:
         raise UsageError(f"{error}") from error
     hint = f"put this line at the top of a workflow: # yaml-language-server: $schema={out.as_posix()}"
-    Console().print(escape(hint), highlight=False, soft_wrap=True)
+    Console().say(escape(hint))
 
 
 def _inherited(workflow: str, registry: Registry) -> dict[str, Located]:

@@ -9,28 +9,26 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.core.text import plural
-from pano_mvs.engine.cache.maintenance import GarbageCollection, collect, size_on_disk, usage_of, verify
+from pano_mvs.engine.cache.maintenance import collect, size_on_disk, usage_of, verify
 from pano_mvs.engine.cache.remote import Copied, RemoteCache
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.results.summary import CACHE_VARIABLE
+from pano_mvs.results.summary import CACHE_VARIABLE, FAILED_ITEMS
 
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
-_FAILED_ITEMS = 3
 
 
 def cache_root(cache: Path | None) -> Path:
     """Return the folder given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder."""
-    variable = os.environ.get(CACHE_VARIABLE)
-    return cache or (Path(variable) if variable else Path(".pano-mvs"))
+    return cache or Path(os.environ.get(CACHE_VARIABLE) or ".pano-mvs")
 
 
 def push_cache(store: Store, console: Console, url: str) -> None:
@@ -59,9 +57,7 @@ def _copying(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 def _print_copied(copied: Copied, to: str, console: Console) -> None:
     files = f"{copied.files} {plural(copied.files, 'file')}, {size_text(copied.size_bytes)}"
-    console.print(
-        f"copied to {escape(to)}: {files}; {copied.present} were there already", highlight=False, soft_wrap=True
-    )
+    console.say(f"copied to {escape(to)}: {files}; {copied.present} were there already")
 
 
 def open_cache(cache: Path | None) -> Store:
@@ -110,7 +106,7 @@ def verify_cache(store: Store, console: Console) -> int:
         ("temporary", damage.temporary),
     ):
         for path in paths[:_SHOWN]:
-            console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
+            console.say(f"{what}: {escape(path)}")
         if len(paths) > _SHOWN:
             console.print(f"{what}: … and {len(paths) - _SHOWN} more")
     console.print(
@@ -121,7 +117,7 @@ def verify_cache(store: Store, console: Console) -> int:
     if not damage.removed and not damage.incomplete:
         return 0
     console.print("the next run computes the missing results again")
-    return _FAILED_ITEMS
+    return FAILED_ITEMS
 
 
 def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, older_than: str) -> None:
@@ -130,15 +126,12 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
     found = collect(store, unused_s=seconds_from_text(unused), forget_after_s=forget_after_s, delete=delete)
     for entry in found.runs:
         console.print(f"run of {escape(entry.workflow)} into {escape(entry.out)}, ended {entry.when}", highlight=False)
-    console.print(_told(found, delete=delete), highlight=False)
-    if not delete and (found.records or found.blobs or found.runs):
-        console.print("nothing was deleted; use --delete to delete these results")
-
-
-def _told(found: GarbageCollection, *, delete: bool) -> str:
     records, blobs = len(found.records), len(found.blobs)
     what = f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, {size_text(found.size_bytes)}"
-    return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
+    verb = "deleted" if delete else "would delete"
+    console.print(f"{verb}: {what}; {size_text(found.kept_bytes)} stay", highlight=False)
+    if not delete and (found.records or found.blobs or found.runs):
+        console.print("nothing was deleted; use --delete to delete these results")
 
 
 def pin_run(store: Store, console: Console, run: str, *, name: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -51,6 +50,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         cache: the cache folder; by default that of a preset that is run in the current folder.
         out: the folder of the results, with the same default.
     """
+    from pano_mvs.cli.cache.command import cache_root
     from pano_mvs.cli.doctor.checks import (
         folder_finding,
         kernel_cache_finding,
@@ -60,15 +60,13 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     )
     from pano_mvs.cli.doctor.libraries import library_findings
     from pano_mvs.engine.stages.registry import Registry
-    from pano_mvs.results.summary import CACHE_VARIABLE
     from pano_mvs.session.session import presets_folder
 
     yield from package_findings()
     yield from library_findings()
     yield from machine_findings()
     yield kernel_cache_finding()
-    variable = os.environ.get(CACHE_VARIABLE)
-    yield folder_finding("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
+    yield folder_finding("cache", cache_root(cache), "--cache DIR")
     yield folder_finding("results", out or Path("out"), "--out DIR")
     yield from plugin_findings(Registry.installed(), presets_folder())
 
@@ -90,7 +88,7 @@ def show(findings: Sequence[Finding], console: Console, *, as_json: bool = False
     for finding in findings:
         if finding.remedy:
             head = f"[{_COLOURS[finding.state]}]{finding.state}:[/] {escape(finding.what)}"
-            console.print(f"{head}: {escape(finding.remedy)}", highlight=False, soft_wrap=True)
+            console.say(f"{head}: {escape(finding.remedy)}")
     warned = sum(finding.state == "warning" for finding in findings)
     verdict = f"{len(failed)} failed: a run cannot work" if failed else "a run can work"
     console.print(f"{verdict}; {warned} {plural(warned, 'warning')}", highlight=False)

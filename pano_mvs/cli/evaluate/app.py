@@ -6,60 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import typer
+from rich.markup import escape
 from typer.core import TyperGroup
 
-from pano_mvs.cli.console import Console
+from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.error_messages import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 
 _FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
-
-EstimatesArgument = Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")]
-TruthOption = Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")]
-OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
-]
-AlignOption = Annotated[
-    Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to its truth by one factor.")
-]
-ScaleOption = Annotated[
-    str, typer.Option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
-]
-UnitOption = Annotated[float, typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")]
-TruthUnitOption = Annotated[float, typer.Option("--truth-unit", help="Unit of the true ranges.")]
-PeakOption = Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.")]
-BadOption = Annotated[
-    list[str], typer.Option("--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.")
-]
-MinConfidenceOption = Annotated[
-    int,
-    typer.Option(
-        "--min-confidence",
-        min=0,
-        max=255,
-        help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
-    ),
-]
-MasksOption = Annotated[Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")]
-MaskOption = Annotated[Path | None, typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.")]
-ImagesOption = Annotated[
-    Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
-]
-ErrorLimitOption = Annotated[
-    float, typer.Option("--error-limit", help="Relative error at the end of the colour scale.")
-]
-BaselineOption = Annotated[
-    Literal["best", "median", "mean"], typer.Option("--baseline", help="Constant range to compare with.")
-]
-PosesOption = Annotated[
-    Path | None, typer.Option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
-]
-TruePosesOption = Annotated[
-    Path | None, typer.Option("--true-poses", help="True poses, for the scale; default: those of the ground truth.")
-]
-CsvOption = Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")]
 
 
 class RunByDefault(TyperGroup):
@@ -105,7 +60,7 @@ def poses(
     as_json: JsonOption = False,
 ) -> None:
     """Compare poses with ground truth, regardless of their frames and units."""
-    from pano_mvs.cli.evaluate.printing import print_json, print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import evaluate_poses
 
     evaluation = evaluate_poses(model, truth)
@@ -140,7 +95,7 @@ def cloud(
     as_json: JsonOption = False,
 ) -> None:
     """Compare a cloud with ground truth: accuracy, completeness, F-score."""
-    from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import evaluate_cloud, write_error_clouds, write_overview
 
     evaluation = evaluate_cloud(cloud, truth, poses=poses, true_poses=true_poses, thresholds=thresholds)
@@ -153,34 +108,65 @@ def cloud(
         return
     print_summary(evaluation.summary(), Console())
     if out is not None:
-        print_line(f"accuracy.ply, completeness.ply and images of the errors are in {out}", Console())
+        Console().say(escape(f"accuracy.ply, completeness.ply and images of the errors are in {out}"))
 
 
 @evaluate_app.command("depth")
 @guarded
 def depth(
-    source: EstimatesArgument,
-    truth: TruthOption,
-    out: OutOption = None,
-    align: AlignOption = "none",
-    scale: ScaleOption = "auto",
-    unit: UnitOption = 1.0,
-    truth_unit: TruthUnitOption = 1.0,
-    peak: PeakOption = 10.0,
-    bad: BadOption = ["5%"],  # noqa: B006  # typer reads it and never changes it
-    min_confidence: MinConfidenceOption = 0,
-    masks: MasksOption = None,
-    mask: MaskOption = None,
-    images: ImagesOption = None,
-    error_limit: ErrorLimitOption = 0.1,
-    baseline: BaselineOption = "best",
-    poses: PosesOption = None,
-    true_poses: TruePosesOption = None,
-    csv: CsvOption = None,
+    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
+    ] = None,
+    align: Annotated[
+        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to its truth by one factor.")
+    ] = "none",
+    scale: Annotated[
+        str, typer.Option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
+    ] = "auto",
+    unit: Annotated[float, typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")] = 1.0,
+    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the true ranges.")] = 1.0,
+    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.")] = 10.0,
+    bad: Annotated[
+        list[str], typer.Option("--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.")
+    ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
+    min_confidence: Annotated[
+        int,
+        typer.Option(
+            "--min-confidence",
+            min=0,
+            max=255,
+            help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
+        ),
+    ] = 0,
+    masks: Annotated[
+        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.")
+    ] = None,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
+    ] = None,
+    error_limit: Annotated[
+        float, typer.Option("--error-limit", help="Relative error at the end of the colour scale.")
+    ] = 0.1,
+    baseline: Annotated[
+        Literal["best", "median", "mean"], typer.Option("--baseline", help="Constant range to compare with.")
+    ] = "best",
+    poses: Annotated[
+        Path | None, typer.Option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
+    ] = None,
+    true_poses: Annotated[
+        Path | None, typer.Option("--true-poses", help="True poses, for the scale; default: those of the ground truth.")
+    ] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
-    from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import (
         BadLimit,
         ScoreSettings,
@@ -215,9 +201,8 @@ def depth(
     print_summary(depth_summary(evaluation, baseline=baseline), Console())
     if out is not None:
         count = len(evaluation.views)
-        print_line(
-            f"{count} {plural(count, 'image')} of the errors, scores.json and scores.csv are in {out}", Console()
-        )
+        images_text = f"{count} {plural(count, 'image')} of the errors"
+        Console().say(escape(f"{images_text}, scores.json and scores.csv are in {out}"))
 
 
 def _scale(text: str) -> float | Literal["auto"]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from rich.box import SIMPLE
 from rich.markup import escape
 from rich.table import Table
@@ -21,7 +19,7 @@ def print_summary(summary: Summary, console: Console) -> None:
         if isinstance(part, TextTable):
             console.print(_rich_table(part))
         else:
-            print_line(part, console)
+            console.say(escape(part))
 
 
 def print_run(evaluation: RunEvaluation, console: Console) -> None:
@@ -29,23 +27,13 @@ def print_run(evaluation: RunEvaluation, console: Console) -> None:
     if (poses := evaluation.poses) is not None:
         print_scores(ScoresSummary(poses=poses.poses), console)
         if "registered_in_one_frame" in poses.poses:
-            print_line(poses.notes[0], console)
+            console.say(escape(poses.notes[0]))
     if evaluation.depth is not None:
         print_summary(depth_summary(evaluation.depth), console)
     if evaluation.cloud is not None:
         print_summary(evaluation.cloud.summary(), console)
     for result, reason in evaluation.not_compared.items():
-        print_line(f"{result}: not compared, {reason}", console)
-
-
-def print_line(text: str, console: Console) -> None:
-    """Print a line without wrapping it."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def print_json(values: dict[str, object]) -> None:
-    """Print one JSON object to standard output."""
-    print(json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False))
+        console.say(escape(f"{result}: not compared, {reason}"))
 
 
 def _rich_table(text: TextTable) -> Table:

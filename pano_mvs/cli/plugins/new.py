@@ -10,10 +10,10 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.core.paths import exists
@@ -112,11 +112,11 @@ def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> Non
             raise UsageError(f"{path} already exists; nothing was written. Choose another name or another --dir")
     for path, text in zip(paths, (plugin, test), strict=True):
         write_text(path, text)
-    console.print(f"wrote {escape(str(paths[0]))} and its test", highlight=False, soft_wrap=True)
+    console.say(f"wrote {escape(str(paths[0]))} and its test")
     console.print("use it in a workflow:", highlight=False)
     console.print(f"  plugins: [{name}.py]", highlight=False, markup=False)
     console.print(f"  stages:\n    {KINDS[kind].use.format(name=name)}", highlight=False, markup=False)
-    console.print(f"test it: pytest {escape(str(paths[1]))}", highlight=False, soft_wrap=True)
+    console.say(f"test it: pytest {escape(str(paths[1]))}")
 
 
 def show_kinds(console: Console) -> None:

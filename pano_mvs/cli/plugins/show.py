@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic_core import PydanticUndefined
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError, WorkflowError
 from pano_mvs.engine.stages.registry import Plugin, Registry
 from pano_mvs.engine.stages.stage import StageSpec
@@ -40,11 +40,9 @@ def show_plugins(console: Console, *, workflow: str | None = None, files: Sequen
     for (kind, name), mark in sorted(registry.registrations.items()):
         console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
     for clash in registry.clashes.values():
-        console.print(f"[red]twice:[/] {escape(clash)}", highlight=False, soft_wrap=True)
+        console.say(f"[red]twice:[/] {escape(clash)}")
     for plugin in registry.broken:
-        console.print(
-            f"[red]broken:[/] {escape(plugin.origin)}: {escape(plugin.error)}", highlight=False, soft_wrap=True
-        )
+        console.say(f"[red]broken:[/] {escape(plugin.origin)}: {escape(plugin.error)}")
         stages = [name for kind, name in plugin.names if kind == "stage"]
         if stages:
             console.print(f"  the whole of it: pano-mvs stage show {escape(stages[0])}", highlight=False)

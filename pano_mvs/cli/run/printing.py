@@ -43,7 +43,7 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     print_scores(summary.scores, console)
     _print_comparison(summary.all_scores, console)
     for note in summary.notes:
-        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+        console.say(f"note: {escape(note)}")
     if summary.left_over:
         count = len(summary.left_over)
         text = f"{count} {plural(count, 'file')} of an earlier run, which this run did not write,"
@@ -52,8 +52,11 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     count = len(summary.files)
     files = f"{count} {plural(count, 'file')}, {len(output.written)} written now"
     report = f"; open {escape(str(output.out / 'report.html'))} in a browser"
-    console.print(f"results in {escape(str(output.out))} ({files}){report}", highlight=False, soft_wrap=True)
-    _print_next(following, console)
+    console.say(f"results in {escape(str(output.out))} ({files}){report}")
+    if following:
+        console.print("next:", highlight=False)
+    for command in following:
+        console.say(f"  {escape(command)}")
 
 
 def next_commands(output: RunOutput, session: Session) -> list[str]:
@@ -76,25 +79,18 @@ def next_commands(output: RunOutput, session: Session) -> list[str]:
     return commands
 
 
-def _print_next(commands: Sequence[str], console: Console) -> None:
-    if commands:
-        console.print("next:", highlight=False)
-    for command in commands:
-        console.print(f"  {escape(command)}", highlight=False, soft_wrap=True)
-
-
 def _print_failures(summary: RunSummary, console: Console) -> None:
     causes = summary.failures
     for failure in causes[:_SHOWN_FAILURES]:
         text = f"{one_line(failure.label)}: {failure.cause} — {failure.consequence}"
-        console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        console.say(f"[red]failed:[/] {escape(text)}")
         if failure.log:
-            console.print(f"  log: {escape(failure.log)}", highlight=False, soft_wrap=True)
+            console.say(f"  log: {escape(failure.log)}")
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
     for image, rejected in summary.rejected.items():
         text = f"{one_line(image)}: {rejected.reason}"
-        console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        console.say(f"[yellow]left out:[/] {escape(text)}")
 
 
 def _print_poses(summary: RunSummary, console: Console) -> None:
@@ -109,13 +105,13 @@ def _print_poses(summary: RunSummary, console: Console) -> None:
 def print_verdict(verdict: Verdict, console: Console) -> None:
     """Print the verdict of the report and its findings."""
     if verdict.judgement:
-        console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)
+        console.say(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]")
     for finding in verdict.findings:
         if finding.mood in _MARKS:
             text = (
                 f"[{_COLORS[finding.mood]}]{_MARKS[finding.mood]}:[/] {escape(finding.text)} {escape(finding.remedy)}"
             )
-            console.print(text.rstrip(), highlight=False, soft_wrap=True)
+            console.say(text.rstrip())
 
 
 _COLORS = {"good": "green", "fair": "yellow", "bad": "red"}

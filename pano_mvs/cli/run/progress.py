@@ -10,13 +10,14 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import TextIO, cast
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.streams import apart
 from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
 from pano_mvs.session.progress import (
@@ -144,7 +145,7 @@ class ProgressDisplay:
             stages = [f"{one_line(name)} {_count(stage)}" for name, stage in self._running()]
             stages += filter(None, [self._compiling()])
         now = f" (now: {shortened_list(stages)})" if stages else ""
-        self.console.print(escape(f"{100 * left.done:.0f} %, {text}{now}"), highlight=False, soft_wrap=True)
+        self.console.say(escape(f"{100 * left.done:.0f} %, {text}{now}"))
 
     def _running(self) -> list[tuple[str, StageProgress]]:
         return [(name, stage) for name, stage in self._estimator.stages.items() if stage.running]
@@ -167,9 +168,9 @@ class ProgressDisplay:
     def _print_failure(self, failure: UnitFailed) -> None:
         """Print a failure and the last lines of the unit's output."""
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
-        self.console.print(f"[red]failed[/] {escape(label)}", highlight=False, soft_wrap=True)
+        self.console.say(f"[red]failed[/] {escape(label)}")
         for line in failure.said[-_SHOWN_LINES:]:
-            self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
+            self.console.say(f"  | {escape(line)}")
 
     def _print_stage(self, summary: StageFinished) -> None:
         """Print what a stage did."""

@@ -8,8 +8,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.progress import ProgressDisplay, _Repeated
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.session.progress import (
