@@ -79,6 +79,7 @@ def test_a_preset_reads_the_scenes_of_a_tour_that_it_is_given(tmp_path: Path, la
     session = open_session("quickstart", images=folder)
     stage = session.workflow.stages["images"]
     assert stage.spec.name == "source.tour"
+    assert isinstance(stage.params, TourParams)
     notes = next(iter(list_tour(stage.params))).notes
     assert notes == ("2 scenes of a virtual tour are read from the faces of their cubes",)
 
