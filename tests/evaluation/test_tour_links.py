@@ -1,0 +1,44 @@
+"""Links of virtual tours are compared with the directions of cameras."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from tests.benchmarks.poses.tours.links import offsets, read_links
+from tests.evaluation.test_placements import poses_of
+
+
+def test_links_are_read_from_the_scenes_of_a_tour(tmp_path: Path) -> None:
+    scenes = [
+        {"id": "0-hall", "linkHotspots": [{"yaw": 0.5, "pitch": 0.1, "target": "1-room"}]},
+        {"id": "1-room", "linkHotspots": []},
+    ]
+    (tmp_path / "app-files").mkdir()
+    (tmp_path / "app-files/data.js").write_text(f"var APP_DATA = {json.dumps({'scenes': scenes})};\n")
+    assert read_links(tmp_path) == (2, {("0-hall", "1-room"): 0.5})
+    with pytest.raises(SystemExit, match=r"no data\.js"):
+        read_links(tmp_path / "nothing")
+
+
+def test_a_link_is_off_by_the_angle_to_the_other_camera() -> None:
+    """The room lies in front of the hall, and the hall to the right of the room's camera."""
+    turned = rotation_from_rotvec(np.array([0.0, np.pi / 2, 0.0]))
+    cameras = {
+        "0-hall.png": Rigid3.from_center(np.eye(3), np.zeros(3)),
+        "1-room.png": Rigid3.from_center(turned.T, np.array([0.0, 0.0, 2.0])),
+    }
+    ray = cameras["1-room.png"].rotation @ np.array([0.0, 0.0, -2.0])
+    links = {
+        ("0-hall", "1-room"): np.deg2rad(10.0),
+        ("1-room", "0-hall"): float(np.arctan2(ray[0], ray[2])) + 2 * np.pi,
+        ("0-hall", "2-garden"): 1.0,
+    }
+    poses = poses_of(cameras, doubts={"1-room.png": "a reason"})
+    there, back = offsets(poses, links)
+    assert (there.scene, there.target, there.off_deg, there.doubted) == ("0-hall", "1-room", pytest.approx(10.0), True)
+    assert back.off_deg == pytest.approx(0.0, abs=1e-6)
