@@ -23,7 +23,7 @@ from pano_mvs.algorithms.two_view.significance import (
 from pano_mvs.algorithms.two_view.upright import upright_poses
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3, angle_between
+from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
 from pano_mvs.scene import Features, TwoView
 
 FloatArray = NDArray[np.float64]
@@ -38,6 +38,8 @@ _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
 MAX_LOG10_LEARNED = -50.0
 """For learned matches: about where a pair is as likely right as wrong (see docs/learned.md, False pairs)."""
+_ALIKE_DEG = 5.0
+"""Learned matches that a rotation alone brings as close must be more significant (see docs/learned.md, False pairs)."""
 
 
 @checks_settings
@@ -68,7 +70,8 @@ def verify_pair(
     A network matches by the arrangement of key points as well, so that its false matches, such as those of equal doors
     and windows, agree with one another far more often than shuffled ones, mostly on a pose that keeps an upright camera
     upright. If both images have learned key points, a pose must therefore be far more significant, and upright poses
-    are not sought.
+    are not sought. It must be still more significant if a rotation alone nearly explains its inliers: what looks alike
+    in two places, such as two rows of lockers, mostly matches as if it were seen from one place.
 
     Args:
         first: key points of the first image.
@@ -89,8 +92,7 @@ def verify_pair(
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
     learned = bool(first.learned and second.learned)
-    most = MAX_LOG10_LEARNED if learned else MAX_LOG10_FALSE_ALARMS
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, most)
+    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, learned)
     count = len(matches_idx)
     if count < max(min_inliers, MIN_MATCHES):
         return pair.failed(f"{count} {plural(count, 'match', 'matches')}, {max(min_inliers, MIN_MATCHES)} needed")
@@ -193,7 +195,7 @@ class _Pair:
     rng: np.random.Generator
     threshold_rad: float
     min_inliers: int
-    max_log10_false_alarms: float = MAX_LOG10_FALSE_ALARMS
+    learned: bool = False
 
     def failed(self, reason: str) -> TwoView:
         """Return the falsy value of the pair with all its matches."""
@@ -225,7 +227,15 @@ class _Pair:
             models_per_sample=models,
         )
         enough = witnesses >= self.min_inliers
-        return _Evidence(pose, count, witnesses, alarms, enough, self.max_log10_false_alarms)
+        return _Evidence(pose, count, witnesses, alarms, enough, self._most(inliers))
+
+    def _most(self, inliers: NDArray[np.bool_]) -> float:
+        """Return the logarithm of the most false alarms with which a pose is accepted."""
+        if not self.learned:
+            return MAX_LOG10_FALSE_ALARMS
+        p, q = self.p[inliers], self.q[inliers]
+        left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
+        return MAX_LOG10_LEARNED * max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)) ** 3
 
     def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
         """Return the geometry of a pose with inliers, and the parallax of each inlier in radians."""
@@ -258,6 +268,8 @@ class _Pair:
             agreeing = _agreeing(evidence.witnesses, len(self.p))
             few = f"{self.min_inliers} needed"
             chance = "which may be chance: the images may not overlap"
+            if self.learned and evidence.log10_false_alarms <= MAX_LOG10_LEARNED:
+                chance = "but a rotation nearly explains them: the images may show two things that look alike"
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
         view, parallax = self.view(evidence)
         reason = _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)

@@ -3,9 +3,10 @@
 Each DIR is a capture with truth.json, see `tests.benchmarks.poses.tours.measure`. Each panorama is matched with those
 that have the most similar learned key points, as `matches.lightglue` does. The best relative pose of each pair is right
 if it agrees with the truth to 3° and 6°, or to 6° and 15° where the truth was drawn by hand. The table shows right and
-wrong pairs by log₁₀ of their false alarms. Below is where a logistic regression on the logarithm of this exponent gives
-even odds, which is the limit of `verify_pair` for learned matches. Results stay in DIR/pairs, also those of a run that
-was interrupted.
+wrong pairs by log₁₀ of their false alarms and by the median angle that the best rotation leaves between the matches
+that agree, and how many of them `verify_pair` accepts. Below is where a logistic regression on the logarithm of this
+exponent gives even odds, which is the limit of `verify_pair` for learned matches. Results stay in DIR/pairs, also those
+of a run that was interrupted.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,12 +29,13 @@ from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.frame.vertical_lines import up_of_panorama
 from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
-from pano_mvs.scene import Features, TwoView
+from pano_mvs.geometry import angle_between, geodesic_angle, nearest_rotation
+from pano_mvs.scene import Features
 from tests.benchmarks.poses.precision import cached
 from tests.benchmarks.poses.tours.measure import read_truth
 
 EDGES = (-np.inf, -200.0, -100.0, -75.0, -50.0, -35.0, -25.0, -15.0, -6.0, np.inf)
+LEFT_DEG = (0.0, 3.0, 5.0, 8.0, np.inf)
 _EXACT_DEG, _DRAWN_DEG = (3.0, 6.0), (6.0, 15.0)
 
 
@@ -51,14 +54,17 @@ def candidates(first: Features, second: Features) -> np.ndarray:
     return np.concatenate([own, match_learned(first, second)])
 
 
-def best_pose(view: TwoView) -> Rigid3 | None:
-    """Return the best relative pose of a pair, verified or not; None if there is no hypothesis."""
-    best = view if view else next(iter(view.alternatives), None)
-    return None if best is None else Rigid3(best.rotation, best.direction)
+class JudgedPair(NamedTuple):
+    """A pair with a hypothesis: log₁₀ of its false alarms, what a rotation leaves, and whether the pose is right."""
+
+    exponent: float
+    left_deg: float
+    accepted: bool
+    right: bool
 
 
-def judged_pairs(capture: Path, *, neighbours: int) -> Iterator[tuple[float, bool]]:
-    """Yield log₁₀ of the false alarms of each pair with a hypothesis, and whether its pose is right."""
+def judged_pairs(capture: Path, *, neighbours: int) -> Iterator[JudgedPair]:
+    """Yield the pairs of a capture that have a hypothesis."""
     truth = read_truth(capture)
     assert truth is not None, f"{capture} has no truth.json with headings"
     poses, limits = truth
@@ -71,11 +77,12 @@ def judged_pairs(capture: Path, *, neighbours: int) -> Iterator[tuple[float, boo
         ends = found[first], found[second]
         matches = cached(folder / f"{first}_{second}.pkl", partial(candidates, *ends))
         view = verify_pair(*ends, matches, rng=np.random.default_rng(0))
-        pose, true = best_pose(view), poses[second] @ poses[first].inverse()
-        if pose is not None:
-            turned = geodesic_angle(pose.rotation, true.rotation)
-            off = angle_between(pose.translation, true.translation)
-            yield view.log10_false_alarms, bool(np.all(np.rad2deg([turned, off]) < most))
+        best, true = view if view else next(iter(view.alternatives), None), poses[second] @ poses[first].inverse()
+        if best is not None:
+            off = geodesic_angle(best.rotation, true.rotation), angle_between(best.direction, true.translation)
+            p, q = (end.bearings[idx] for end, idx in zip(ends, best.matches_idx.T, strict=True))
+            left = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
+            yield JudgedPair(view.log10_false_alarms, float(left), bool(view), bool(np.all(np.rad2deg(off) < most)))
 
 
 def even_exponent(exponents: np.ndarray, right: np.ndarray) -> float:
@@ -99,11 +106,13 @@ def main() -> None:
     parser.add_argument("--neighbours", type=int, default=8)
     given = parser.parse_args()
     pairs = [pair for capture in given.captures for pair in judged_pairs(capture, neighbours=given.neighbours)]
-    exponents, right = np.array([one for one, _ in pairs]), np.array([one for _, one in pairs], np.bool_)
-    print("| log₁₀ of the false alarms | right | wrong |\n|---|---|---|")
-    for low, high in pairwise(EDGES):
-        inside = (exponents > low) & (exponents <= high)
-        print(f"| {low:g} to {high:g} | {int((inside & right).sum())} | {int((inside & ~right).sum())} |")
+    exponents, left, accepted, right = (np.array(column) for column in zip(*pairs, strict=True))
+    print("| log₁₀ of the false alarms | left by a rotation | right | wrong | accepted: right | wrong |")
+    print("|---" * 6 + "|")
+    for (low, high), (near, far) in product(pairwise(EDGES), pairwise(LEFT_DEG)):
+        inside = (exponents > low) & (exponents <= high) & (left >= near) & (left < far)
+        counts = (int((inside & one).sum()) for one in (right, ~right, accepted & right, accepted & ~right))
+        print(f"| {low:g} to {high:g} | {near:g}° to {far:g}° | " + " | ".join(map(str, counts)) + " |")
     print(f"even odds at {even_exponent(exponents, right):.0f}")
 
 
