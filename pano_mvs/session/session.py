@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.paths import exists, is_denied, is_folder, problem_of, resolved
 from pano_mvs.engine.planning.plan import DEFAULT_OPTIONS, RunOptions
-from pano_mvs.engine.stages.params import files_of
+from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
@@ -31,7 +32,7 @@ class Session:
     run_options: RunOptions = DEFAULT_OPTIONS
 
 
-_VIDEO_SOURCE, _TOUR_SOURCE = "source.video", "source.tour"
+_FOLDER_SOURCE, _VIDEO_SOURCE, _TOUR_SOURCE = "source.folder", "source.video", "source.tour"
 
 
 def presets_folder() -> Path:
@@ -64,7 +65,8 @@ def open_session(
 ) -> Session:
     """Find, validate and wire a workflow.
 
-    If `images` holds a virtual tour, its stage of images becomes source.tour, unless `overrides` name another one.
+    If `images` holds a virtual tour, source.tour takes the place of source.folder with the settings that both have,
+    unless `overrides` name a source.
 
     The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
     preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
@@ -80,8 +82,6 @@ def open_session(
         raise InputError("--images: the name of the folder is empty. Give the folder that holds the panoramas")
     images = None if images is None else Path(images)
     mistake = None if images is None else _images_mistake(images)
-    if images is not None and is_folder(images) and is_tour(images):
-        overrides = [f"images.use={_TOUR_SOURCE}", *overrides]  # before the user's own, which prevail
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
@@ -99,6 +99,10 @@ def open_session(
             f"--images {images}: this is a video. Use the preset walk, or "
             f"--set images.use={_VIDEO_SOURCE} --set pairs.use=pairs.sequential"
         )
+    chosen = any(override.partition("=")[0].strip() == "images.use" for override in overrides)
+    if images is not None and not chosen and workflow.stages["images"].spec.name == _FOLDER_SOURCE and is_tour(images):
+        overrides = [*_tour_overrides(workflow.stages["images"].params, registry), *overrides]
+        workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
     root = Path(cache) if cache else default_cache(path, is_preset=is_preset)
@@ -110,6 +114,15 @@ def open_session(
             "among its own. Choose another folder"
         )
     return session
+
+
+def _tour_overrides(params: Params, registry: Registry) -> list[str]:
+    """Return what makes source.tour the stage of images, with the settings of source.folder that it has as well."""
+    shared = registry.stages[_TOUR_SOURCE].params_type.model_fields.keys() & type(params).model_fields.keys() - {"path"}
+    return [
+        f"images.use={_TOUR_SOURCE}",
+        *(f"images.{name}={json.dumps(getattr(params, name))}" for name in sorted(shared)),
+    ]
 
 
 def default_cache(workflow: Path, *, is_preset: bool) -> Path:

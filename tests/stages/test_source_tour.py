@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.faces.sampling import CUBE
-from pano_mvs.core.errors import InputError
+from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid
 from pano_mvs.io.images.captures import is_tour, list_scenes
@@ -82,6 +82,39 @@ def test_a_preset_reads_the_scenes_of_a_tour_that_it_is_given(tmp_path: Path, la
     assert isinstance(stage.params, TourParams)
     notes = next(iter(list_tour(stage.params))).notes
     assert notes == ("2 scenes of a virtual tour are read from the faces of their cubes",)
+
+
+def test_a_tour_keeps_the_settings_that_both_sources_have(tmp_path: Path) -> None:
+    folder = write_tour(tmp_path / "tour", "Marzipano")
+    session = open_session("fast", images=folder, overrides=["images.nadir_deg=25"])
+    params = session.workflow.stages["images"].params
+    assert isinstance(params, TourParams)
+    assert (params.path, params.max_width, params.nadir_deg) == (folder, 1024, 25.0)
+    with pytest.raises(WorkflowError, match="mask_folder") as caught:
+        open_session("fast", images=folder, overrides=["images.mask_folder=x"])
+    assert "source.tour" not in str(caught.value), "nobody has named it"
+
+
+def test_a_workflow_without_a_stage_of_images_gets_one_error(tmp_path: Path) -> None:
+    folder = write_tour(tmp_path / "tour", "Marzipano")
+    workflow = tmp_path / "own.yaml"
+    workflow.write_text(f"pano_mvs: 1\nstages:\n  pictures: {{use: source.folder, path: {folder}}}\n")
+    with pytest.raises(WorkflowError, match="no stage called 'images'") as caught:
+        open_session(workflow, images=folder)
+    assert "source.tour" not in str(caught.value)
+
+
+def test_panoramas_are_not_taken_for_a_tour(tmp_path: Path) -> None:
+    """Names of dates may look like tiles, and a folder of panoramas may also hold a tour that was made of them."""
+    for name in ("d3_01", "d3_02", "f4_01"):
+        write(tmp_path / f"dates/12/{name}.png", face_of("f"))
+    assert not is_tour(tmp_path / "dates")
+    folder = write_tour(tmp_path / "tour", "Marzipano")
+    assert is_tour(folder)
+    write(folder / "panorama.png", face_of("f"))
+    assert not is_tour(folder)
+    write_tour(tmp_path / "one", "Marzipano", ("hall",))
+    assert not is_tour(tmp_path / "one")
 
 
 def test_a_named_source_and_plain_pictures_are_not_taken_for_a_tour(tmp_path: Path) -> None:

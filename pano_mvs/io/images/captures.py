@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -254,17 +254,10 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
     Raises:
         InputError: if there is no complete scene.
     """
-    found: dict[str, dict[int, dict[tuple[str, int, int], Path]]] = {}
     pictures = [path for path in files_below(folder, notes) if path.suffix.lower() in PICTURE_SUFFIXES]
-    layouts = _TILES if any(_tile(folder, path, _TILES) for path in pictures) else _SIX_FILES
-    for path in pictures:
-        match = _tile(folder, path, layouts)
-        if match is None:
-            continue
-        groups = match.groupdict()
-        face = _NAMES.get(groups["face"].lower(), groups["face"].lower())
-        tile = face, int(groups.get("row") or 0), int(groups.get("column") or 0)
-        found.setdefault(groups["scene"], {}).setdefault(int(groups.get("level") or 0), {})[tile] = path
+    found = _scenes(folder, pictures, _TILES)
+    if not any(map(_finest, found.values())):
+        found = _scenes(folder, pictures, _TILES + _SIX_FILES)
     scenes = {name: tiles for name, levels in found.items() if (tiles := _finest(levels))}
     if incomplete := [name or folder.name for name in found if name not in scenes]:
         notes.append(f"{len(incomplete)} scenes have no complete cube and are skipped: {shortened_list(incomplete)}")
@@ -279,16 +272,30 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
 
 
 def is_tour(folder: Path) -> bool:
-    """Return whether a folder holds tiles of a virtual tour's cubes; six files for each scene do not count."""
+    """Return whether a folder holds tiles of two complete cubes or more, and no picture outside of its subfolders."""
     try:
-        return any(_tile(folder, path, _TILES) for path in files_below(folder, []))
+        pictures = [path for path in files_below(folder, []) if path.suffix.lower() in PICTURE_SUFFIXES]
     except InputError:
         return False
+    complete = sum(bool(_finest(levels)) for levels in _scenes(folder, pictures, _TILES).values())
+    return complete > 1 and all(path.parent != folder for path in pictures)
 
 
-def _tile(folder: Path, path: Path, layouts: Sequence[re.Pattern[str]]) -> re.Match[str] | None:
-    place = path.relative_to(folder).with_suffix("").as_posix()
-    return next((match for layout in layouts if (match := layout.fullmatch(place))), None)
+def _scenes(
+    folder: Path, pictures: Iterable[Path], layouts: Sequence[re.Pattern[str]]
+) -> dict[str, dict[int, dict[tuple[str, int, int], Path]]]:
+    """Return the tiles of each scene by level, then by face, row and column."""
+    found: dict[str, dict[int, dict[tuple[str, int, int], Path]]] = {}
+    for path in pictures:
+        place = path.relative_to(folder).with_suffix("").as_posix()
+        match = next((match for layout in layouts if (match := layout.fullmatch(place))), None)
+        if match is None:
+            continue
+        groups = match.groupdict()
+        face = _NAMES.get(groups["face"].lower(), groups["face"].lower())
+        tile = face, int(groups.get("row") or 0), int(groups.get("column") or 0)
+        found.setdefault(groups["scene"], {}).setdefault(int(groups.get("level") or 0), {})[tile] = path
+    return found
 
 
 def _below(name: str, shared: str) -> str:

@@ -72,6 +72,7 @@ def main(tours: list[Path], *, out: Path, workflow: str = "quality", until: str 
         scenes, links = read_links(tour)
         place, cache = out / tour.name / "run", out / tour.name / "cache"
         command = [sys.executable, "-m", "pano_mvs", "run", workflow, "--images", str(tour), "--until", until]
+        command += ["--set", "images.use=source.tour"]
         done = subprocess.run([*command, "--out", str(place), "--cache", str(cache)], capture_output=True, text=True)
         poses = pano_mvs.load(place, cache=cache).poses if done.returncode in (0, 3) else None  # 3: some are left out
         groups = [] if poses is None else list(split_groups(poses))
