@@ -170,12 +170,12 @@ def test_touching_one_image_under_known_poses_runs_exactly_its_units(pano_mvs: C
     assert stages["poses"] == 1, "it looks whether the pictures are those whose poses the file records"
 
 
-def test_real_rooms_on_pictures_without_overlap_ends_with_the_reasons(pano_mvs: Command, capture: Path) -> None:
+def test_pictures_without_overlap_end_with_the_reasons(pano_mvs: Command, capture: Path) -> None:
     rng = np.random.default_rng(0)
     for path in sorted((capture / "images").iterdir()):
         noise = rng.integers(0, 255, (SIZE_HW[0] // 8, SIZE_HW[1] // 8, 3), dtype=np.uint8)
         cv2.imwrite(str(path), cv2.resize(noise, SIZE_HW[::-1], interpolation=cv2.INTER_CUBIC))
-    result = pano_mvs("run", "real_rooms", "--images", capture / "images", "--out", "out", *SMALL)
+    result = pano_mvs("run", "quality", "--images", capture / "images", "--out", "out", *SMALL)
     assert result.code == 4
     assert "no two panoramas could be registered" in result.flat
     assert not Path("out/cloud.ply").exists()
