@@ -103,6 +103,7 @@ def test_the_costs_decide_what_is_doubted() -> None:
     assert (outcome.right, outcome.wrong, outcome.right_doubted, outcome.wrong_silent) == (2, 2, 1, 1)
 
 
+@pytest.mark.slow
 def test_every_measurement_that_is_fitted_is_measured() -> None:
     tiny = tiny_capture(Variant(size_hw=(128, 256)))
     poses = Poses.without_points(dict(zip(tiny.names, tiny.poses, strict=True)), frame="x", scale="x", metric=True)

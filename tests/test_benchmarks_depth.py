@@ -29,6 +29,7 @@ ROOM = Place("weak_room", 64, 2, arguments=(("seed", 1),))
 SMALL = "depth.planes=16 depth.near=1.0 depth.far=6.0"
 
 
+@pytest.mark.slow
 def test_every_mechanism_makes_a_valid_workflow_of_its_own(tmp_path: Path) -> None:
     keys = set()
     for one in (FULL, *MECHANISMS):

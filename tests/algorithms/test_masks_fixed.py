@@ -103,6 +103,7 @@ def share(pixels: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
     return float(AREA[pixels & of].sum() / AREA[of].sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_rigs_are_found(views: list[NDArray[np.uint8]], name: str) -> None:
     pictures, truth = with_rigs(views, name)

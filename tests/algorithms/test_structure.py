@@ -74,6 +74,7 @@ def planes(box: Box) -> Structure:
     return box.structure()
 
 
+@pytest.mark.slow
 def test_edges_place_walls_whose_ranges_are_biased(planes: Structure) -> None:
     planes.check()
     expected = np.concatenate([sign * np.eye(3) for sign in (1.0, -1.0)])

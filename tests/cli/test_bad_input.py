@@ -120,6 +120,7 @@ def test_output_folder_that_cannot_be_written(pano_mvs: Command, short: Path) ->
         assert pano_mvs("run", short, "--out", "locked/out").code == 2
 
 
+@pytest.mark.slow
 def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: Path) -> None:
     rng = np.random.default_rng(1)
     for name in ("002.png", "003.png"):
@@ -199,6 +200,7 @@ def test_linked_folders_are_followed_and_loops_end(pano_mvs: Command, short: Pat
     assert run_json(Path("out"))["stages"][0]["units"] == 4
 
 
+@pytest.mark.slow
 def test_damaged_poses_are_computed_again(pano_mvs: Command, capture: Path) -> None:
     arguments = ("run", "quickstart", "--images", capture / "images", "--cache", "cache", "--out", "out", *TO_POSES)
     assert pano_mvs(*arguments).code == 0

@@ -40,6 +40,7 @@ def alone(tmp_path: Path, capture: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["locked/in", "locked/in/a.yaml", "n" * 300, "circle/x", "a\0b"])
 def test_path_that_cannot_be_looked_at_is_no_bug(pano_mvs: Command, path: str) -> None:
     """`is_file` and its like raised below folders that may not be searched, and for names that are too long."""

@@ -324,6 +324,7 @@ def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: T
     assert cache("ls")[0] == 0
 
 
+@pytest.mark.slow
 def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cache) -> None:  # noqa: F811
     """Everything is collected, again and again, while two processes compute; the run heals what it finds gone.
 
@@ -432,6 +433,7 @@ def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: C
     assert files_of(toy.folder / "cache") == before
 
 
+@pytest.mark.slow
 def test_cache_that_cannot_be_written_says_so(toy: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     """By permissions, or, where these do not bind us, by a stand-in of the calls that would fail."""
     toy.run()

@@ -53,6 +53,7 @@ def test_a_new_plugin_keeps_its_contract(written: Path, kind: str) -> None:
         contract_test.check()
 
 
+@pytest.mark.slow
 def test_new_plugins_run_in_a_workflow(pano_mvs: Command, written: Path) -> None:
     files = ", ".join(str(written / f"new_{kind}.py") for kind in KINDS)
     images = tiny_capture(Variant((32, 64))).folder / "images"

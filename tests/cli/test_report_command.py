@@ -26,6 +26,7 @@ def pictures(page: Page) -> dict[str | None, str | None]:
     return {attrs["alt"]: attrs["src"] for attrs in page.all("img") if attrs["alt"]}
 
 
+@pytest.mark.slow
 def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, tmp_path: Path) -> None:
     write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=(48, 96))
     truth = tmp_path / "capture" / "truth"
@@ -138,6 +139,7 @@ def test_a_run_that_does_nothing_leaves_the_report_before(pano_mvs: Command, toy
     assert json.loads((toy.folder / "out" / "run.json").read_text())["exit_code"] == 0
 
 
+@pytest.mark.slow
 def test_what_an_interrupted_run_had_made_is_shown(
     pano_mvs: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -148,6 +148,7 @@ WORDS = st.text(st.characters(min_codepoint=32, max_codepoint=0x2FF, exclude_cat
 TRICKY = st.sampled_from(["null", "~", "yes", "no", "1", "1e5", "0x10", "0o7", "- a", "a: b", "#", "''", " a ", ".inf"])
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(
     text=WORDS | TRICKY,

@@ -63,6 +63,7 @@ def test_a_plugins_cost_is_run_and_cached_by_its_code(pano_mvs: Command, workflo
     assert "3 units computed" in pano_mvs("run", workflow).flat
 
 
+@pytest.mark.slow
 def test_a_plugins_backend_is_run(pano_mvs: Command, workflow: Path) -> None:
     result = pano_mvs("run", workflow, "--set", "depth.backend=mine", "--set", "depth.cost=sad")
     assert result.code == 0, result.text

@@ -86,6 +86,7 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, st
     return {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="kernel files are not locked there")
 def test_processes_that_need_the_same_kernel_compile_it_once(environment: dict[str, str]) -> None:
     import fcntl
@@ -102,6 +103,7 @@ def test_processes_that_need_the_same_kernel_compile_it_once(environment: dict[s
     assert sorted(process.communicate()[0] for process in started) == ["0 True True\n", "1 True True\n"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="another variable names the folder for caches")
 def test_copies_share_kernels_until_one_is_edited(tmp_path: Path, environment: dict[str, str]) -> None:
     """Even where the edited copy inherits the folder of the other one, and the edit is in another file."""

@@ -23,6 +23,7 @@ def block(mark: str) -> str:
     return found.group(1)
 
 
+@pytest.mark.slow
 def test_plugin_and_workflow_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_capture(tmp_path / "room", default_room(), capture_poses(3, spread=0.4), size_hw=(128, 256))
     (tmp_path / "room" / "images").rename(tmp_path / "photos")

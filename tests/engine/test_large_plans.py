@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 from collections import Counter
 
+import pytest
+
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.units import Unit
@@ -12,6 +14,7 @@ from pano_mvs.session.session import open_session
 from tests.engine.conftest import Toy
 
 
+@pytest.mark.slow
 def test_a_plan_takes_units_one_at_a_time(toy: Toy) -> None:
     for number in range(20, 40):
         toy.number(f"{number}.txt", str(number))

@@ -28,6 +28,7 @@ def run(folder: Path) -> dict[str, int]:
     return {stage.name: stage.run for stage in result.stages if stage.run}
 
 
+@pytest.mark.slow
 def test_one_more_picture_runs_what_it_touches_and_nothing_else(folder: Path) -> None:
     assert run(folder)["matches"] == 8 * COUNT - 36
     more = write_picture(folder, COUNT)

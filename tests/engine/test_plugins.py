@@ -165,6 +165,7 @@ def test_a_relative_plugin_folder_is_refused(tmp_path: Path, monkeypatch: pytest
     assert not (tmp_path / "imported").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [["-m", "pano_mvs"], ["-P", "-c", "from pano_mvs.cli.app import main; main()"]])
 def test_nothing_is_imported_from_the_current_folder(tmp_path: Path, start: list[str]) -> None:
     trap = "import pathlib\npathlib.Path(__file__).with_suffix('.sprung').touch()\n"

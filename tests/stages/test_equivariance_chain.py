@@ -38,6 +38,7 @@ def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, E
     return measure(DenseChain("quality", overrides=SMALL), ScenePlace(scene, folder, SIZE[1]), folder, seed=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["depth", "slanted", "checked", "planes"])
 def test_rolled_pictures_give_the_rolled_range(found: dict[str, Equivariance], stage: str) -> None:
     median, above_1_percent = found[stage].roll

@@ -74,6 +74,7 @@ def workspace(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return write_workspace(out, capture.images, capture.poses, capture.ranges, points=3000, size_px=120)
 
 
+@pytest.mark.slow
 def test_colmap_fuses_the_workspace_to_the_walls(workspace: Path, capture: Capture) -> None:
     points = fused_points(workspace)
     assert len(points) > 20_000

@@ -55,6 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_folder_is_localised_and_the_rest_is_named(capture: Inputs, folder: Path, tmp_path: Path) -> None:
     ctx = Context(np.random.default_rng(0), tmp_path)
     found = localise(*capture, LocaliseParams(path=folder), ctx)

@@ -50,6 +50,7 @@ def verified(
     )
 
 
+@pytest.mark.slow
 def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
     poses = verified(tiny, ctx)
     assert ctx.notes == [f"{WRONG} was moved to another place, which the images confirm better"]

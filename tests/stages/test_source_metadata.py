@@ -93,6 +93,7 @@ def test_any_bytes_in_exif(places: list[tuple[int, int]], order: bool) -> None:
     read_with_neighbours(JPEG[:2] + app1(b"Exif\0\0" + changed) + JPEG[2:], "jpg")
 
 
+@pytest.mark.slow
 @given(data=st.data(), kind=st.sampled_from([*SOUND, *BOXES]))
 @settings(max_examples=100, deadline=None)
 def test_any_bytes_in_the_boxes_of_a_file(data: st.DataObject, kind: str) -> None:

@@ -10,6 +10,7 @@ import pytest
 from tests.stress import damage, hostile, kills, load
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "check", [damage.unnoticed_when_read, damage.not_healed_after_verification, damage.not_healed_by_running]
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
@@ -39,15 +40,17 @@ INPUTS: dict[str, dict[str, Any]] = {
     "features.aliked": {"features": None},  # those of the tiny capture, which the stage returns, too, are everywhere
     "export.splat_bundle": {"frames": {f"{idx:03d}.png": SplatFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
+# They run neural networks or render, a second or more at each call.
+SLOW = ("export.mesh_textured", "features.aliked", "masks.operator", "poses.localise")
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 
-def contract_tests() -> list[ContractTest]:
+def contract_tests() -> list[ParameterSet]:
     stages = Registry.installed().stages
     builtin = [name for name in sorted(stages) if stages[name].function.__module__.startswith("pano_mvs.stages.")]
     assert len(builtin) > 30
     return [
-        contract_test
+        pytest.param(contract_test, id=str(contract_test), marks=[pytest.mark.slow] if name in SLOW else [])
         for name in builtin
         for contract_test in stage_contract_tests(
             stages[name], settings=SETTINGS.get(name), inputs=INPUTS.get(name), size_hw=SIZES_HW.get(name, (32, 64))
@@ -55,6 +58,6 @@ def contract_tests() -> list[ContractTest]:
     ]
 
 
-@pytest.mark.parametrize("contract_test", contract_tests(), ids=str)
+@pytest.mark.parametrize("contract_test", contract_tests())
 def test_keeps_the_contract(contract_test: ContractTest) -> None:
     contract_test.check()

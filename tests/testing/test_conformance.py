@@ -348,6 +348,7 @@ def test_a_part_that_breaks_its_contract_is_caught(
         broken.check()
 
 
+@pytest.mark.slow
 def test_a_backend_that_finds_something_else_is_caught(tmp_path: Path) -> None:
     path = tmp_path / "backend.py"
     path.write_text(PARTS.format("backend", "return np.zeros(reference.shape[:2])"))

@@ -57,6 +57,7 @@ def test_density_is_the_same_across_the_seam(name: str, found: dict[str, Feature
     assert at_poles > 0.6 * len(x) * (1 - np.cos(0.2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_turning_the_camera_keeps_key_points_and_descriptors(name: str, turn: str, found: dict[str, Features]) -> None:

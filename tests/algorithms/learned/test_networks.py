@@ -117,6 +117,7 @@ def turned(features: Features, other: Features, new_from_old: NDArray[np.float64
     return len(matches), float(np.mean(off < np.deg2rad(0.5)))
 
 
+@pytest.mark.slow
 def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8], found: Features) -> None:
     """No view's centre is where it was, and what was on the seam is not."""
     rolled, new_from_old = roll_panorama(panorama, 200)
@@ -129,6 +130,7 @@ def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8]
     assert np.mean(near_seam[matched]) > 0.7 * np.mean(near_seam)
 
 
+@pytest.mark.slow
 def test_a_tilted_camera_is_levelled_by_its_zenith(panorama: NDArray[np.uint8], found: Features) -> None:
     tilt = rotation_from_rotvec([0.5, 0.0, -0.6])
     picture = rotate_panorama(panorama, tilt)
@@ -152,6 +154,7 @@ def test_a_photograph_matches_where_the_panorama_shows_the_same(panorama: NDArra
     assert len(match_photograph(blank, found)) == 0
 
 
+@pytest.mark.slow
 def test_the_record_is_valid_and_leaves_out_masked_pixels(panorama: NDArray[np.uint8], found: Features) -> None:
     found.check()
     assert found.learned == len(found) == 1500

@@ -154,6 +154,7 @@ def shown_points(poses: Poses, ranges: NDArray[Any]) -> NDArray[np.float64]:
     return result
 
 
+@pytest.mark.slow
 def test_alignment_places_observations_several_times_as_well_and_says_how_well(room: Room) -> None:
     poses, pictures = room
     aligned = align_tracks(poses, pictures.__getitem__)

@@ -221,6 +221,7 @@ def pictures() -> list[tuple[str, np.ndarray, np.ndarray]]:
     return [(f"b/{n} ä.png", render(default_room(), pose, (240, 480))[0], valid) for n, pose in enumerate(poses)]
 
 
+@pytest.mark.slow
 def test_colmaps_sift_respects_masks_and_registers(
     pictures: list[tuple[str, np.ndarray, np.ndarray]], tmp_path: Path
 ) -> None:
@@ -236,6 +237,7 @@ def test_colmaps_sift_respects_masks_and_registers(
     assert relative_pose_errors(by_name(poses), truth).median_pair_deg < 1
 
 
+@pytest.mark.slow
 def test_the_terminal_stays_quiet_and_the_log_level_is_restored(tmp_path: Path) -> None:
     code = (
         "import numpy as np, sys; from pathlib import Path; from tests.algorithms.poses.test_colmap_solver import *; "

@@ -86,6 +86,7 @@ def taken(request: pytest.FixtureRequest) -> tuple[Picture, Rigid3]:
     return photograph(*request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal_px", [None, 1.1 * FOCAL_PX])
 def test_a_photograph_is_localised(
     panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3], focal_px: float | None
@@ -125,6 +126,7 @@ def test_a_photograph_that_was_cropped_on_one_side_is_refused(model: Model) -> N
     assert "it seems to be cropped: its optical centre is" in found
 
 
+@pytest.mark.slow
 def test_patches_confirm_a_pose_of_few_key_points(model: Model, taken: tuple[Picture, Rigid3]) -> None:
     picture, pose = taken
     refused = localised(picture, model[0], focal_px=FOCAL_PX, max_keypoints=60)
@@ -153,6 +155,7 @@ def many(panoramas: dict[str, KnownPoints]) -> dict[str, KnownPoints]:
     return {name: panoramas.get(name, other) for name in names}
 
 
+@pytest.mark.slow
 def test_a_large_capture_gives_the_pose_of_the_panoramas_that_show_the_place(
     panoramas: dict[str, KnownPoints], many: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]
 ) -> None:

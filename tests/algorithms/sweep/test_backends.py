@@ -30,6 +30,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import CASES, agreement, share_alike, sweep_case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numba", "opencv"])
 def test_every_backend_gives_the_winners_of_the_readable_one(backend: str) -> None:
     shares = [agreement(number, backend) for number in range(CASES)]

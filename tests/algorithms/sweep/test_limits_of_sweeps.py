@@ -222,6 +222,7 @@ def swept_between(
     )
 
 
+@pytest.mark.slow
 def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(
     outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
 ) -> None:

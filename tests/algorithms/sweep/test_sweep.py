@@ -58,6 +58,7 @@ def _share_within(result: RangeMap, truth: NDArray[np.float32], ratio: float) ->
     return float(np.sum(weight * good) / weight.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "masked", "source_height"),
     [

@@ -48,6 +48,7 @@ def surface(folder: Path) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
     pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
 ) -> None:
@@ -163,6 +164,7 @@ def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: 
     np.testing.assert_array_equal(found, [0, -1, 0])
 
 
+@pytest.mark.slow
 def test_errors_are_written_as_clouds_and_drawn(
     pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
 ) -> None:

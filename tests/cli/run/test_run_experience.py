@@ -41,6 +41,7 @@ def events_of(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
+@pytest.mark.slow
 def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # noqa: F811
     toy.number("3.txt", "13")
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("noise", x.value)'))
@@ -64,6 +65,7 @@ def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # n
     assert set(begun.values()) == {1}
 
 
+@pytest.mark.slow
 def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:  # noqa: F811
     toy.edit(
         "plug.py",
@@ -75,6 +77,7 @@ def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:  # noqa
     assert {"a", "b"} <= set(err.split())
 
 
+@pytest.mark.slow
 def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noqa: F811
     for number in range(1, 6):
         toy.number(f"{number}.txt", "not a number")
@@ -168,6 +171,7 @@ def _read_until(process: subprocess.Popen[str], *words: str) -> None:
     pytest.fail(f"it ended with {code} and never said {words}, but {said} and {err}")
 
 
+@pytest.mark.slow
 @ON_POSIX
 def test_second_interrupt_ends_at_once(toy: Toy) -> None:  # noqa: F811
     """The units in flight may take an hour, and so may the run after the first interrupt."""
@@ -219,6 +223,7 @@ def _state(pid: int) -> str:
     return path.read_text() if path.is_file() else ""
 
 
+@pytest.mark.slow
 def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:  # noqa: F811
     toy.number("3.txt", "13")
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("just before")'))

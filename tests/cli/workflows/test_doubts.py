@@ -103,6 +103,7 @@ def test_a_camera_that_a_later_stage_clears_is_not_doubted(pano_mvs: Command, do
     assert run_json(Path("out"))["poses"]["doubts"] == {}
 
 
+@pytest.mark.slow
 def test_dense_results_doubt_a_camera_in_the_wrong_place_alone(pano_mvs: Command, capture: Path) -> None:
     result = pano_mvs("run", write_dense(capture.parent, capture, width=192), "--out", "out")
     assert result.code == 0, result.text

@@ -53,6 +53,7 @@ def test_stages_may_not_write_where_the_run_does_or_outside(pano_mvs: Command) -
         assert "stage 'images': to: " in result.flat
 
 
+@pytest.mark.slow
 def test_nothing_is_imported_from_the_current_folder_but_what_is_named(tmp_path: Path) -> None:
     """Modules that anything of ours might look for lie among somebody's pictures, and beside the workflow."""
     names = ("numpy", "numba", "json", "pickle", "random", "helper", "sitecustomize", "conftest", "jinja2")

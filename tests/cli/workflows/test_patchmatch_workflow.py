@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.cli.conftest import Command, run_json
 
 WORKFLOW = """\
@@ -19,6 +21,7 @@ stages:
 """
 
 
+@pytest.mark.slow
 def test_refinement_makes_more_pixels_consistent_and_all_more_precise(capture: Path, pano_mvs: Command) -> None:
     path = capture.parent / "planes.yaml"
     scores = {}

@@ -56,6 +56,7 @@ def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return out / "out", result.output
 
 
+@pytest.mark.slow
 def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, str]) -> None:
     out, _ = quickstart
     model = {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}

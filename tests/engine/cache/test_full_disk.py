@@ -74,6 +74,7 @@ def run(toy: Toy, *options: str) -> tuple[int, str]:
     return result.exit_code, " ".join(result.output.split())
 
 
+@pytest.mark.slow
 def test_disk_that_fills_up_anywhere_stops_the_run_and_loses_nothing(
     toy: Toy, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

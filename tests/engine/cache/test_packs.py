@@ -158,6 +158,7 @@ def test_small_packs_are_merged(tmp_path: Path) -> None:
         assert len(store.blobs.get(ref)) in (1, 50)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_cache_is_packed_while_a_run_uses_it(toy: Toy) -> None:
     for number in range(6, 25):
         toy.number(f"{number}.txt", str(10 * number))
@@ -192,6 +193,7 @@ PLANTED: dict[str, Callable[[Path], None]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no FIFOs")
 @pytest.mark.parametrize("what", PLANTED)
 @pytest.mark.parametrize("where", ["records", "blobs", "packs"])
@@ -264,6 +266,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no SIGKILL")
 def test_a_process_that_is_killed_while_it_packs_loses_nothing(tmp_path: Path) -> None:
     """Two at a time pack one cache; each is killed at a random moment, and others go on."""

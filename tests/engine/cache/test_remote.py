@@ -91,6 +91,7 @@ def test_a_run_goes_on_elsewhere_and_computes_nothing(
     assert is_whole(place), "the copy is a cache itself"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_an_object_store_holds_a_cache(computed: Store, bucket: str, tmp_path: Path) -> None:
     pushed = RemoteCache(bucket).push(computed)

@@ -147,6 +147,7 @@ def test_store_of_another_layout_is_refused(tmp_path: Path) -> None:
         Store(tmp_path)
 
 
+@pytest.mark.slow
 def test_much_damage_takes_few_passes(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each damaged blob made the run start over: hundreds of them in a large capture took hours."""
     for number in range(6, 20):

@@ -49,6 +49,7 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
     return {name for name, reach in edited.items() if reach.digest != as_it_is()[name].digest}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "old", "new", "stages"),
     [

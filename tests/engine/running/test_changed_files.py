@@ -139,6 +139,7 @@ def delivered(toy: Toy) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (toy.folder / "out").glob("*.out")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("after", "executor"),
     [

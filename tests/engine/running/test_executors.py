@@ -147,6 +147,7 @@ def test_killed_worker_costs_one_try(toy: Toy) -> None:
     assert ran(result) == ALL_UNITS
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_many_inputs_reach_workers_through_a_file(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half a million of them as one message took 3 kB each. The worker dies once, so that they are sent twice."""
@@ -191,6 +192,7 @@ def test_the_files_of_the_user_among_many_inputs_reach_workers(toy: Toy, monkeyp
         unit_from_json(message, entry.spec, other)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: Toy) -> None:
     toy.edit(
@@ -285,6 +287,7 @@ def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make, kin
     assert ran(result)["scaled"] == 4
 
 
+@pytest.mark.slow
 def test_timeout_ends_the_unit_and_not_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy machine the other units may take longer than that too, so for them it does not count."""
     kill_once(toy, when="x.value == 20", how="time.sleep(600)")
@@ -359,6 +362,7 @@ def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
     assert count.read_text() == "xxx"
 
 
+@pytest.mark.slow
 def test_declared_memory_bounds_how_many_run_at_a_time(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     log = toy.folder / "log"
     toy.edit(

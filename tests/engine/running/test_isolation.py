@@ -45,6 +45,7 @@ def ended(pids: Path) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [SerialExecutor, one_process])
 @pytest.mark.parametrize("at_import", [False, True])
 def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_import: bool) -> None:
@@ -85,6 +86,7 @@ open({str(pids)!r}, "a").write(f"{{child}} ")""",
     assert ended(pids)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("child", ["os.fork() == 0", "subprocess.Popen(['sleep', '600']) is None"])
 def test_a_timeout_ends_what_the_unit_started(toy: Toy, child: str) -> None:
     """A child that held the pipe of the worker made the run wait for it for ever."""
@@ -104,6 +106,7 @@ if x.value == 20:
     assert ended(pids)
 
 
+@pytest.mark.slow
 def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> None:
     pids = toy.folder / "pids"
     edit(
@@ -119,6 +122,7 @@ def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> Non
     assert ended(pids)
 
 
+@pytest.mark.slow
 def test_isolated_units_have_processes_of_their_own(toy: Toy) -> None:
     pids = toy.folder / "pids"
     edit(toy, f'open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")')

@@ -59,6 +59,7 @@ def test_refresh_of_a_unit_that_there_is_not_says_so(toy: Toy) -> None:
     assert not run(toy, RunOptions(refresh=("mean:1.txt",))).warnings
 
 
+@pytest.mark.slow
 def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
     toy.run()
     toy.edit("plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by"))

@@ -46,6 +46,7 @@ def wait_for_means(toy: Toy, process: subprocess.Popen[str], count: int) -> None
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_killed_run_resumes_with_the_unfinished_units_only(toy: Toy, tmp_path: Path) -> None:
     hold = hold_means(toy)
@@ -69,6 +70,7 @@ def test_killed_run_resumes_with_the_unfinished_units_only(toy: Toy, tmp_path: P
     assert deliverables(toy) == clean
 
 
+@pytest.mark.slow
 def test_interrupt_ends_with_exit_code_130_and_says_how_to_go_on(toy: Toy) -> None:
     hold_means(toy)
     process = start(toy)

@@ -45,6 +45,7 @@ def test_values_flow_through_every_cardinality(toy: Toy) -> None:
     assert b"'1.txt': -60.0" in files["all.txt"]
 
 
+@pytest.mark.slow
 def test_a_stage_for_every_image_loses_none_of_them(toy: Toy) -> None:
     """Images without neighbours, and those whose own item failed, pass through; a unit depends on its neighbours."""
     toy.edit("plug.py", lambda text: text + MORE)

@@ -67,6 +67,7 @@ def matches() -> Matches:
     return room_matches()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_matches", [False, True])
 def test_true_poses_stay_and_nobody_is_doubted(matches: Matches, with_matches: bool) -> None:
     given = displaced()
@@ -130,6 +131,7 @@ def test_a_shifted_block_is_put_back_as_a_whole() -> None:
     np.testing.assert_allclose(inside[1], inside[0], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_matches", [False, True])
 def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: Matches, with_matches: bool) -> None:
     given = displaced("2.png")
@@ -143,6 +145,7 @@ def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: M
         assert bytes_of(found, name) == bytes_of(given, name)
 
 
+@pytest.mark.slow
 def test_key_points_of_some_images_alone_are_not_enough_to_move_any(matches: Matches) -> None:
     features, two_views = matches
     given = displaced("2.png")
@@ -195,6 +198,7 @@ def test_one_camera_or_none_comes_back_as_it_is() -> None:
         assert verified(given) is given
 
 
+@pytest.mark.slow
 def test_groups_are_judged_apart() -> None:
     """The second is the same room in another world: as one group its cameras would contradict the first."""
     there = Similarity3(3.0, rotation_from_rotvec([0.5, -0.2, 1.0]), np.array([0.2, 0.1, -0.3]))

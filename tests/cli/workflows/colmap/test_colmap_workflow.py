@@ -81,6 +81,7 @@ def test_every_mode_registers_all(
     assert found.median_pair_deg < 0.3
 
 
+@pytest.mark.slow
 def test_colmaps_own_sift_registers_all(pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path) -> None:
     path = workflow(tmp_path, rendered, "  poses: {use: poses.colmap_sift}")
     result = pano_mvs("run", path, "--out", "o", "--cache", cache)
