@@ -14,7 +14,7 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 
 _TILES = 20
 _PAD_PX = 4
-_MAX_WIDTH = 2048  # maximum width of panoramas whose maps are cached: 50 MB, 8 bytes a pixel plus one for the mask
+_MAX_WIDTH = 2560  # maximum width of panoramas whose maps are cached: 78 MB, 8 bytes a pixel plus one for the mask
 _OWNED_SLACK_PX = 2.0  # key points just beyond the edge are kept, and may be in a pixel with a more distant centre
 
 

@@ -64,3 +64,16 @@ def test_masks_change_no_key_point(monkeypatch: pytest.MonkeyPatch, room_image: 
     assert len(found) > 200
     np.testing.assert_array_equal(found.bearings, plain.bearings)
     np.testing.assert_array_equal(found.descriptors, plain.descriptors)
+
+
+def test_a_wide_panorama_has_the_key_points_of_the_reduced_one(room_image: NDArray[np.uint8]) -> None:
+    mask = np.ones(SIZE, np.bool_)
+    mask[90:, :100] = False
+    wide, wide_mask = (np.repeat(np.repeat(array, 2, axis=0), 2, axis=1) for array in (room_image, mask))
+    wide_mask[180, 200] = False  # a pixel that is masked in part
+    mask[90, 100] = False
+    found, reduced = tangent.extract_sift(room_image, mask), tangent.extract_sift(wide, wide_mask, max_width=SIZE[1])
+    assert len(found) > 200
+    assert reduced.size_hw == wide.shape[:2]
+    for name in ("bearings", "descriptors", "sizes_rad", "colors_rgb"):
+        np.testing.assert_array_equal(getattr(reduced, name), getattr(found, name))
