@@ -30,11 +30,11 @@ def extract_aliked(
     mask: NDArray[np.bool_],
     *,
     up: FloatArray,
-    max_keypoints: MaxKeypoints = 3000,
+    max_keypoints: MaxKeypoints = 6000,
     threshold: Annotated[float, Setting("minimum score of a key point", ge=0, le=1)] = 0.01,
     networks: Networks = PACKAGED,
 ) -> Features:
-    """Extract the ALIKED key points of a panorama on six level views around the horizon.
+    """Extract the ALIKED key points of a panorama on two rows of level views around the horizon.
 
     Views are level because the descriptors do not tolerate a large roll. Key points that two views share are one. The
     last digits of the network's results differ between processors, so descriptors are rounded.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
-from pano_mvs.algorithms.learned.tiles import COUNT, level_tiles
+from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -31,7 +31,9 @@ def match_learned(
     second: Features,
     *,
     min_score: Annotated[float, Setting("minimum probability of a match", ge=0, le=1)] = 0.1,
-    max_views: Annotated[int, Setting("number of pairs of views that are compared, those most alike", ge=1, le=36)] = 5,
+    max_views: Annotated[
+        int, Setting("number of pairs of views that are compared, those most alike", ge=1, le=256)
+    ] = 8,
     networks: Networks = PACKAGED,
 ) -> NDArray[np.int32]:
     """Match the ALIKED key points of two panoramas.
@@ -40,7 +42,7 @@ def match_learned(
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
         min_score: minimum probability of a match.
-        max_views: how many of the 36 pairs of views are compared, those with the most similar descriptors.
+        max_views: how many of the 256 pairs of views are compared, those with the most similar descriptors.
         networks: the network files and what executes them.
 
     Returns:
@@ -154,7 +156,7 @@ def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
     seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
     counts = seen[0].astype(np.int64) @ seen[1].astype(np.int64).T
     order = np.argsort(-counts, axis=None, kind="stable")[:most]
-    return [(int(idx) // COUNT, int(idx) % COUNT) for idx in order]
+    return [(int(one), int(other)) for one, other in zip(*np.unravel_index(order, counts.shape), strict=True)]
 
 
 def _one_to_one(scores: dict[tuple[int, int], float], offsets: list[int]) -> NDArray[np.int32]:

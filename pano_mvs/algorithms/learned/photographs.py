@@ -59,7 +59,7 @@ def view_of_photograph(
 
 
 def match_photograph(
-    photograph: PhotographView, panorama: Features, *, max_views: int = 2, networks: Networks = PACKAGED
+    photograph: PhotographView, panorama: Features, *, max_views: int = 4, networks: Networks = PACKAGED
 ) -> NDArray[np.int32]:
     """Match the learned key points of a photograph and a panorama by LightGlue.
 

