@@ -226,7 +226,7 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
     try:
         picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
         image = np.array(picture, copy=True)  # a view may not outlive the image
-    except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
+    except (ValueError, EOFError, OSError, RuntimeError, SyntaxError, IndexError) as error:  # index: it has no images
         raise InputError(
             f"{path}: not a HEIC image that can be decoded ({error}). Copy it again, or convert it to JPEG"
         ) from error

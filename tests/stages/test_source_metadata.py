@@ -107,6 +107,12 @@ def test_any_bytes_in_the_boxes_of_a_file(data: st.DataObject, kind: str) -> Non
     read_with_neighbours(bytes(changed), SUFFIXES.get(kind, kind.rpartition(".")[2]))
 
 
+def test_a_heic_file_without_images_is_refused() -> None:
+    changed = bytearray(BOXES["heif"])
+    changed[changed.index(b"ispe") - 1] = 0  # the length of the box with the size of its image
+    read_with_neighbours(bytes(changed), "heic")
+
+
 @pytest.mark.parametrize("kind", [*SOUND, *BOXES])
 def test_unchanged_files_are_read(kind: str, tmp_path: Path) -> None:
     suffix = SUFFIXES.get(kind, kind.rpartition(".")[2])
