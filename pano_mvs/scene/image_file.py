@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_header import JPEG_START, PNG_START, TIFF_STARTS, Size, is_cut_short, stated_size
+from pano_mvs.scene.image_header import (
+    JPEG_START,
+    PNG_START,
+    TIFF_STARTS,
+    Size,
+    is_cut_short,
+    stated_size,
+    stated_size_of_file,
+)
 from pano_mvs.scene.record import FilePart
 
 MAX_PIXELS = 512_000_000
@@ -103,12 +111,28 @@ def check_stated_size(data: bytes, path: Path, max_pixels: int = MAX_PIXELS) -> 
             f"{what}, more than the limit of {max_pixels / 1e6:.0f}. Scale it down; for panoramas, the "
             "source's setting max_megapixels raises the limit"
         )
-    if data.startswith(_COMPRESSED_STARTS) and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * len(data)):
+    if _is_too_short(data, len(data), pixels):
         raise InputError(
             f"{what}, but a file of {len(data)} bytes cannot hold them: it is damaged or cut short. Copy "
             "it again, or export it again"
         )
     return size
+
+
+def readable_pixels(path: Path, max_pixels: int) -> int:
+    """Return the number of pixels that an image file's header states, 0 if it cannot be read or will be refused."""
+    height, width = stated_size_of_file(path) or (0, 0)
+    pixels = height * width
+    try:
+        with path.open("rb") as stream:
+            refused = pixels > max_pixels or _is_too_short(stream.read(16), path.stat().st_size, pixels)
+    except OSError:
+        return 0
+    return 0 if refused else pixels
+
+
+def _is_too_short(data: bytes, length: int, pixels: int) -> bool:
+    return data.startswith(_COMPRESSED_STARTS) and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * length)
 
 
 def _decoded(data: bytes, flags: int) -> tuple[NDArray[np.generic] | None, str]:

@@ -35,8 +35,7 @@ from pano_mvs.io.images.metadata import position_from_exif, read_container
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.rig_calibration import read_rig
 from pano_mvs.scene.files import item_stems
-from pano_mvs.scene.image_file import MAX_PIXELS, decode_image, decoding_bytes_per_pixel, write_png
-from pano_mvs.scene.image_header import stated_size_of_file
+from pano_mvs.scene.image_file import MAX_PIXELS, decode_image, decoding_bytes_per_pixel, readable_pixels, write_png
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.stages.source import working_size
 
@@ -114,10 +113,8 @@ def stitching_memory_bytes(params: DualFisheyeParams, inputs: Mapping[str, Any])
     decoded = 0
     for role in ("first", "second"):
         if role in item.files:
-            height, width = stated_size_of_file(item.files[role]) or (0, 0)
-            if height * width > params.max_megapixels * 1e6:
-                return 0
-            decoded += height * width * (decoding_bytes_per_pixel(item.files[role]) + 3)
+            pixels = readable_pixels(item.files[role], int(params.max_megapixels * 1e6))
+            decoded += pixels * (decoding_bytes_per_pixel(item.files[role]) + 3)
     columns = params.width or params.max_width
     return 60_000_000 + decoded + 8 * columns**2 // 2 + 40_000 * columns
 

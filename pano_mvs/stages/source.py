@@ -22,9 +22,9 @@ from pano_mvs.scene.image_file import (
     MAX_PIXELS,
     decode_image,
     decoding_bytes_per_pixel,
+    readable_pixels,
     write_png,
 )
-from pano_mvs.scene.image_header import stated_size_of_file
 
 
 class FolderParams(Params):
@@ -91,11 +91,9 @@ def _is_a_copy(copy: Copy) -> str:
 def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
     """Return the memory for reading an image and its mask, from the header of the file; 0 for files to be rejected."""
     item: SourceItem = inputs["item"]
-    height, width = stated_size_of_file(item.files["image"]) or (0, 0)
-    if height * width > params.max_pixels:
-        return 0
+    image = item.files["image"]
     masked = MASK_BYTES_PER_PIXEL if "mask" in item.files else 0
-    return height * width * max(decoding_bytes_per_pixel(item.files["image"]), masked)
+    return readable_pixels(image, params.max_pixels) * max(decoding_bytes_per_pixel(image), masked)
 
 
 @source("source.folder", list_items=list_folder, memory=folder_memory_bytes)

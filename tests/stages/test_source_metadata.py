@@ -107,6 +107,12 @@ def test_any_bytes_in_the_boxes_of_a_file(data: st.DataObject, kind: str) -> Non
     read_with_neighbours(bytes(changed), SUFFIXES.get(kind, kind.rpartition(".")[2]))
 
 
+def test_a_width_that_the_file_cannot_hold_plans_no_memory() -> None:
+    changed = bytearray(SOUND["tif"])
+    changed[20] = 127  # the most significant half of the width
+    read_with_neighbours(bytes(changed), "tif")
+
+
 def test_a_heic_file_without_images_is_refused() -> None:
     changed = bytearray(BOXES["heif"])
     changed[changed.index(b"ispe") - 1] = 0  # the length of the box with the size of its image
