@@ -79,8 +79,8 @@ def run(
         str,
         typer.Option(
             "--executor",
-            help="How units are computed: processes, dask, or serial (one unit "
-            "at a time in this process, for debugging). Default: processes.",
+            help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
+            "serial (one unit at a time in this process, for debugging). Default: processes.",
             show_default=False,
         ),
     ] = "",
@@ -100,6 +100,15 @@ def run(
             show_default=False,
         ),
     ] = "",
+    queue: Annotated[
+        Path | None,
+        typer.Option(
+            "--queue",
+            metavar="FILE.yaml",
+            help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
@@ -170,7 +179,7 @@ def run(
     session = open_session(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
-    execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable)
     division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
     if division is not None:
         raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))

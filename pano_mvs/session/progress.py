@@ -24,7 +24,7 @@ class RunStarted:
     Attributes:
         workflow: its name.
         stages: names of its stages, in order.
-        executor: `processes`, `serial` or `dask`.
+        executor: such as `processes`.
         workers: number of units at a time.
         threads: of each worker.
         out: the output folder.

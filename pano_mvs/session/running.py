@@ -46,10 +46,12 @@ class Execution:
     """How the units of a run are computed.
 
     Attributes:
-        executor: `serial`, `processes` or `dask`; empty to choose by the other settings and this machine.
+        executor: `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by
+            the other settings and this machine.
         workers: number of units at a time; 0 for one per core, if memory permits.
         threads: of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler.
+        queue: YAML file with the settings of jobs, for a queueing system.
         min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
             of $PANO_MVS_MIN_FREE, or else 200 MB.
         durable: whether to flush every result to disk.
@@ -59,6 +61,7 @@ class Execution:
     workers: int = 0
     threads: int = 0
     scheduler: str = ""
+    queue: Path | None = None
     min_free: str = ""
     durable: bool = False
 
@@ -71,7 +74,7 @@ def run(
     *,
     settings: Mapping[str, object] | None = None,
     cache: str | Path | None = None,
-    executor: str = "",
+    executor: str | Execution = "",
     workers: int | None = None,
     until: Sequence[str] = (),
     only: Sequence[str] = (),
@@ -100,7 +103,8 @@ def run(
         settings: `STAGE.PARAM` to a Python value, or to a string in the syntax of `--set`.
         cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
             current folder if the workflow is a preset).
-        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`.
+        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`; or an `Execution`, for
+            other settings, such as a queueing system.
         workers: number of units at a time; None for one per core, if memory permits.
         until: run only these stages and those that they need.
         only: run only these units, as `STAGE:ITEM`, and those that they need.
@@ -122,7 +126,8 @@ def run(
         out=out,
         run_options=run_options,
     )
-    return run_session(session, Execution(executor, workers or 0), progress or ignore)
+    execution = executor if isinstance(executor, Execution) else Execution(executor)
+    return run_session(session, replace(execution, workers=workers or execution.workers), progress or ignore)
 
 
 def _check_not_merged(out: Path) -> None:
@@ -155,6 +160,7 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
         workers=execution.workers,
         threads=execution.threads,
         scheduler=execution.scheduler,
+        queue=execution.queue,
     )
     try:
         return _run_and_report(session, store, executor, progress=progress)

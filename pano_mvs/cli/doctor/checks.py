@@ -125,7 +125,13 @@ VersionOf: TypeAlias = Callable[[str], str | None]
 
 _DISTRIBUTION = "pano-mvs"
 _EXTRAS_FOR_DEVELOPERS = frozenset({"dev", "docs"})
-_USES = {"dask": "--executor dask", "heic": "HEIC images", "exr": "OpenEXR files", "remote": "cache push and pull"}
+_USES = {
+    "dask": "--executor dask",
+    "queues": "--executor slurm",
+    "heic": "HEIC images",
+    "exr": "OpenEXR files",
+    "remote": "cache push and pull",
+}
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 
 

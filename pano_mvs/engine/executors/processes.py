@@ -81,6 +81,10 @@ class ProcessExecutor:
         """Return the free memory of this host."""
         return free_memory_bytes()
 
+    def notice(self) -> str:
+        """Return nothing: the workers are here."""
+        return ""
+
     def cancel(self) -> None:
         """End the processes of all jobs; later jobs get new ones."""
         self._out.clear()

@@ -103,7 +103,7 @@ class Run:
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
         if options.isolate and not self.executor.enforces_timeouts:
-            raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use processes or dask")
+            raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use another one")
         self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
         self.keys: dict[str, dict[str, str]] = {}
@@ -345,6 +345,8 @@ class RunPass:
                 self._end(finished)
             elif must_wait:
                 self._run.observer.waiting()
+                if notice := dispatcher.notice:
+                    self._run.observer.warn(notice)
 
     def _take_from_cache(self, unit: Unit) -> bool:
         """Settle a unit that is in the cache; return whether it is, or is being computed for another unit."""
