@@ -109,6 +109,14 @@ def run(
             show_default=False,
         ),
     ] = None,
+    notify: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--notify",
+            metavar="URL",
+            help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
@@ -170,6 +178,7 @@ def run(
     from pano_mvs.cli.blocks_command import division_of, run_in_blocks
     from pano_mvs.cli.plan_commands import show_dry_run
     from pano_mvs.cli.run.command import run_workflow
+    from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
@@ -181,12 +190,13 @@ def run(
     )
     execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable)
     division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
-    if division is not None:
-        raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
-    if dry_run:
-        show_dry_run(session, execution, Console(), as_json=as_json)
-        return
-    raise typer.Exit(run_workflow(session, execution, as_json=as_json))
+    with notified([] if dry_run else notify or [], session.out):
+        if division is not None:
+            raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
+        if dry_run:
+            show_dry_run(session, execution, Console(), as_json=as_json)
+            return
+        raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
 
 @app.command()
@@ -287,6 +297,15 @@ def status(
     from pano_mvs.cli.plan_commands import show_status
 
     show_status(target, out, overrides=overrides or [], images=images, cache=cache, console=Console())
+
+
+@app.command("watch")
+@guarded
+def watch_output(out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")]) -> None:
+    """Follow a run that another terminal or host has started, until it ends; exit with its exit code."""
+    from pano_mvs.cli.watch_command import watch_run
+
+    raise typer.Exit(watch_run(out, Console()))
 
 
 @app.command()

@@ -27,6 +27,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
@@ -171,7 +172,8 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
 def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
     """Run, and report the first and the last event."""
     clock = time.perf_counter()
-    observer = EventObserver(progress)
+    log = EventLog(progress)
+    observer = EventObserver(log, executor=executor)
     observer.report(
         RunStarted(
             workflow=session.workflow.name,
@@ -180,6 +182,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
             workers=executor.capacity,
             threads=executor.threads,
             out=session.out,
+            cache=store.root.absolute(),
         )
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
@@ -187,6 +190,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
     try:
         run = _new_run(session, store, executor, observer=observer)
         with output_lock(session.out):
+            log.open(session.out)
             if (forecast := forecast_run(run)) is not None:
                 observer.report(forecast)
             summary, values = _execute(run, started, clock)
@@ -199,7 +203,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         end = replace(_counted(run, end), exit_code=INTERRUPTED, stopped="interrupted")
         raise
     finally:
-        progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
+        log(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
 def _new_run(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> Run:

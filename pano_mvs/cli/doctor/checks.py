@@ -128,6 +128,7 @@ _EXTRAS_FOR_DEVELOPERS = frozenset({"dev", "docs"})
 _USES = {
     "dask": "--executor dask",
     "queues": "--executor slurm",
+    "notify": "--notify",
     "heic": "HEIC images",
     "exr": "OpenEXR files",
     "remote": "cache push and pull",

@@ -42,6 +42,10 @@ class SerialExecutor:
         """Return the free memory of this host."""
         return free_memory_bytes()
 
+    def places(self) -> int:
+        """Return 1."""
+        return 1
+
     def notice(self) -> str:
         """Return nothing."""
         return ""

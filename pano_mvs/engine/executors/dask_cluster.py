@@ -159,6 +159,10 @@ class DaskExecutor:
         limits = [worker["memory_limit"] for worker in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return int(min(limits, default=0)) * len(limits)
 
+    def places(self) -> int:
+        """Return the number of threads of the workers, each of which computes a unit."""
+        return sum(self._client.nthreads().values())
+
     def notice(self) -> str:
         """Return nothing: the workers were there when the run began."""
         return ""

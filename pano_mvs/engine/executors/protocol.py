@@ -122,8 +122,11 @@ class Executor(Protocol):
     def free_memory_bytes(self) -> int:
         """Return the memory for all running units together; 0 if unknown."""
 
+    def places(self) -> int:
+        """Return the number of units that can be computed at a time at this moment, as workers come and go."""
+
     def notice(self) -> str:
-        """Return what the user should know while units wait, such as that no worker has started; usually empty."""
+        """Return what the user should know now, such as that no worker has started; usually empty."""
 
     def cancel(self) -> None:
         """End all jobs at once and forget them."""

@@ -260,7 +260,7 @@ class QueueExecutor(DaskExecutor):
             self._refusals.clear()
             return f"{self.name} refused a job, which is submitted again in a minute: {text}"
         now = time.monotonic()
-        if self._client.scheduler_info(n_workers=1)["workers"]:
+        if not self._is_started or self.places():
             self._had_workers_at = now
         if now - self._had_workers_at < _PATIENCE_S:
             return ""

@@ -87,11 +87,6 @@ class Dispatcher:
         """Whether the executor takes another job."""
         return len(self._running) < self._executor.capacity
 
-    @property
-    def notice(self) -> str:
-        """What the user should know while units wait; see `Executor`."""
-        return self._executor.notice()
-
     def fits(self, unit: Unit) -> bool:
         """Return whether the memory that a unit declares is free beside that of the running ones."""
         needed = self._memory_of(unit)

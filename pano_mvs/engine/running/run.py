@@ -345,8 +345,6 @@ class RunPass:
                 self._end(finished)
             elif must_wait:
                 self._run.observer.waiting()
-                if notice := dispatcher.notice:
-                    self._run.observer.warn(notice)
 
     def _take_from_cache(self, unit: Unit) -> bool:
         """Settle a unit that is in the cache; return whether it is, or is being computed for another unit."""
