@@ -317,6 +317,15 @@ def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.
     rewrite_report(out, cache, Console())
 
 
+@app.command("crate")
+@guarded
+def describe_run(out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")]) -> None:
+    """Describe a run as an RO-Crate: software, settings, and digests of inputs and outputs, for an archive."""
+    from pano_mvs.results.crate import write_crate
+
+    Console().say(escape(f"{write_crate(out)} is written"))
+
+
 app.command()(plugins)
 app.command()(doctor)
 

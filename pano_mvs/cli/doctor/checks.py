@@ -127,6 +127,7 @@ _DISTRIBUTION = "pano-mvs"
 _EXTRAS_FOR_DEVELOPERS = frozenset({"dev", "docs"})
 _USES = {
     "dask": "--executor dask",
+    "crate": "crate",
     "queues": "--executor slurm",
     "notify": "--notify",
     "heic": "HEIC images",
