@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import get_args
 
@@ -55,6 +56,7 @@ def test_other_lines_are_no_events(line: str) -> None:
     assert event_from_line(line) is None
 
 
+@pytest.mark.skipif(os.name != "posix", reason="Windows keeps files that are open")
 def test_reader_follows_the_file_and_notices_another_run(tmp_path: Path) -> None:
     passed: list[Event] = []
     log, reader = EventLog(passed.append), EventReader(tmp_path)

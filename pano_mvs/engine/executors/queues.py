@@ -86,6 +86,11 @@ class Queue(BaseModel):
         """Memory of a job."""
         return bytes_from_size(self.memory)
 
+    def shape(self, threads: int = 0) -> tuple[int, int]:
+        """Return the number of units at a time in a job, and the threads of each; 0 for an equal share of the cores."""
+        places = 0 if threads else max(1, min(self.cores, self.memory_bytes // WORKER_BYTES))
+        return share_cores(self.cores, workers=places, threads=threads)
+
 
 _KEYS = (*Queue.model_fields, "partition", "project")
 
@@ -173,7 +178,7 @@ def _encryption(keys: Path) -> Any:
     return security(require_encryption=True, tls_ca_file=str(keys / "ca_file"), **files)
 
 
-def _patient(base: Any) -> Any:
+def patient(base: Any) -> Any:
     """Return a class of jobs that are submitted again later if the queueing system refuses them.
 
     A class of dask-jobqueue raises an error where nobody receives it, and never submits the job again. This one enters
@@ -214,11 +219,7 @@ class QueueExecutor(DaskExecutor):
             UsageError: if dask-jobqueue is not installed, or the queueing system is not on this host.
         """
         self.name = system
-        places, self.threads = share_cores(
-            queue.cores,
-            workers=0 if threads else max(1, min(queue.cores, queue.memory_bytes // WORKER_BYTES)),
-            threads=threads,
-        )
+        places, self.threads = queue.shape(threads)
         self.capacity = with_waiting(places * queue.jobs)
         self.cores = max(queue.cores, self.threads)
         self._queue = queue
@@ -230,7 +231,7 @@ class QueueExecutor(DaskExecutor):
         options = importlib.import_module("dask").config.get(f"jobqueue.{system}.scheduler-options", {})
         try:
             cluster = kind(
-                job_cls=_patient(kind.job_cls),
+                job_cls=patient(kind.job_cls),
                 security=_encryption(self._keys),
                 scheduler_options={"dashboard_address": None, **options},
                 **job_settings(system, queue, places=places, logs=self._logs),

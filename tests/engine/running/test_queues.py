@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
+import os
 import re
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from pano_mvs.core.errors import UsageError, WorkflowError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors import queues
 from pano_mvs.engine.executors.choose import make_executor
-from pano_mvs.engine.executors.queues import SYSTEMS, cluster_class, job_settings, read_queue
+from pano_mvs.engine.executors.dask_cluster import run_unit, versions
+from pano_mvs.engine.executors.protocol import JobOutcome
+from pano_mvs.engine.executors.queues import SYSTEMS, cluster_class, job_settings, patient, read_queue
 
 SETTINGS = """\
 partition: long
@@ -36,9 +43,12 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the commands that submit jobs on the PATH; nothing calls them."""
+    """Put the commands that submit jobs on the PATH; they refuse."""
+    if os.name != "posix":
+        pytest.skip("the commands are scripts of a POSIX shell")
     for command in SYSTEMS.values():
-        (tmp_path / command).touch(mode=0o755)
+        (tmp_path / command).write_text("#!/bin/sh\necho 'error: too many jobs' >&2\nexit 1\n")
+        (tmp_path / command).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
 
 
@@ -86,6 +96,11 @@ def test_documented_settings_are_valid(page: str, tmp_path: Path) -> None:
     assert read_queue(path).jobs == 20
 
 
+@pytest.mark.parametrize(("threads", "shape"), [(0, (10, 1)), (4, (4, 4))])
+def test_units_of_a_job_share_its_cores_and_its_memory(threads: int, shape: tuple[int, int], file: Path) -> None:
+    assert read_queue(file).shape(threads) == shape
+
+
 def test_settings_must_be_a_mapping(tmp_path: Path) -> None:
     path = tmp_path / "queue.yaml"
     path.write_text("- cores\n")
@@ -119,3 +134,32 @@ def test_interrupts_are_still_interrupts(monkeypatch: pytest.MonkeyPatch) -> Non
     before = signal.getsignal(signal.SIGINT)
     cluster_class("slurm")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.usefixtures("commands")
+def test_job_that_is_refused_is_submitted_again(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cluster submits the jobs that it plans and does not have, so a refused one must not stay among them."""
+    monkeypatch.setattr(queues, "_RETRY_S", 0.0)
+    kind = patient(cluster_class("slurm").job_cls)
+    settings = job_settings("slurm", read_queue(file), places=5, logs=tmp_path / "jobs")
+
+    async def submitted() -> dict[str, object]:
+        job = kind("tls://host:8786", name="worker", **settings)
+        cluster = SimpleNamespace(workers={"worker": job, "other": object()})
+        job._cluster = lambda: cluster
+        await job
+        await asyncio.sleep(0.01)
+        return cluster.workers
+
+    assert list(asyncio.run(submitted())) == ["other"]
+    assert kind.refusals == ["error: too many jobs"]
+
+
+@pytest.mark.parametrize("version", ["", "0.1"])
+def test_worker_that_joins_during_a_run_refuses_units_if_it_differs(version: str, tmp_path: Path) -> None:
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "tmp" / "token").write_text("token" if version else "another folder")
+    expected = str(tmp_path), "token", versions() | ({"numpy": version} if version else {})
+    outcome = JobOutcome.from_json(json.loads(run_unit("a run", "{}", expected)))
+    assert (outcome.status, outcome.error, outcome.exit_code) == ("stopped", "UsageError", 2)
+    assert ("numpy is" if version else "does not see the cache") in outcome.cause
