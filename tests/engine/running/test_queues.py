@@ -145,11 +145,12 @@ def test_job_that_is_refused_is_submitted_again(file: Path, tmp_path: Path, monk
 
     async def submitted() -> dict[str, object]:
         job = kind("tls://host:8786", name="worker", **settings)
-        cluster = SimpleNamespace(workers={"worker": job, "other": object()})
+        workers: dict[str, object] = {"worker": job, "other": object()}
+        cluster = SimpleNamespace(workers=workers)
         job._cluster = lambda: cluster
         await job
         await asyncio.sleep(0.01)
-        return cluster.workers
+        return workers
 
     assert list(asyncio.run(submitted())) == ["other"]
     assert kind.refusals == ["error: too many jobs"]
