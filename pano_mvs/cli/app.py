@@ -79,8 +79,8 @@ def run(
         str,
         typer.Option(
             "--executor",
-            help="How units are computed: processes, dask, or serial (one unit "
-            "at a time in this process, for debugging). Default: processes.",
+            help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
+            "serial (one unit at a time in this process, for debugging). Default: processes.",
             show_default=False,
         ),
     ] = "",
@@ -100,6 +100,23 @@ def run(
             show_default=False,
         ),
     ] = "",
+    queue: Annotated[
+        Path | None,
+        typer.Option(
+            "--queue",
+            metavar="FILE.yaml",
+            help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
+            show_default=False,
+        ),
+    ] = None,
+    notify: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--notify",
+            metavar="URL",
+            help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
@@ -161,6 +178,7 @@ def run(
     from pano_mvs.cli.blocks_command import division_of, run_in_blocks
     from pano_mvs.cli.plan_commands import show_dry_run
     from pano_mvs.cli.run.command import run_workflow
+    from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
@@ -170,14 +188,15 @@ def run(
     session = open_session(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
-    execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable)
     division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
-    if division is not None:
-        raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
-    if dry_run:
-        show_dry_run(session, execution, Console(), as_json=as_json)
-        return
-    raise typer.Exit(run_workflow(session, execution, as_json=as_json))
+    with notified([] if dry_run else notify or [], session.out):
+        if division is not None:
+            raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
+        if dry_run:
+            show_dry_run(session, execution, Console(), as_json=as_json)
+            return
+        raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
 
 @app.command()
@@ -280,6 +299,15 @@ def status(
     show_status(target, out, overrides=overrides or [], images=images, cache=cache, console=Console())
 
 
+@app.command("watch")
+@guarded
+def watch_output(out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")]) -> None:
+    """Follow a run that another terminal or host has started, until it ends; exit with its exit code."""
+    from pano_mvs.cli.watch_command import watch_run
+
+    raise typer.Exit(watch_run(out, Console()))
+
+
 @app.command()
 @guarded
 def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
@@ -287,6 +315,15 @@ def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.
     from pano_mvs.cli.page_commands import rewrite_report
 
     rewrite_report(out, cache, Console())
+
+
+@app.command("crate")
+@guarded
+def describe_run(out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")]) -> None:
+    """Describe a run as an RO-Crate: software, settings, and digests of inputs and outputs, for an archive."""
+    from pano_mvs.results.crate import write_crate
+
+    Console().say(escape(f"{write_crate(out)} is written"))
 
 
 app.command()(plugins)

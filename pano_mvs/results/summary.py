@@ -79,6 +79,7 @@ class RunSummary(Entry):
         left_over: existing files of earlier runs that this run did not write, with their digests.
         verdict: whether the result is reliable; None if the run ended before it could be judged.
         merged: the blocks, if the folder holds merged runs and not a run.
+        inputs: file that a source read to its digest.
     """
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
@@ -111,6 +112,7 @@ class RunSummary(Entry):
     left_over: Mapping[str, str] = {}
     verdict: Verdict | None = None
     merged: MergedSummary | None = None
+    inputs: Mapping[str, str] = {}
 
     @staticmethod
     def from_json(value: object) -> RunSummary:

@@ -24,10 +24,11 @@ class RunStarted:
     Attributes:
         workflow: its name.
         stages: names of its stages, in order.
-        executor: `processes`, `serial` or `dask`.
+        executor: such as `processes`.
         workers: number of units at a time.
         threads: of each worker.
         out: the output folder.
+        cache: the folder of the cache.
     """
 
     kind: ClassVar[str] = "run_started"
@@ -37,6 +38,7 @@ class RunStarted:
     workers: int
     threads: int
     out: Path
+    cache: Path = Path()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,14 @@ class KernelsCompiled:
     kind: ClassVar[str] = "kernels_compiled"
     kernels: int
     seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class WorkersChanged:
+    """Workers have come or gone, as jobs of a queueing system do; this is the number of units at a time now."""
+
+    kind: ClassVar[str] = "workers_changed"
+    workers: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +221,7 @@ Event = (
     RunStarted
     | Forecast
     | KernelsCompiled
+    | WorkersChanged
     | StageStarted
     | UnitStarted
     | UnitFailed

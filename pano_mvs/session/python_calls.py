@@ -15,8 +15,8 @@ Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
 _SETTING = re.compile(r"(?<![^\s(])--set ([^\s=:]+)")
-_WITH_VALUE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|until|only|refresh) (?=\S)")
-_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|workers)\b")
+_WITH_VALUE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|until|only|refresh) (?=\S)")
+_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|workers)\b")
 _MIN_FREE = re.compile(r"(?<![^\s(])--min-free\b")  # not an argument
 
 

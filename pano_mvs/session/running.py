@@ -27,6 +27,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
@@ -46,10 +47,12 @@ class Execution:
     """How the units of a run are computed.
 
     Attributes:
-        executor: `serial`, `processes` or `dask`; empty to choose by the other settings and this machine.
+        executor: `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by
+            the other settings and this machine.
         workers: number of units at a time; 0 for one per core, if memory permits.
         threads: of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler.
+        queue: YAML file with the settings of jobs, for a queueing system.
         min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
             of $PANO_MVS_MIN_FREE, or else 200 MB.
         durable: whether to flush every result to disk.
@@ -59,6 +62,7 @@ class Execution:
     workers: int = 0
     threads: int = 0
     scheduler: str = ""
+    queue: Path | None = None
     min_free: str = ""
     durable: bool = False
 
@@ -71,7 +75,7 @@ def run(
     *,
     settings: Mapping[str, object] | None = None,
     cache: str | Path | None = None,
-    executor: str = "",
+    executor: str | Execution = "",
     workers: int | None = None,
     until: Sequence[str] = (),
     only: Sequence[str] = (),
@@ -100,7 +104,8 @@ def run(
         settings: `STAGE.PARAM` to a Python value, or to a string in the syntax of `--set`.
         cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
             current folder if the workflow is a preset).
-        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`.
+        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`; or an `Execution`, for
+            other settings, such as a queueing system.
         workers: number of units at a time; None for one per core, if memory permits.
         until: run only these stages and those that they need.
         only: run only these units, as `STAGE:ITEM`, and those that they need.
@@ -122,7 +127,8 @@ def run(
         out=out,
         run_options=run_options,
     )
-    return run_session(session, Execution(executor, workers or 0), progress or ignore)
+    execution = executor if isinstance(executor, Execution) else Execution(executor)
+    return run_session(session, replace(execution, workers=workers or execution.workers), progress or ignore)
 
 
 def _check_not_merged(out: Path) -> None:
@@ -155,6 +161,7 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
         workers=execution.workers,
         threads=execution.threads,
         scheduler=execution.scheduler,
+        queue=execution.queue,
     )
     try:
         return _run_and_report(session, store, executor, progress=progress)
@@ -165,7 +172,8 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
 def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
     """Run, and report the first and the last event."""
     clock = time.perf_counter()
-    observer = EventObserver(progress)
+    log = EventLog(progress)
+    observer = EventObserver(log, executor=executor)
     observer.report(
         RunStarted(
             workflow=session.workflow.name,
@@ -174,6 +182,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
             workers=executor.capacity,
             threads=executor.threads,
             out=session.out,
+            cache=store.root.absolute(),
         )
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
@@ -181,6 +190,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
     try:
         run = _new_run(session, store, executor, observer=observer)
         with output_lock(session.out):
+            log.open(session.out)
             if (forecast := forecast_run(run)) is not None:
                 observer.report(forecast)
             summary, values = _execute(run, started, clock)
@@ -193,7 +203,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         end = replace(_counted(run, end), exit_code=INTERRUPTED, stopped="interrupted")
         raise
     finally:
-        progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
+        log(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
 def _new_run(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> Run:

@@ -101,6 +101,7 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
         versions=_versions(),
         files=dict(sorted(result.published.items())),
         left_over=dict(sorted(result.left_over.items())),
+        inputs=run.listing.digests(),
     )
 
 

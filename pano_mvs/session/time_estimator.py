@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from pano_mvs.core.kernel_cache import count_compiled
+from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.planning.forecast import StageForecast, makespan
 from pano_mvs.engine.running.events import Failure, Observer, StageSummary, UnitStatus
 from pano_mvs.session.progress import (
@@ -34,6 +35,7 @@ from pano_mvs.session.progress import (
     UnitFinished,
     UnitStarted,
     Warned,
+    WorkersChanged,
 )
 
 _OVERDUE = 1.2
@@ -186,6 +188,8 @@ class TimeEstimator:
                 self._report_s = event.report_s
                 for forecast in event.stages:
                     self._of(forecast.stage).forecast = forecast
+            case WorkersChanged():
+                self._workers = max(1, event.workers)
             case KernelsCompiled():
                 for stage in self.stages.values():
                     stage.wait(event.seconds, self._clock())
@@ -298,8 +302,12 @@ _ESTIMATE_EVERY_S = 1.0
 class EventObserver(Observer):
     """An observer of the engine's run that passes everything on as events, and adds the time left."""
 
-    def __init__(self, progress: Progress, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, progress: Progress, clock: Callable[[], float] = time.monotonic, executor: Executor | None = None
+    ) -> None:
         self._progress = progress
+        self._executor = executor
+        self._workers = executor.capacity if executor else 0
         self._clock = clock
         self._estimator = TimeEstimator(clock)
         self._next_estimate_s = clock() + _ESTIMATE_EVERY_S
@@ -335,7 +343,7 @@ class EventObserver(Observer):
         self.report(StageFinished(stage=summary.name, **counts, **times, metrics=dict(summary.metrics)))
 
     def waiting(self) -> None:
-        """Report how many kernels have been compiled, and the time left."""
+        """Report how many kernels have been compiled, which workers there are, and the time left."""
         now = self._clock()
         if now < self._next_estimate_s:
             return
@@ -346,7 +354,18 @@ class EventObserver(Observer):
             compiled = KernelsCompiled(kernels - self._kernels_before, round(since_s, 6))
             self._estimator(compiled)
             self._progress(compiled)
+        if self._executor is not None:
+            self._report_workers(self._executor)
         self._progress(self._estimator.estimate())
+
+    def _report_workers(self, executor: Executor) -> None:
+        if (workers := executor.places()) != self._workers:
+            self._workers = workers
+            changed = WorkersChanged(workers)
+            self._estimator(changed)
+            self._progress(changed)
+        if notice := executor.notice():
+            self._progress(Warned(notice))
 
     def warn(self, text: str) -> None:
         """Pass the event on."""

@@ -62,7 +62,7 @@ POSES = [
 
 def test_every_field_of_run_json_keeps_its_name_and_value() -> None:
     written = json.loads(json.dumps(RunSummary.from_json(SUMMARY).to_json()))
-    assert [*written] == ["schema", *FIELDS, "verdict", "merged"]
+    assert [*written] == ["schema", *FIELDS, "verdict", "merged", "inputs"]
     assert [*written["poses"]] == POSES
     for name in ("workflow", "exit_code", "machine", "executor", "rejected", "cloud", "files", "versions"):
         assert written[name] == SUMMARY[name]

@@ -18,6 +18,7 @@ from pano_mvs.session.progress import (
     UnitFinished,
 )
 from pano_mvs.session.python_calls import arguments_from_options, overrides_from_settings
+from pano_mvs.session.running import Execution
 from tests.engine.conftest import Toy
 
 
@@ -174,6 +175,12 @@ def test_errors_name_arguments_and_not_options(toy: Toy) -> None:
     (toy.folder / "file").touch()
     with pytest.raises(pano_mvs.UsageError, match="Choose another folder with out=DIR"):
         run_toy(toy, out=toy.folder / "file")
+
+
+def test_execution_takes_the_place_of_the_name_of_an_executor(toy: Toy) -> None:
+    assert run_toy(toy, executor=Execution("serial", threads=3)).summary.executor["threads"] == 3
+    with pytest.raises(pano_mvs.UsageError, match=r"executor=slurm requires queue=FILE\.yaml"):
+        run_toy(toy, executor=Execution("slurm"))
 
 
 def test_only_options_become_arguments() -> None:

@@ -125,7 +125,15 @@ VersionOf: TypeAlias = Callable[[str], str | None]
 
 _DISTRIBUTION = "pano-mvs"
 _EXTRAS_FOR_DEVELOPERS = frozenset({"dev", "docs"})
-_USES = {"dask": "--executor dask", "heic": "HEIC images", "exr": "OpenEXR files", "remote": "cache push and pull"}
+_USES = {
+    "dask": "--executor dask",
+    "crate": "crate",
+    "queues": "--executor slurm",
+    "notify": "--notify",
+    "heic": "HEIC images",
+    "exr": "OpenEXR files",
+    "remote": "cache push and pull",
+}
 _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 
 

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from types import FrameType
-from typing import Any, TextIO
+from typing import TextIO
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
-from pano_mvs.core.text import json_without_controls
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.progress import Event, RunFinished, RunStarted
+from pano_mvs.session.event_log import line_from_event
+from pano_mvs.session.progress import Event
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
@@ -82,9 +79,6 @@ def interrupted_by_termination() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-SCHEMA = 1
-
-
 class JsonEvents:
     """A progress callback that writes the events of a run as JSON lines."""
 
@@ -93,12 +87,5 @@ class JsonEvents:
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
-        fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
-        if isinstance(event, RunStarted):
-            fields["schema"] = SCHEMA
-        fields |= dataclasses.asdict(event)
-        if isinstance(event, RunFinished) and event.verdict is None:
-            del fields["verdict"], fields["doubts"]
-        line = json.dumps(fields, ensure_ascii=False, allow_nan=False, default=str)
-        self._stream.write(json_without_controls(line) + "\n")
+        self._stream.write(line_from_event(event))
         self._stream.flush()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.memory import free_memory_bytes
@@ -10,7 +11,8 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
-from pano_mvs.engine.executors.threads import available_threads, share_cores
+from pano_mvs.engine.executors.queues import SYSTEMS, QueueExecutor, read_queue
+from pano_mvs.engine.executors.threads import WORKER_BYTES, available_threads, share_cores
 
 
 class SerialExecutor:
@@ -40,6 +42,14 @@ class SerialExecutor:
         """Return the free memory of this host."""
         return free_memory_bytes()
 
+    def places(self) -> int:
+        """Return 1."""
+        return 1
+
+    def notice(self) -> str:
+        """Return nothing."""
+        return ""
+
     def cancel(self) -> None:
         """Forget the job."""
         self._jobs.clear()
@@ -49,11 +59,12 @@ class SerialExecutor:
 
 
 VARIABLE = "PANO_MVS_EXECUTOR"
-_WORKER_BYTES = 3_000_000_000
-EXECUTORS = ("serial", "processes", "dask")
+EXECUTORS = ("serial", "processes", "dask", *SYSTEMS)
 
 
-def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: int = 0, scheduler: str = "") -> Executor:
+def make_executor(
+    store: Store, name: str = "", *, workers: int = 0, threads: int = 0, scheduler: str = "", queue: Path | None = None
+) -> Executor:
     """Return an executor; the caller closes it.
 
     Args:
@@ -63,6 +74,7 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         workers: number of units at a time; 0 for as many as cores and memory (3 GB each) allow.
         threads: threads of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
+        queue: file with the settings of the jobs, for a queueing system.
 
     Raises:
         UsageError: if the arguments contradict each other, or the executor is not installed or cannot be reached.
@@ -72,6 +84,14 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS)}")
     if scheduler and name != "dask":
         raise UsageError(f"--scheduler requires --executor dask; {name} has no scheduler")
+    if queue is not None and name not in SYSTEMS:
+        raise UsageError(f"--queue requires --executor slurm, pbs, lsf or sge; {name} has no jobs")
+    if name in SYSTEMS:
+        if queue is None:
+            raise UsageError(f"--executor {name} requires --queue FILE.yaml; docs/running.md shows such a file")
+        if workers:
+            raise UsageError(f"--workers has no effect with --executor {name}: set `jobs` in {queue}")
+        return QueueExecutor(store, name, read_queue(queue), threads=threads)
     if name == "serial":
         if workers > 1:
             raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
@@ -92,5 +112,5 @@ def shape(workers: int = 0, threads: int = 0) -> tuple[int, int]:
     """
     cores = available_threads()
     if not workers and not threads:
-        workers = max(1, min(cores, free_memory_bytes() // _WORKER_BYTES or cores))
+        workers = max(1, min(cores, free_memory_bytes() // WORKER_BYTES or cores))
     return share_cores(cores, workers=workers, threads=threads)

@@ -16,6 +16,7 @@ import threading
 import uuid
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import gettempdir
@@ -59,9 +60,33 @@ class DaskExecutor:
             UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
                 not see the cache.
         """
-        distributed = _import_distributed()
+        distributed = import_extra("distributed", "--executor dask", "dask")
         if scheduler:
             _check_address(scheduler)
+            self._connect(store, scheduler)
+        else:
+            # Threads suffice for dask workers, because each starts one of our worker processes.
+            self._connect(
+                store,
+                distributed.LocalCluster(
+                    n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
+                ),
+            )
+        try:
+            places, share, cores = self._check_workers()
+        except UsageError:
+            self.close()
+            raise
+        self.capacity = with_waiting(places) if scheduler else places
+        self.threads = threads or share
+        self.cores = max(self.threads, cores)
+
+    def _connect(self, store: Store, cluster: Any) -> None:
+        """Connect to a cluster, or to a scheduler by its address.
+
+        Raises:
+            UsageError: if the scheduler does not answer, or the cache cannot be written.
+        """
         self._store = store
         self._run = uuid.uuid4().hex
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
@@ -69,25 +94,22 @@ class DaskExecutor:
         self._attempts = 0
         self._requests: dict[int, Path] = {}  # job to the file with its request, for large requests
         self._sources: dict[str, Any] = {}
-        self._cluster: Any = None
-        if not scheduler:
-            # Threads suffice for dask workers, because each starts one of our worker processes.
-            self._cluster = distributed.LocalCluster(
-                n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
+        self._cluster = None if isinstance(cluster, str) else cluster
+        try:
+            self._client = importlib.import_module("distributed").Client(
+                cluster, timeout=_CONNECT_S, set_as_default=False
             )
-        try:
-            self._client = distributed.Client(scheduler or self._cluster, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise UsageError(f"--scheduler {scheduler}: it does not answer ({error})") from error
+            raise UsageError(f"--scheduler {cluster}: it does not answer ({error})") from error
+        self._token = store.blobs.temporary / f"{temporary_prefix()}hello-{uuid.uuid4().hex}"
+        # What each worker compares with its own: the cache, a file in it, and the versions.
+        self._expected = str(store.root.absolute()), self._token.name, versions()
         try:
-            places, share, cores = self._check_workers()
-        except UsageError:
+            self._token.parent.mkdir(parents=True, exist_ok=True)
+            self._token.write_text(self._token.name, encoding="ascii")
+        except OSError as error:
             self.close()
-            raise
-        self.capacity = places + (places + 1) // 2 if scheduler else places
-        self.threads = threads or share
-        self.cores = max(self.threads, cores)
-        self._is_remote = bool(scheduler)
+            raise self._store.cannot_write(error) from error
 
     def submit(self, job: Job) -> None:
         """Submit a job."""
@@ -106,7 +128,11 @@ class DaskExecutor:
         self._attempts += 1
         number, attempt = job.number, self._attempts
         key = f"pano-mvs-{job.unit.key}-{self._run}-{attempt}"
-        future = self._client.submit(run_unit, self._run, text, key=key, pure=False, retries=0)
+        with suppress(OSError):
+            os.utime(self._token)  # an old one might be removed
+        future = self._client.submit(
+            run_unit, self._run, text, self._expected, key=key, pure=False, retries=0, resources=self._resources(job)
+        )
         self._out[number] = attempt, future
         future.add_done_callback(lambda done: self._ended.put((number, attempt, done)))
 
@@ -128,10 +154,18 @@ class DaskExecutor:
 
     def free_memory_bytes(self) -> int:
         """Return the free memory of this host, or, for a remote cluster, the smallest limit times the workers."""
-        if not self._is_remote:
+        if self._cluster is not None:
             return free_memory_bytes()
         limits = [worker["memory_limit"] for worker in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return int(min(limits, default=0)) * len(limits)
+
+    def places(self) -> int:
+        """Return the number of threads of the workers, each of which computes a unit."""
+        return sum(self._client.nthreads().values())
+
+    def notice(self) -> str:
+        """Return nothing: the workers were there when the run began."""
+        return ""
 
     def cancel(self) -> None:
         """Cancel all jobs and end their processes."""
@@ -147,6 +181,12 @@ class DaskExecutor:
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+        for path in children(self._token.parent, f"{self._token.name}*"):
+            path.unlink(missing_ok=True)
+
+    def _resources(self, _job: Job) -> dict[str, float] | None:
+        """Return what a job takes of the resources that workers declare."""
+        return None
 
     def _texts(self, path: Path) -> Any:
         key = str(path)
@@ -156,21 +196,14 @@ class DaskExecutor:
 
     def _check_workers(self) -> tuple[int, int, int]:
         """Return the number of units at a time, the threads for each, and the threads for a unit that runs alone."""
-        token = f"{temporary_prefix()}hello-{uuid.uuid4().hex}"
-        folder = self._store.blobs.temporary
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / token).write_text(token, encoding="ascii")
-        except OSError as error:
-            self.close()
-            raise self._store.cannot_write(error) from error
-        try:
-            found = self._client.run(introduce, str(self._store.root.absolute()), token, on_error="return")
-            for worker, answer in found.items():
-                self._check(worker, answer, token)
-        finally:
-            for path in children(folder, f"{token}*"):
-                path.unlink(missing_ok=True)
+        found = self._client.run(introduce, *self._expected[:2], on_error="return")
+        for worker, answer in found.items():
+            if isinstance(answer, BaseException):
+                raise UsageError(f"dask worker {worker} cannot run pano_mvs: {answer}. Install it there") from answer
+            if not is_file(self._token.with_name(answer["answer"])):
+                answer["token"] = ""
+            if problem := objection(answer, self._expected):
+                raise UsageError(problem)
         if not found:
             raise UsageError("--scheduler: it has no workers; start some with `dask worker`")
         places = self._client.nthreads()
@@ -180,22 +213,6 @@ class DaskExecutor:
         cores = {answer["host"]: answer["cores"] for answer in found.values()}
         share = max(1, min(cores[host] // count for host, count in on_host.items()))
         return sum(places.values()), share, min(cores.values())
-
-    def _check(self, worker: str, answer: Any, token: str) -> None:
-        if isinstance(answer, BaseException):
-            raise UsageError(f"dask worker {worker} cannot run pano_mvs: {answer}. Install it there") from answer
-        place = f"dask worker {worker} on {answer['host']}"
-        others = differences(versions(), answer["versions"])
-        if others:
-            raise UsageError(
-                f"{place}: {'; '.join(others)}. Results would depend on the worker: install the same versions there"
-            )
-        if answer["token"] != token or not is_file(self._store.blobs.temporary / answer["answer"]):
-            reason = answer["reason"] or "it is another folder there"
-            raise UsageError(
-                f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
-                "a cache with --cache DIR that all hosts share under the same path"
-            )
 
 
 def _outcome(future: Any) -> JobOutcome:
@@ -216,24 +233,40 @@ def _check_address(scheduler: str) -> None:
         raise UsageError(f"--scheduler {scheduler}: must be an address such as tcp://host:8786")
 
 
-def _import_distributed() -> Any:
+def import_extra(library: str, option: str, extra: str) -> Any:
+    """Return an optional library.
+
+    Raises:
+        UsageError: if it is not installed, with the command that installs it.
+    """
     try:
-        return importlib.import_module("distributed")
+        return importlib.import_module(library)
     except ImportError as error:
-        raise UsageError("--executor dask needs dask: pip install 'pano-mvs[dask]'") from error
+        raise UsageError(f"{option} needs {library}: pip install 'pano-mvs[{extra}]'") from error
+
+
+def with_waiting(places: int) -> int:
+    """Return the number of units to submit for a number of places, so that none stays empty between two units."""
+    return places + (places + 1) // 2
 
 
 _LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "pydantic")
 _workers: dict[tuple[str, int], WorkerProcess] = {}
+_accepted: set[str] = set()  # runs for which this dask worker has the same versions and sees the cache
 
 
-def run_unit(run: str, text: str) -> str:
-    """Compute a unit in the worker process of this thread.
+def run_unit(run: str, text: str, expected: tuple[str, str, dict[str, str]]) -> str:
+    """Compute a unit in the worker process of this thread, if this dask worker fits; it may have joined a minute ago.
 
     Args:
         run: id of the run, to end its processes later.
         text: the request as JSON, or the path of a file in the cache that contains it.
+        expected: as for `objection`.
     """
+    if run not in _accepted:
+        if problem := objection(introduce(*expected[:2]), expected):
+            return json.dumps(JobOutcome("stopped", cause=problem, error="UsageError", exit_code=2).to_json())
+        _accepted.add(run)
     request = json.loads(text if text.startswith("{") else Path(text).read_bytes())
     worker = _workers.setdefault((run, threading.get_ident()), _new_worker(request["cores"]))
     return json.dumps(worker.run(request).to_json())
@@ -268,6 +301,27 @@ def introduce(store: str, token: str) -> dict[str, Any]:
         "answer": answer.name,
         "reason": reason,
     }
+
+
+def objection(answer: Mapping[str, Any], expected: tuple[str, str, Mapping[str, str]]) -> str:
+    """Return why a worker must not compute units; empty if it may.
+
+    Args:
+        answer: of `introduce`, on the worker.
+        expected: the folder of the cache, the content of the token there, and the versions that the command uses.
+    """
+    root, token, ours = expected
+    place = f"dask worker on {answer['host']}"
+    others = differences(ours, answer["versions"])
+    if others:
+        return f"{place}: {'; '.join(others)}. Results would depend on the worker: install the same versions there"
+    if answer["token"] != token:
+        reason = answer["reason"] or "it is another folder there"
+        return (
+            f"{place} does not see the cache {root} ({reason}). Choose a cache with --cache DIR that all hosts share "
+            "under the same path"
+        )
+    return ""
 
 
 def versions() -> dict[str, str]:

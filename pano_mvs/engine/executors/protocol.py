@@ -25,6 +25,7 @@ class Job:
         log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.
         plugins: the plugin files of the workflow, with the digests of their code.
         fresh: whether it needs a process of its own.
+        memory_bytes: memory that it needs; 0 if unknown.
     """
 
     number: int
@@ -34,6 +35,7 @@ class Job:
     log: Path
     plugins: Mapping[Path, str] = field(default_factory=dict)
     fresh: bool = False
+    memory_bytes: int = 0
 
     @property
     def inputs_file(self) -> Path:
@@ -119,6 +121,12 @@ class Executor(Protocol):
 
     def free_memory_bytes(self) -> int:
         """Return the memory for all running units together; 0 if unknown."""
+
+    def places(self) -> int:
+        """Return the number of units that can be computed at a time at this moment, as workers come and go."""
+
+    def notice(self) -> str:
+        """Return what the user should know now, such as that no worker has started; usually empty."""
 
     def cancel(self) -> None:
         """End all jobs at once and forget them."""

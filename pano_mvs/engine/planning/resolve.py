@@ -59,6 +59,10 @@ class SourceListing:
         files = [[tuple(item.files.values()) for item in items if not item.problem] for items in self._items.values()]
         return CaptureSize.of_files(max(files, key=len, default=[]))
 
+    def digests(self) -> dict[str, str]:
+        """Return the digest of each file that the run can use, by its absolute path."""
+        return {str(path.absolute()): file.digest for path, file in self._files.items() if path not in self.lost}
+
     def digest(self, path: Path, store: Store) -> str:
         """Return the digest of a listed file, and register the file with the store under it.
 

@@ -49,7 +49,6 @@ class FinishedJob:
 @dataclass(slots=True)
 class _RunningJob:
     job: Job
-    memory_bytes: int
     attempts: int = 1
 
 
@@ -93,7 +92,7 @@ class Dispatcher:
         needed = self._memory_of(unit)
         if not needed:
             return True
-        used = sum(running.memory_bytes for running in self._running.values())
+        used = sum(running.job.memory_bytes for running in self._running.values())
         if not used:
             self._free_bytes = self._executor.free_memory_bytes()
         return not self._free_bytes or used + needed <= self._free_bytes
@@ -116,9 +115,10 @@ class Dispatcher:
         threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
         fresh = self._isolate and not unit.entry.spec.is_built_in
-        job = Job(self._next_number, unit, threads, unit.entry.policy.timeout_s, log, self._plugins, fresh)
+        memory, timeout_s = self._memory_of(unit), unit.entry.policy.timeout_s
+        job = Job(self._next_number, unit, threads, timeout_s, log, self._plugins, fresh, memory)
         self._next_number += 1
-        self._running[job.number] = _RunningJob(job, self._memory_of(unit))
+        self._running[job.number] = _RunningJob(job)
         self._executor.submit(job)
 
     def next_finished(self, timeout_s: float | None = None) -> FinishedJob | None:

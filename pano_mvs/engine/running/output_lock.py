@@ -56,6 +56,12 @@ def output_lock(out: Path) -> Iterator[None]:
                 path.unlink()
 
 
+def is_run_gone(out: Path) -> bool:
+    """Return whether a run in an output folder was killed: it left its lock, and its process is known to have ended."""
+    owner = _owner(_read(out / LOCK_NAME))
+    return owner is not None and _is_gone(owner)
+
+
 def _acquire(path: Path, own: bytes) -> None:
     for _ in range(_MAX_ATTEMPTS):
         if _create(path, own):

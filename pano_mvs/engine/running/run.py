@@ -103,7 +103,7 @@ class Run:
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
         if options.isolate and not self.executor.enforces_timeouts:
-            raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use processes or dask")
+            raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use another one")
         self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
         self.keys: dict[str, dict[str, str]] = {}

@@ -43,8 +43,12 @@ class WorkflowFile:
         return node.value if node is not None and isinstance(node.value, dict) else {}
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a workflow file.
+def read_text(path: Path, what: str = "workflow") -> str:
+    """Return the text of a YAML file.
+
+    Args:
+        path: the file.
+        what: its purpose, for messages.
 
     Raises:
         InputError: if it is not a regular file, too large, or not text.
@@ -52,27 +56,27 @@ def read_text(path: Path) -> str:
     try:
         info = path.stat()
         if stat.S_ISDIR(info.st_mode):
-            raise InputError(f"workflow {path} is a folder: give the path of a YAML file")
+            raise InputError(f"{what} {path} is a folder: give the path of a YAML file")
         if not stat.S_ISREG(info.st_mode):
             raise InputError(
-                f"workflow {path} is not a regular file (a pipe, a socket or a device): give the path of a YAML file"
+                f"{what} {path} is not a regular file (a pipe, a socket or a device): give the path of a YAML file"
             )
         if info.st_size > MAX_BYTES:
             raise InputError(
-                f"workflow {path} has {info.st_size} bytes, but at most {MAX_BYTES} are allowed: is it a workflow?"
+                f"{what} {path} has {info.st_size} bytes, but at most {MAX_BYTES} are allowed: is it a {what}?"
             )
         with path.open("rb") as stream:
             return stream.read(MAX_BYTES + 1).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"workflow {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
+            f"{what} {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
             "give another file"
         ) from error
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"workflow {path} cannot be read: {error}. Check its permissions, or give another file"
+            f"{what} {path} cannot be read: {error}. Check its permissions, or give another file"
         ) from error
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
@@ -238,30 +238,46 @@ class WorkflowReader:
         try:
             return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
-            known = [info.alias or field_name for field_name, info in model.model_fields.items()]
-            for problem in error.errors(include_url=False):
-                self._report(problem, node, name=name, known=known)
+            report_invalid(
+                error, node, self.problems, subject=f"stage {name!r}: ", known=(*_keys(model), *RESERVED_KEYS)
+            )
             return None
 
     def _bases(self, node: Located) -> dict[str, Path]:
         """Return the folder that the paths in each setting start from."""
         return {key: self._folder(item) for key, item in node.value.items()}
 
-    def _report(self, problem: Any, node: Located, *, name: str, known: list[str]) -> None:
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    return [info.alias or name for name, info in model.model_fields.items()]
+
+
+def report_invalid(
+    error: ValidationError, node: Located, problems: Problems, *, known: Sequence[str], subject: str = ""
+) -> None:
+    """Add a line for each setting that does not fit a model.
+
+    Args:
+        error: of the validation.
+        node: the mapping with the settings.
+        problems: receives the lines.
+        known: the settings that exist.
+        subject: what the settings belong to, at the beginning of each line.
+    """
+    for problem in error.errors(include_url=False):
         path = tuple(problem["loc"])
         found = node.at(path)
         key = ".".join(map(str, path))
         if problem["type"] == "extra_forbidden":
-            options = [*known, *(key for key in RESERVED_KEYS if key not in known)] if len(path) == 1 else []
-            unknown = f"unknown setting {key[:80]!r}.{did_you_mean(key, options)}"
-            self.problems.add(found.key_place, f"stage {name!r}: {unknown}")
+            hint = did_you_mean(key, list(dict.fromkeys(known)) if len(path) == 1 else [])
+            problems.add(found.key_place, f"{subject}unknown setting {key[:80]!r}.{hint}")
         elif problem["type"] == "missing":
-            self.problems.add(found.key_place, f"stage {name!r}: setting {key!r} is missing")
+            problems.add(found.key_place, f"{subject}setting {key!r} is missing")
         else:
             message = problem["msg"].removeprefix("Value error, ")
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
             setting = f"{key}: " if key else ""
-            self.problems.add(found.place, f"stage {name!r}: {setting}{message} (got {shown})")
+            problems.add(found.place, f"{subject}{setting}{message} (got {shown})")
 
 
 def _name_of(shown_as: str) -> str:
