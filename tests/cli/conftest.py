@@ -67,11 +67,11 @@ def run_json(folder: Path) -> dict[str, Any]:
 
 
 def deliverables(folder: Path) -> dict[str, bytes]:
-    """Return the files of an output folder, but for those that carry times."""
+    """Return the files of an output folder, also of its blocks, but for those that carry times."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
         if path.is_file()
         and path.name not in ("run.json", "report.html")
-        and path.relative_to(folder).parts[0] != "logs"
+        and "logs" not in path.relative_to(folder).parts
     }

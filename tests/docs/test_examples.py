@@ -176,12 +176,12 @@ def test_every_setting_of_a_command_exists(
 def runnable(arguments: list[str], cache: Path) -> list[str]:
     """Return a command as the test runs it; nothing if it needs more than a few panoramas and some seconds.
 
-    A run ends with its stage `images`. What reads the results of a whole run, opens a window, or needs a scheduler or
-    pictures of two lenses is left out.
+    A run ends with its stage `images`. What reads the results of a whole run, opens a window, or needs a scheduler, a
+    queue or pictures of two lenses is left out.
     """
     if arguments[0] not in ("run", "check", "plan", "status", "stage", "plugins", "schema", "cache"):
         return []
-    if {"--scheduler", "--only", "--explain", "pin", "images.use=source.dual_fisheye"} & set(arguments):
+    if {"--scheduler", "--queue", "--only", "--explain", "pin", "images.use=source.dual_fisheye"} & set(arguments):
         return []
     words = [str(cache) if word == "/shared/cache" else word for word in arguments]
     if words[0] == "run":
@@ -218,6 +218,7 @@ def test_a_command_of_a_page_is_cut_short_or_left_out(tmp_path: Path) -> None:
     assert runnable(["run", "fast"], tmp_path) == ["run", "fast", "--until", "images"]
     assert runnable(["plan", "fast", "--cache", "/shared/cache"], tmp_path)[-1] == str(tmp_path)
     assert runnable(["run", "fast", "--scheduler", "tcp://host:8786"], tmp_path) == []
+    assert runnable(["run", "fast", "--executor", "slurm", "--queue", "slurm.yaml"], tmp_path) == []
     assert runnable(["view", "out/fast"], tmp_path) == []
 
 

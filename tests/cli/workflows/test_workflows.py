@@ -66,7 +66,13 @@ def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, st
         for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("uncertainty", "tiff"), ("preview", "jpg"))
     }
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    assert files == model | views | {"cloud.ply", "report.html", "run.json", ".pano-mvs-output"}
+    assert files == model | views | {
+        "cloud.ply",
+        "report.html",
+        "run.json",
+        "logs/events.jsonl",
+        ".pano-mvs-output",
+    }
 
 
 def test_quickstart_tells_the_accuracy_and_where_the_results_are(quickstart: tuple[Path, str]) -> None:
