@@ -114,6 +114,27 @@ def test_a_plane_is_not_laid_where_another_view_sees_through_it(box: Box, planes
     np.testing.assert_array_equal(result.range[middle], box.maps["0.png"].range[middle])
 
 
+@pytest.mark.parametrize("deep", [1.4, np.nan])
+def test_nothing_lies_below_the_floor(box: Box, planes: Structure, deep: float) -> None:
+    """A view that confirms nothing sees its floor too deep, or not at all; the other views see it."""
+    own, down = box.maps["0.png"], ray_grid(SIZE)[..., 1] > 0.6
+    floor = down & ~box.walls["0.png"]
+    confidence = np.where(floor, np.where(np.isnan(deep), 0, SEEN), own.confidence).astype(np.uint8)
+    sunk = replace(own, range=np.where(floor, deep * own.range, own.range).astype(np.float32), confidence=confidence)
+    result = box.laid(planes, range_map=sunk)
+    assert np.mean(np.abs(result.range[floor] / box.truth["0.png"][floor] - 1) < 0.01) > 0.97
+    assert (result.confidence[floor] < 128).mean() > 0.97
+
+
+def test_what_a_view_confirms_below_the_floor_stays(box: Box, planes: Structure) -> None:
+    own, down = box.maps["0.png"], ray_grid(SIZE)[..., 1] > 0.6
+    floor = down & ~box.walls["0.png"]
+    lower = replace(own, range=np.where(floor, 1.4 * own.range, own.range).astype(np.float32))
+    unseen = floor & (np.arange(SIZE[1]) % 3 == 0)
+    lower = replace(lower, confidence=np.where(unseen, SEEN, own.confidence).astype(np.uint8))
+    np.testing.assert_array_equal(box.laid(planes, range_map=lower).range[floor], lower.range[floor])
+
+
 def test_without_gravity_there_are_no_planes(box: Box) -> None:
     structure = box.structure(frame="the first registered camera")
     assert len(structure) == 0

@@ -34,6 +34,8 @@ _WEIGHTS = 1.0, 0.5, 0.3, 0.03
 # Planes with less of the sphere are not laid.
 _MIN_AREA = 0.003
 _SOURCES = 4
+# A floor that slopes by this angle must not be taken for the level one: nearer the horizon, nothing is moved up to it.
+_SLOPE_RAD = np.radians(1.0)
 
 
 @checks_settings
@@ -53,6 +55,9 @@ def lay_structure(
     plain_error: Annotated[float, Setting("the same of a pixel without texture", gt=0, le=1)] = 0.08,
 ) -> tuple[RangeMap, float]:
     """Move pixels to the planes of a place that they show.
+
+    Nothing lies below the floor, the lowest level plane: what is not confirmed there, or has no range, is moved to it,
+    unless the view confirms more pixels below that plane than on it.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
@@ -89,6 +94,13 @@ def lay_structure(
         tolerance=on_grid(tolerance, stride),
         guide=cv2.resize(guide, coarse_rays.shape[1::-1], interpolation=cv2.INTER_AREA),
     )
+    sunk = np.zeros(size, np.bool_)
+    floor = _floor(structure, planes)
+    if floor is not None:
+        sunk = _below(
+            on_planes[floor], range_map, error=plain_error, cosine=-rays @ structure.normals_in_world[planes[floor]]
+        )
+        label[on_grid(sunk, stride)] = floor
     places = cam_from_world.center + coarse_rays * _chosen(coarse_planes, label)[..., None]
     agree, seen_through = _seen_by_others(places, sources[:_SOURCES], source_poses[:_SOURCES], error=plain_error)
     label, agree = _enlarged(np.where(seen_through, -1, label), size), _enlarged(agree, size) > 0
@@ -96,7 +108,7 @@ def lay_structure(
     with np.errstate(invalid="ignore"):
         near = np.abs(range_map.range / laid - 1) <= tolerance
     matched = range_map.confidence >= WEAK_CONFIDENCE[0]
-    unsure = np.where(textured, ~matched, range_map.confidence < CONSISTENT_CONFIDENCE[0])
+    unsure = np.where(textured, ~matched, range_map.confidence < CONSISTENT_CONFIDENCE[0]) | sunk
     moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
     kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
     confidence = np.select(
@@ -113,6 +125,27 @@ def lay_structure(
     return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
+
+
+def _floor(structure: Structure, planes: NDArray[np.intp]) -> int | None:
+    """Return the position in `planes` of the lowest one that is seen from above, in a world with y down."""
+    level = [number for number, idx in enumerate(planes) if structure.normals_in_world[idx, 1] < -0.5]
+    return max(level, key=lambda number: -float(structure.offsets[planes[number]]), default=None)
+
+
+def _below(floor: FloatArray, range_map: RangeMap, *, error: float, cosine: FloatArray) -> Mask:
+    """Return the pixels that are not confirmed below the floor, or have no range; none if more are confirmed there.
+
+    `floor`: (H, W) ranges on it. `error`: relative, of a range on it. `cosine`: of the angle between ray and vertical.
+    """
+    steep = np.isfinite(floor) & (cosine > _SLOPE_RAD / error)
+    with np.errstate(invalid="ignore"):
+        on_it, below = np.abs(range_map.range / floor - 1) < error, ~(range_map.range <= floor * (1 + error))
+    confirmed = range_map.confidence >= CONSISTENT_CONFIDENCE[0]
+    area = pixel_solid_angle(floor.shape)[:, None]
+    if (area * (steep & confirmed & below)).sum() > (area * (steep & confirmed & on_it)).sum():
+        return np.zeros(floor.shape, np.bool_)
+    return np.asarray(steep & below & ~confirmed)
 
 
 def _labels(
