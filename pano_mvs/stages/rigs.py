@@ -114,6 +114,8 @@ def stitching_memory_bytes(params: DualFisheyeParams, inputs: Mapping[str, Any])
     for role in ("first", "second"):
         if role in item.files:
             pixels = readable_pixels(item.files[role], int(params.max_megapixels * 1e6))
+            if pixels == 0:  # the unit will refuse it
+                return 0
             decoded += pixels * (decoding_bytes_per_pixel(item.files[role]) + 3)
     columns = params.width or params.max_width
     return 60_000_000 + decoded + 8 * columns**2 // 2 + 40_000 * columns
