@@ -65,6 +65,8 @@ def measure(tour: Path, out: Path) -> dict[str, float]:
         for one in part.values()
     }
     run = pano_mvs.load(out)
+    if run.poses is None:
+        raise SystemExit(f"{out}: contains no poses")
     rows = []
     for group in split_groups(run.poses):
         if len(group.names) < 2:
@@ -75,7 +77,8 @@ def measure(tour: Path, out: Path) -> dict[str, float]:
         unit = float(np.linalg.norm(plan - plan.mean(axis=0)) / np.linalg.norm(centers - centers.mean(axis=0)))
         for name, place in zip(group.names, places, strict=True):
             view = run.views[name]
-            rows.append(_shares(panoramas[name], view.range_map * unit / place["scale"], view.confidence))
+            if view.range_map is not None and view.confidence is not None:
+                rows.append(_shares(panoramas[name], view.range_map * unit / place["scale"], view.confidence))
     return {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
 
 
