@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.structure.lay import lay_structure
+from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY
 from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 
@@ -27,7 +30,8 @@ Picture = NDArray[np.uint8]
 class Box:
     """Views of a box: plain walls of different greys whose ranges are 3 % too large, and a textured exact floor."""
 
-    def __init__(self) -> None:
+    def __init__(self, size_hw: tuple[int, int] = SIZE, turn_deg: float = 0.0) -> None:
+        turned = Rigid3.from_center(Rotation.from_euler("y", -turn_deg, degrees=True).as_matrix(), np.zeros(3))
         self.truth: dict[str, NDArray[np.float32]] = {}
         self.walls: dict[str, NDArray[np.bool_]] = {}
         self.maps: dict[str, RangeMap] = {}
@@ -36,15 +40,15 @@ class Box:
         noise = np.random.default_rng(3)
         for number, center in enumerate(CENTERS):
             name = f"{number}.png"
-            ranges, normals = box_range(SIZE, HALF, center)
+            ranges, normals = box_range(size_hw, HALF, center)
             wall, floor = np.abs(normals[..., 1]) < 0.5, normals[..., 1] < -0.5
             greys = np.select([normals[..., 0] > 0.5, normals[..., 0] < -0.5, wall], [200.0, 170.0, 225.0], 120.0)
-            greys = np.where(floor, noise.integers(20, 100, SIZE), greys)
+            greys = np.where(floor, noise.integers(20, 100, size_hw), greys)
             self.truth[name], self.walls[name] = ranges, wall
             self.pictures[name] = np.repeat(greys[..., None], 3, axis=-1).astype(np.uint8)
             edge = wall & has_texture(self.pictures[name])
             self.maps[name] = as_map(np.where(wall, 1.03 * ranges, ranges), np.where(edge, SEEN, TRUSTED))
-            self.cams[name] = Rigid3.from_center(np.eye(3), center)
+            self.cams[name] = Rigid3.from_center(np.eye(3), center) @ turned
 
     def structure(self, frame: str = "y down") -> Structure:
         poses = Poses.without_points(self.cams, frame=frame, scale="", metric=True)
@@ -92,6 +96,32 @@ def test_pixels_move_to_the_walls_that_they_show(box: Box, planes: Structure) ->
     error = np.abs(result.range / box.truth["0.png"] - 1)
     assert np.mean(error < 0.01) > 0.97
     assert (result.confidence[box.walls["0.png"]] >= 128).mean() > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn_deg", [0.0, 25.0])
+def test_walls_without_any_match_stand_where_their_creases_are(turn_deg: float) -> None:
+    """No view has a match on a wall: their ranges are the floor's and the ceiling's, spread out."""
+    box = Box((256, 512), turn_deg)
+    for name, own in box.maps.items():
+        wall = box.walls[name]
+        box.maps[name] = replace(
+            own,
+            range=np.where(wall, 2.2, own.range).astype(np.float32),
+            confidence=np.where(wall, FILLED_CONFIDENCE[1], own.confidence).astype(np.uint8),
+        )
+    structure = box.structure()
+    structure.check()
+    walls = np.abs(structure.normals_in_world[:, 1]) < 0.5
+    assert walls.sum() == 4
+    assert (structure.uncertainties[walls] == OUTLINE_UNCERTAINTY).all()
+    result, wall = box.laid(structure), box.walls["0.png"]
+    error = np.abs(result.range[wall] / box.truth["0.png"][wall] - 1)
+    assert np.median(error) < 0.01
+    assert np.mean(error < 0.03) > 0.95
+    assert (result.confidence[wall] < 128).all()
+    confirmed = replace(box.maps["0.png"], confidence=np.full(wall.shape, TRUSTED, np.uint8))
+    np.testing.assert_array_equal(box.laid(structure, range_map=confirmed).range[wall], confirmed.range[wall])
 
 
 def test_what_stands_before_a_wall_stays(box: Box, planes: Structure) -> None:

@@ -17,19 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
-from pano_mvs.algorithms.structure.view import FloatArray, PlaneView, plane_ranges
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.algorithms.structure.outline import room_labels, room_of
+from pano_mvs.algorithms.structure.view import (
+    HALF_DIFFERENCE,
+    STEP_RAD,
+    FloatArray,
+    PlaneView,
+    ScenePlane,
+    blurred,
+    differences,
+    plane_ranges,
+    world_rays,
+)
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
-# Profiles across a crease: steps of 0.1° to either side, and the distance of the samples that are compared.
-_STEP_RAD, _REACH, _HALF_DIFFERENCE = np.radians(0.1), 45, 4
+# Profiles across a crease: steps to either side.
+_REACH = 45
 _AZIMUTHS_RAD = np.radians(np.arange(0.0, 360.0, 0.7))
-_BLUR_PX, _CLIP_LEVELS, _COARSE_STEPS = 0.7, 40.0, 2
+_COARSE_STEPS = 2
 # The planes must be seen on their sides of the crease, this far from it.
 _BESIDE_RAD = np.radians([2.0, 3.5])
 _LEAST_COSINE = 0.08
 _MIN_SAMPLES = 6
-PLAIN_WEIGHT = 0.05
-"""Weight of a point without texture relative to a precise one in the fit of a plane."""
 
 # Standard deviations of the shift and the turn of planes that were fitted to precise points, and to others.
 _PRECISE_STDS, _PLAIN_STDS = np.array([0.002, np.radians(0.1)]), np.array([0.02, np.radians(0.7)])
@@ -44,36 +53,6 @@ _COARSE_SHIFTS, _COARSE_TURNS_RAD = np.linspace(-0.06, 0.06, 25), np.radians(np.
 _FINE_SHIFTS, _FINE_TURNS_RAD = np.linspace(-0.004, 0.004, 9), np.radians(np.linspace(-0.3, 0.3, 5))
 _HEIGHT_SHIFTS = np.linspace(-0.01, 0.01, 21)
 _ROUNDS = 3
-_PAD_PX = 4
-
-
-@dataclass(frozen=True, eq=False)
-class ScenePlane:
-    """The plane n · X = offset.
-
-    `normal`: (3,) unit normal n in the world, towards the side from which it was seen. `offset`: in scene units.
-    `support`: solid angle of its points, summed over views. `precise_support`: that of confirmed points with texture.
-    `uncertainty`: relative standard deviation of ranges on it. `is_level`: whether the normal is vertical; else it is
-    horizontal.
-    """
-
-    normal: NDArray[np.float64]
-    offset: float
-    support: float
-    precise_support: float
-    uncertainty: float
-    is_level: bool
-
-    @property
-    def precise_share(self) -> float:
-        """The share of precise points in the fit."""
-        plain = PLAIN_WEIGHT * (self.support - self.precise_support)
-        return self.precise_support / max(self.precise_support + plain, 1e-9)
-
-    @property
-    def y(self) -> float:
-        """The height of a level plane, as a y coordinate of the world."""
-        return float(self.offset * self.normal[1])
 
 
 def placed_by_creases(
@@ -81,8 +60,8 @@ def placed_by_creases(
 ) -> list[ScenePlane]:
     """Return the planes, in the same order, moved to where the pictures show their creases.
 
-    `views`: of one group, in whose world y points down along gravity. `planes`: found in ranges. `max_relative_error`:
-    of ranges on a plane.
+    Planes without support that show no clear ones are left out. `views`: of one group, in whose world y points down
+    along gravity. `planes`: found in ranges and outlines. `max_relative_error`: of ranges on a plane.
     """
     creases = _creases(views, planes, max_relative_error)
     heights = np.array([plane.y if plane.is_level else np.nan for plane in planes])
@@ -97,13 +76,15 @@ def placed_by_creases(
             placement.move(heights, _FINE_SHIFTS / (1 + round_number), _FINE_TURNS_RAD / (1 + round_number), fine=True)
         for level in levels[1:]:
             heights[level] = _best_height(planes[level], level, heights, placed=list(placed.values()))
+    clear = {idx: placement for idx, placement in placed.items() if placement.share >= _MIN_SHARE}
     return [
         replace(plane, offset=float(heights[idx] * plane.normal[1]))
         if plane.is_level
-        else placed[idx].result()
-        if idx in placed
+        else clear[idx].result()
+        if idx in clear
         else plane
         for idx, plane in enumerate(planes)
+        if plane.support or idx in clear
     ]
 
 
@@ -139,6 +120,10 @@ class _Placement:
         foot = creases.center[:, [0, 2]] + across * (self._height / (across @ normal))[:, None]
         self._middle = foot.mean(axis=0)
         self._distance = float(np.abs(self._height).mean())
+        self._most = [
+            max(float(np.sqrt((profiles**2).sum(axis=-1).max(axis=1)).sum()), 1e-9)
+            for profiles in (creases.coarse, creases.fine)
+        ]
         self.turn = self.shift = 0.0
         self.share = 0.0
 
@@ -161,7 +146,7 @@ class _Placement:
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (offset - center[:, [0, 2]] @ normal) / (self._across @ normal)
         dip = np.arctan2(heights[creases.level] - center[:, 1], distance)
-        place = (dip - creases.dip) / _STEP_RAD + _REACH
+        place = (dip - creases.dip) / STEP_RAD + _REACH
         inside = (distance > 0) & (place >= 0) & (place < 2 * _REACH)
         place = np.where(inside, place, 0.0)
         first = place.astype(np.int64)
@@ -170,17 +155,16 @@ class _Placement:
         samples = np.arange(len(first))
         values = profiles[samples, first] * (1 - part) + profiles[samples, first + 1] * part
         common = np.add.reduceat(values * inside[:, None], creases.starts, axis=0)
-        most = np.sqrt((profiles**2).sum(axis=-1).max(axis=1)).sum()
-        share = float(np.sqrt((common**2).sum(axis=-1)).sum() / max(most, 1e-9))
+        share = float(np.sqrt((common**2).sum(axis=-1)).sum() / self._most[fine])
         shift_std, turn_std = self._stds
         return float(share - _LOSS * ((shift / shift_std) ** 2 + (turn / turn_std) ** 2))
 
     def result(self) -> ScenePlane:
-        """Return the plane at its place, or where it was if it has no clear creases."""
-        if self.share < _MIN_SHARE:
-            return self.plane
+        """Return the plane at its place."""
         (x, z), offset = self._moved(self.turn, self.shift)
-        uncertainty = min(self.plane.uncertainty, _CREASE_UNCERTAINTY)
+        uncertainty = self.plane.uncertainty
+        if self.plane.support:  # ranges and creases agree
+            uncertainty = min(uncertainty, _CREASE_UNCERTAINTY)
         return replace(self.plane, normal=np.array([x, 0.0, z]), offset=offset, uncertainty=uncertainty)
 
     def _moved(self, turn: float, shift: float) -> tuple[FloatArray, float]:
@@ -217,9 +201,8 @@ def _creases(views: Sequence[PlaneView], planes: Sequence[ScenePlane], tolerance
     """Return the creases of each upright plane that has any."""
     parts: dict[int, list[tuple[FloatArray, ...]]] = {}
     for view in views:
-        labels = _nearest_planes(view, planes, tolerance)
-        padded = pad_panorama(view.load(), _PAD_PX).astype(np.float32)
-        picture = np.asarray(cv2.GaussianBlur(padded, (0, 0), _BLUR_PX))
+        labels = _shown_planes(view, planes, tolerance)
+        picture = blurred(view.load())
         for idx, upright in enumerate(planes):
             for level, other in enumerate(planes):
                 if upright.is_level or not other.is_level:
@@ -243,20 +226,22 @@ def _joined(parts: Sequence[tuple[FloatArray, ...]]) -> _Creases:
     return _Creases(azimuth, dip, center, level.astype(np.int64), starts, fine, coarse.astype(np.float64))
 
 
-def _nearest_planes(view: PlaneView, planes: Sequence[ScenePlane], tolerance: float) -> NDArray[np.int64]:
-    """Return the plane that is nearest to each pixel's range, (h, w), −1 for none."""
+def _shown_planes(view: PlaneView, planes: Sequence[ScenePlane], tolerance: float) -> NDArray[np.int64]:
+    """Return the plane of each pixel, (h, w), −1 for none: by its range if confirmed, else by the room's outline."""
+    center = view.cam_from_world.center
+    ranges = [plane_ranges(view.rays, center, normal=plane.normal, offset=plane.offset) for plane in planes]
     best = np.full(view.ranges.shape, tolerance)
     labels = np.full(view.ranges.shape, -1)
-    for idx, plane in enumerate(planes):
+    for idx, of_plane in enumerate(ranges):
         with np.errstate(invalid="ignore"):
-            error = np.abs(
-                plane_ranges(view.rays, view.cam_from_world.center, normal=plane.normal, offset=plane.offset)
-                / view.ranges
-                - 1
-            )
+            error = np.abs(of_plane / view.ranges - 1)
             closer = error < best
         best[closer], labels[closer] = error[closer], idx
-    return labels
+    room = room_of(view, planes)
+    if room is None:
+        return labels
+    outlined = room_labels(room, view.rays, ranges)
+    return np.where((outlined >= 0) & (view.confidence < CONSISTENT_CONFIDENCE[0]), outlined, labels)
 
 
 def _profiles(
@@ -283,25 +268,15 @@ def _profiles(
     outward = -np.sign(level_y - center[1])  # towards the horizon, where the upright plane is
     shown = np.zeros(len(azimuth), np.bool_)
     for beside in _BESIDE_RAD:
-        on_upright = _value_at(sides[0], view, rays=_rays(azimuth, dip + outward * beside))
-        on_level = _value_at(sides[1], view, rays=_rays(azimuth, dip - outward * beside))
+        on_upright = _value_at(sides[0], view, rays=world_rays(azimuth, dip + outward * beside))
+        on_level = _value_at(sides[1], view, rays=world_rays(azimuth, dip - outward * beside))
         shown |= on_upright & on_level
     if shown.sum() < _MIN_SAMPLES:
         return None
     azimuth, dip = azimuth[shown], dip[shown]
-    steps = _STEP_RAD * np.arange(-_REACH - _HALF_DIFFERENCE, _REACH + _HALF_DIFFERENCE + 1)
-    rays = _rays(azimuth[:, None], dip[:, None] + steps) @ view.cam_from_world.rotation.T
-    size = picture.shape[0] - 2 * _PAD_PX, picture.shape[1] - 2 * _PAD_PX
-    pixels = (pixel_from_ray(rays, size) + (_PAD_PX - 0.5)).astype(np.float32)
-    colors = cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR).astype(np.float64)
-    differences = colors[:, 2 * _HALF_DIFFERENCE :] - colors[:, : -2 * _HALF_DIFFERENCE]
-    return azimuth, dip, np.clip(differences, -_CLIP_LEVELS, _CLIP_LEVELS)
-
-
-def _rays(azimuth: FloatArray, dip: FloatArray) -> FloatArray:
-    """Return unit rays in the world for azimuths and angles below the horizon."""
-    level = np.cos(dip)
-    return np.stack(np.broadcast_arrays(np.sin(azimuth) * level, np.sin(dip), np.cos(azimuth) * level), axis=-1)
+    steps = STEP_RAD * np.arange(-_REACH - HALF_DIFFERENCE, _REACH + HALF_DIFFERENCE + 1)
+    rays = world_rays(azimuth[:, None], dip[:, None] + steps) @ view.cam_from_world.rotation.T
+    return azimuth, dip, differences(picture, rays, axis=1).astype(np.float64)
 
 
 def _value_at(values: NDArray[np.bool_], view: PlaneView, *, rays: FloatArray) -> NDArray[np.bool_]:

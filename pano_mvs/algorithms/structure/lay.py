@@ -19,7 +19,17 @@ from pano_mvs.algorithms.filters.guided import guided_values
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
-from pano_mvs.algorithms.structure.view import FloatArray, Mask, Picture, on_grid, plane_ranges, stride_of
+from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
+from pano_mvs.algorithms.structure.view import (
+    FloatArray,
+    Mask,
+    Picture,
+    ScenePlane,
+    on_grid,
+    plane_ranges,
+    plane_view,
+    stride_of,
+)
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
@@ -31,6 +41,8 @@ _NO_PLANE = 0.6
 _RADIUS, _EPSILON = 8, 8.0
 # Weights of the own ranges of precise, confirmed, weak and filled pixels.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
+# The weight of the outline of the room where nothing is confirmed.
+_OUTLINE_WEIGHT = 0.2
 # Planes with less of the sphere are not laid.
 _MIN_AREA = 0.003
 _SOURCES = 4
@@ -86,10 +98,16 @@ def lay_structure(
         for idx in planes
     ]
     coarse_rays, coarse_planes = on_grid(rays, stride), [on_grid(ranges, stride) for ranges in on_planes]
+    known = [
+        ScenePlane(normal, float(structure.offsets[idx]), 1.0, 0.0, uncertainty=1.0, is_level=abs(normal[1]) > 0.5)
+        for idx, normal in zip(planes, structure.normals_in_world[planes], strict=True)
+    ]
+    room = room_of(plane_view(range_map, lambda: guide, cam_from_world), known)
     label = _labels(
         coarse_planes,
         on_grid(range_map.range, stride),
         on_grid(range_map.confidence, stride),
+        outlined=None if room is None else room_labels(room, coarse_rays, coarse_planes),
         textured=on_grid(textured, stride),
         tolerance=on_grid(tolerance, stride),
         guide=cv2.resize(guide, coarse_rays.shape[1::-1], interpolation=cv2.INTER_AREA),
@@ -107,8 +125,11 @@ def lay_structure(
     laid = _chosen(on_planes, label)
     with np.errstate(invalid="ignore"):
         near = np.abs(range_map.range / laid - 1) <= tolerance
-    matched = range_map.confidence >= WEAK_CONFIDENCE[0]
-    unsure = np.where(textured, ~matched, range_map.confidence < CONSISTENT_CONFIDENCE[0]) | sunk
+    matched, confirmed = (range_map.confidence >= least[0] for least in (WEAK_CONFIDENCE, CONSISTENT_CONFIDENCE))
+    # Creases of single views confirm nothing, and correct nothing that is confirmed.
+    alone = np.isin(label, np.flatnonzero(structure.uncertainties[planes] >= OUTLINE_UNCERTAINTY))
+    near, agree = near & ~(alone & confirmed), agree & ~alone
+    unsure = np.where(textured, ~matched, ~confirmed) | sunk
     moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
     kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
     confidence = np.select(
@@ -153,6 +174,7 @@ def _labels(
     ranges: NDArray[np.float32],
     confidence: NDArray[np.uint8],
     *,
+    outlined: NDArray[np.int64] | None,
     textured: Mask,
     tolerance: FloatArray,
     guide: Picture,
@@ -161,16 +183,19 @@ def _labels(
     confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
     weak = confidence >= WEAK_CONFIDENCE[0]
     weight = np.select([confirmed & textured, confirmed, weak], _WEIGHTS[:3], _WEIGHTS[3])
+    prior = np.zeros(ranges.shape) if outlined is None else _OUTLINE_WEIGHT * ((outlined >= 0) & ~confirmed)
     area = pixel_solid_angle(confidence.shape[:2])[:, None] / (4 * np.pi)
     best, label = np.full(ranges.shape, _NO_PLANE), np.full(ranges.shape, -1, np.int16)
     for number, on_plane in enumerate(on_planes):
         with np.errstate(invalid="ignore", divide="ignore"):
             error = np.abs(np.log(ranges / on_plane)) / tolerance
-        if not (area * ((error < 1) & weak)).sum() >= _MIN_AREA:
+        shown = np.zeros(ranges.shape, np.bool_) if outlined is None else outlined == number
+        if not (area * ((error < 1) & weak | shown)).sum() >= _MIN_AREA:
             continue
         unknown = np.isfinite(on_plane) & ~np.isfinite(ranges)
         cost = np.where(unknown, 0.5, np.minimum(np.nan_to_num(error, nan=1.0), 1.0))
-        filtered, _ = guided_values(cost, weight, guide.astype(np.float64), radius=_RADIUS, epsilon=_EPSILON)
+        cost = (weight * cost + prior * ~shown) / (weight + prior)
+        filtered, _ = guided_values(cost, weight + prior, guide.astype(np.float64), radius=_RADIUS, epsilon=_EPSILON)
         better = (filtered < best) & np.isfinite(on_plane)
         best[better], label[better] = filtered[better], number
     return label

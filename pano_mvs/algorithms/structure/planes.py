@@ -14,8 +14,17 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.structure.creases import PLAIN_WEIGHT, ScenePlane, placed_by_creases
-from pano_mvs.algorithms.structure.view import FloatArray, Mask, Picture, PlaneView, plane_view
+from pano_mvs.algorithms.structure.creases import placed_by_creases
+from pano_mvs.algorithms.structure.outline import outline_planes, same_wall
+from pano_mvs.algorithms.structure.view import (
+    PLAIN_WEIGHT,
+    FloatArray,
+    Mask,
+    Picture,
+    PlaneView,
+    ScenePlane,
+    plane_view,
+)
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
@@ -53,7 +62,14 @@ def find_planes(
         for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
     ]
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
-    return placed_by_creases(views, planes, max_relative_error=max_relative_error)
+    planes += outline_planes(views, planes)
+    placed = placed_by_creases(views, planes, max_relative_error=max_relative_error)
+    centers = np.array([view.cam_from_world.center for view in views])
+    return [
+        plane
+        for number, plane in enumerate(placed)
+        if plane.support or not any(same_wall(plane, other, centers) for other in placed[:number])
+    ]
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""What the search for planes reads of one view, on a coarse grid."""
+"""What the search for planes reads of one view, and what it finds: planes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -19,6 +20,14 @@ FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
 Value = TypeVar("Value", bound=np.generic)
+
+STEP_RAD = np.radians(0.1)
+"""Distance of the samples across a crease."""
+HALF_DIFFERENCE = 4
+"""Steps from a crease to the two colours that are compared."""
+_BLUR_PX, _CLIP_LEVELS, _PAD_PX = 0.7, 40.0, 4
+PLAIN_WEIGHT = 0.05
+"""Weight of a point without texture relative to a precise one in the fit of a plane."""
 
 _ROWS = 256
 # Planes at a more grazing angle than this cosine are not assigned to pixels.
@@ -86,3 +95,55 @@ def plane_ranges(rays: FloatArray, center: FloatArray, *, normal: FloatArray, of
     height = offset - center @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where((cosine < -_GRAZING) & (height < 0), height / cosine, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlane:
+    """The plane n · X = offset.
+
+    `normal`: (3,) unit normal n in the world, towards the side from which it was seen. `offset`: in scene units.
+    `support`: solid angle of its points, summed over views. `precise_support`: that of confirmed points with texture.
+    `uncertainty`: relative standard deviation of ranges on it. `is_level`: whether the normal is vertical; else it is
+    horizontal.
+    """
+
+    normal: NDArray[np.float64]
+    offset: float
+    support: float
+    precise_support: float
+    uncertainty: float
+    is_level: bool
+
+    @property
+    def precise_share(self) -> float:
+        """The share of precise points in the fit."""
+        plain = PLAIN_WEIGHT * (self.support - self.precise_support)
+        return self.precise_support / max(self.precise_support + plain, 1e-9)
+
+    @property
+    def y(self) -> float:
+        """The height of a level plane, as a y coordinate of the world."""
+        return float(self.offset * self.normal[1])
+
+
+def world_rays(azimuth: FloatArray, dip: FloatArray) -> FloatArray:
+    """Return unit rays in the world for azimuths and angles below the horizon."""
+    level = np.cos(dip)
+    return np.stack(np.broadcast_arrays(np.sin(azimuth) * level, np.sin(dip), np.cos(azimuth) * level), axis=-1)
+
+
+def blurred(picture: Picture) -> NDArray[np.float32]:
+    """Return a panorama (H, W, 3) for `differences`: blurred a little, and padded."""
+    return np.asarray(cv2.GaussianBlur(pad_panorama(picture, _PAD_PX).astype(np.float32), (0, 0), _BLUR_PX))
+
+
+def differences(picture: NDArray[np.float32], rays_in_cam: FloatArray, *, axis: int) -> NDArray[np.float32]:
+    """Return how colours change along an axis of rays, `STEP_RAD` apart; it is 2 `HALF_DIFFERENCE` entries shorter.
+
+    `picture`: from `blurred`. A strong edge counts no more than one of 40 levels.
+    """
+    size = picture.shape[0] - 2 * _PAD_PX, picture.shape[1] - 2 * _PAD_PX
+    pixels = (pixel_from_ray(rays_in_cam, size) + (_PAD_PX - 0.5)).astype(np.float32)
+    colors = np.moveaxis(cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR), axis, 0)
+    changes = np.clip(colors[2 * HALF_DIFFERENCE :] - colors[: -2 * HALF_DIFFERENCE], -_CLIP_LEVELS, _CLIP_LEVELS)
+    return np.asarray(np.moveaxis(changes, 0, axis))
