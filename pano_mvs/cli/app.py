@@ -117,6 +117,10 @@ def run(
             help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
         ),
     ] = None,
+    otel: Annotated[
+        bool,
+        typer.Option("--otel", help="Send the run, its stages and units as spans to an OpenTelemetry collector."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
@@ -188,7 +192,7 @@ def run(
     session = open_session(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
-    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable)
+    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable, otel)
     division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
     with notified([] if dry_run else notify or [], session.out):
         if division is not None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shlex
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.markup import escape
@@ -15,10 +17,12 @@ from pano_mvs.cli.plan_commands import show_dry_run
 from pano_mvs.cli.run.command import interrupted_by_termination, run_shown
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.results.summary import FAILED_ITEMS
+from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, INTERRUPTED
 from pano_mvs.session.commands import run_command
+from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, open_blocks, split_images
-from pano_mvs.session.merging.merge import BLOCKS, merge_outputs
+from pano_mvs.session.merging.merge import merge_outputs
+from pano_mvs.session.progress import BlockStarted, Event, RunFinished, Warned
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
@@ -72,18 +76,40 @@ def run_in_blocks(
         _show_dry_run(session, execution, blocks, console=console)
         return 0
     with interrupted_by_termination(), open_blocks(session, blocks) as runs:
-        codes = []
-        for number, run in enumerate(runs, start=1):
-            _print_heading(run, number, len(runs), console=console)
-            code = _run_block(run, execution, console)
-            codes.append(code)
-            if _is_early(code) and not session.run_options.keep_going:
-                return code
-        if early := [run.name for run, code in zip(runs, codes, strict=True) if _is_early(code)]:
-            console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")
-            return max(filter(_is_early, codes))
-        merged = _merge(session, runs, console)
-        return merged if _is_early(merged) else max(*codes, merged)
+        log, began, code = EventLog(partial(_print_warning, console)), time.monotonic(), 1
+        log.open(session.out / BLOCKS)
+        try:
+            code = _run_and_merge(session, execution, runs, log=log, console=console)
+            return code
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+            raise
+        finally:
+            log(RunFinished(code, "", seconds=round(time.monotonic() - began, 3), out=session.out))
+
+
+def _print_warning(console: Console, event: Event) -> None:
+    if isinstance(event, Warned):
+        console.say(f"[yellow]warning:[/] {escape(event.text)}")
+
+
+def _run_and_merge(
+    session: Session, execution: Execution, runs: Sequence[BlockRun], *, log: EventLog, console: Console
+) -> int:
+    codes = []
+    for number, run in enumerate(runs, start=1):
+        left = sum(len(later.names) for later in runs[number:])
+        log(BlockStarted(run.name, number, len(runs), images=len(run.names), images_left=left))
+        _print_heading(run, number, len(runs), console=console)
+        code = _run_block(run, execution, console)
+        codes.append(code)
+        if _is_early(code) and not session.run_options.keep_going:
+            return code
+    if early := [run.name for run, code in zip(runs, codes, strict=True) if _is_early(code)]:
+        console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")
+        return max(filter(_is_early, codes))
+    merged = _merge(session, runs, console)
+    return merged if _is_early(merged) else max(*codes, merged)
 
 
 def _is_early(code: int) -> bool:

@@ -1,4 +1,4 @@
-"""`pano-mvs watch`: follow a run by the events in its output folder, from any terminal that sees it."""
+"""`pano-mvs watch`: follow a run, or a run in blocks, by the events in its output folder, from any terminal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import shutil
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
+from typing import TypeVar
 
 from rich.console import Group
 from rich.live import Live
@@ -21,10 +22,13 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.ending import ending_text
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.memory import size_text
+from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import clock_text, duration_text, one_line, plural
 from pano_mvs.engine.running.output_lock import is_run_gone
+from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.event_log import EVENTS_FILE, EventReader
 from pano_mvs.session.progress import (
+    BlockStarted,
     Event,
     RunFinished,
     RunStarted,
@@ -45,20 +49,32 @@ _SHOWN_WARNINGS = 3
 _BAR_WIDTH = 20
 _KILLED = 1
 
+View = TypeVar("View", bound="RunView | BlocksView")
+
 
 def watch_run(out: Path, console: Console) -> int:
-    """Show a run until it ends, and return its exit code; 1 if it was killed.
+    """Show a run, or a run in blocks, until it ends, and return its exit code; 1 if it was killed.
 
     Raises:
         InputError: if no run has begun in the folder.
     """
-    reader, view = EventReader(out), RunView(out)
+    blocks = out / BLOCKS
+    in_blocks = is_file(blocks / EVENTS_FILE) and not is_file(out / EVENTS_FILE)
+    folder = blocks if in_blocks else out
+    reader = EventReader(folder)
+    view: RunView | BlocksView = BlocksView(folder) if in_blocks else RunView(folder)
     with ExitStack() as stack:
         live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
         next_line_s = time.monotonic()
         while True:
-            is_gone = is_run_gone(out)  # asked first, so that its last events are read
-            view = _updated(view, reader, out)
+            is_gone = is_run_gone(folder)  # asked first, so that its last events are read
+            try:
+                view = _updated(view, reader)
+            except OSError as error:
+                raise InputError(
+                    f"no run has begun in {out}: {folder / EVENTS_FILE} cannot be read ({error.strerror}). Give the "
+                    "output folder of a run"
+                ) from error
             if is_gone or view.end is not None:
                 break
             if console.is_terminal:
@@ -68,35 +84,113 @@ def watch_run(out: Path, console: Console) -> int:
                 next_line_s += _LINE_EVERY_S
             time.sleep(_EVERY_S)
     console.print(view.shown())
-    console.say(escape(view.ending()))
+    console.say(escape(_ending(view.end)))
     return _KILLED if view.end is None else view.end.exit_code
 
 
-def _updated(view: RunView, reader: EventReader, out: Path) -> RunView:
-    """Return the view after the new events; another one if another run has begun."""
-    try:
-        is_new, events = reader.read()
-    except OSError as error:
-        raise InputError(
-            f"no run has begun in {out}: {out / EVENTS_FILE} cannot be read ({error.strerror}). Give the output folder "
-            "of a run"
-        ) from error
-    view = RunView(out) if is_new else view
+def _updated(view: View, reader: EventReader, since_s: float = 0.0) -> View:
+    """Return the view after the new events; another one if another run has begun.
+
+    Args:
+        view: of the run so far.
+        reader: reads its events.
+        since_s: in seconds since 1970; earlier events are of an earlier run, which this one has not replaced yet.
+
+    Raises:
+        OSError: if there are no events.
+    """
+    is_new, events = reader.read()
+    view = type(view)(view.folder) if is_new else view
     for at, event in events:
-        view.take(at, event)
+        if at >= since_s:
+            view.take(at, event)
+    if isinstance(view, BlocksView):
+        view.update()
     return view
+
+
+def _ending(end: RunFinished | None) -> str:
+    """Return how a run ended, in words; None if it was killed."""
+    if end is None:
+        return "the run was killed; the same command continues it"
+    verdict = end.verdict.judgement if end.verdict is not None else ""
+    reason = f": {end.stopped}" if end.stopped not in ("", "interrupted") else ""
+    text = f"{ending_text(end.exit_code)} (exit code {end.exit_code})"
+    return f"{text} after {duration_text(end.seconds)}{reason}{f'. {verdict}' if verdict else ''}"
+
+
+class BlocksView:
+    """What the events of a run in blocks say about it: the present block, and what is still to come.
+
+    Attributes:
+        folder: with the output folders of the blocks.
+        end: its last event; None while it runs.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.end: RunFinished | None = None
+        self._block: BlockStarted | None = None
+        self._since_s = 0.0
+        self._run = RunView(folder)  # of the block
+        self._reader = EventReader(folder)
+
+    def take(self, at: float, event: Event) -> None:
+        """Take an event into account; see `RunView.take`."""
+        match event:
+            case BlockStarted():
+                folder = self.folder / event.block
+                self._block, self._since_s, self._run, self._reader = event, at, RunView(folder), EventReader(folder)
+            case RunFinished():
+                self.end = event
+            case _:
+                pass
+
+    def update(self) -> None:
+        """Take the new events of the block into account."""
+        if self._block is not None:
+            with suppress(OSError):  # its run has not begun
+                self._run = _updated(self._run, self._reader, self._since_s)
+
+    def shown(self) -> Group:
+        """Return all of it."""
+        lines = [f"{self._block.block}: {_ending(self._run.end)}"] if self._block and self._run.end else []
+        lines += [] if self.end else [self._left_in_all()]
+        return Group(Text(self._heading(), style="bold"), self._run.shown(), *map(Text, filter(None, lines)))
+
+    def left_text(self) -> str:
+        """Return the time left of the block, and of all blocks."""
+        return "; ".join(filter(None, (self._heading(), self._run.left_text(), self._left_in_all())))
+
+    def _heading(self) -> str:
+        block = self._block
+        if block is None:
+            return "starting"
+        return f"block {block.number} of {block.blocks}, {block.images} {plural(block.images, 'image')}"
+
+    def _left_in_all(self) -> str:
+        """Return the time left if the blocks to come take as long as this one, for each image; empty if unknown."""
+        block, left = self._block, self._run.left()
+        if block is None or not self._run.has_begun:
+            return ""
+        if not block.images_left:
+            return "all blocks have run" if self._run.end else ""
+        later_s = (self._run.elapsed_s() + left.seconds_left) * block.images_left / block.images
+        about = "more than" if left.at_least else "about"
+        return f"all blocks: {about} {clock_text(left.seconds_left + later_s)} left, if the later ones take as long"
 
 
 class RunView:
     """What the events of a run say about it.
 
     Attributes:
+        folder: its output folder.
         end: its last event; None while it runs.
     """
 
-    def __init__(self, out: Path, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
         self.end: RunFinished | None = None
-        self._out = out
+        self.folder = folder
         self._clock = clock
         self._start: RunStarted | None = None
         self._began = self._latest = clock()
@@ -158,8 +252,9 @@ class RunView:
 
         Estimates by which the run would have ended by now do not count.
         """
-        self._now = max(self._latest, self._clock())
-        left = self._estimator.estimate()
+        if not self.has_begun:
+            return "starting"
+        left = self.left()
         about = "more than" if left.at_least else "about"
         text = f"{100 * left.done:.0f} %, {about} {clock_text(left.seconds_left)} left"
         if left.at_least:
@@ -168,20 +263,25 @@ class RunView:
         clock = datetime.fromtimestamp(self._now + left.seconds_left).strftime("%H:%M")
         return f"{text} ({clock_text(min(ends))} to {clock_text(max(ends))}), until about {clock}"
 
-    def ending(self) -> str:
-        """Return how the run ended, in words."""
-        if self.end is None:
-            return "the run was killed; the same command continues it"
-        verdict = self.end.verdict.judgement if self.end.verdict is not None else ""
-        reason = f": {self.end.stopped}" if self.end.stopped not in ("", "interrupted") else ""
-        text = f"{ending_text(self.end.exit_code)} (exit code {self.end.exit_code})"
-        return f"{text} after {duration_text(self.end.seconds)}{reason}{f'. {verdict}' if verdict else ''}"
+    @property
+    def has_begun(self) -> bool:
+        """Whether the first event was taken."""
+        return self._start is not None
+
+    def left(self) -> TimeLeft:
+        """Return the estimate of the time left at this moment."""
+        self._now = max(self._latest, self._clock())
+        return self._estimator.estimate()
+
+    def elapsed_s(self) -> float:
+        """Return the time since its beginning, or that it took."""
+        return self.end.seconds if self.end else max(self._latest, self._clock()) - self._began
 
     def _heading(self) -> list[str]:
         if self._start is None:
             return ["starting"]
         start = self._start
-        name = f"{one_line(start.workflow)} in {self._out}"
+        name = f"{one_line(start.workflow)} in {self.folder}"
         workers = f"{start.executor}, {self._workers} {plural(self._workers, 'worker')} of {start.threads} "
         return [f"{name}: {workers}{plural(start.threads, 'thread')}, {clock_text(self._now - self._began)}"]
 
@@ -196,7 +296,7 @@ class RunView:
         return table
 
     def _disk(self) -> str:
-        cache = self._start.cache if self._start is not None else self._out
+        cache = self._start.cache if self._start is not None else self.folder
         try:
             free = f"{size_text(shutil.disk_usage(cache).free)} free for the cache"
         except OSError as error:

@@ -6,7 +6,6 @@ software, with images and settings as its objects, and files of the output folde
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping
 from datetime import datetime, timedelta
@@ -15,6 +14,7 @@ from typing import Any
 
 from pano_mvs.core.digest import DIGEST_BYTES, digest_from_file
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import replacing
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 
@@ -32,18 +32,15 @@ def write_crate(out: Path) -> Path:
         InputError: if there is no run.json.
         StoreError: if the file cannot be written.
     """
-    try:
-        library = importlib.import_module("rocrate.rocrate")
-        context_entity = importlib.import_module("rocrate.model.contextentity").ContextEntity
-    except ImportError as error:
-        raise UsageError("pano-mvs crate needs rocrate: pip install 'pano-mvs[crate]'") from error
+    library = import_extra("rocrate.rocrate", "pano-mvs crate", "crate")
+    entities = import_extra("rocrate.model.contextentity", "pano-mvs crate", "crate")
     summary = RunSummary.read(out)
     if summary.merged is not None:
         raise UsageError(f"{out} holds merged runs: describe the run of each block, {', '.join(summary.merged.blocks)}")
     crate = library.ROCrate()
 
     def described(key: str, kind: str, **properties: object) -> Any:
-        return crate.add(context_entity(crate, key, properties={"@type": kind, **properties}))
+        return crate.add(entities.ContextEntity(crate, key, properties={"@type": kind, **properties}))
 
     inputs = [
         crate.add_file(Path(path).absolute().as_uri(), properties=_digest(digest), validate_url=False)

@@ -188,6 +188,26 @@ class Warned:
 
 
 @dataclass(frozen=True, slots=True)
+class BlockStarted:
+    """`pano-mvs run --block-size` begins with a block, which is a run with events of its own.
+
+    Attributes:
+        block: its name, such as block_2.
+        number: the same as a number, from 1.
+        blocks: number of all blocks.
+        images: number of its images.
+        images_left: number of images of the blocks after it.
+    """
+
+    kind: ClassVar[str] = "block_started"
+    block: str
+    number: int
+    blocks: int
+    images: int
+    images_left: int
+
+
+@dataclass(frozen=True, slots=True)
 class RunFinished:
     """The run has ended, also if it was interrupted or raised an error.
 
@@ -229,6 +249,7 @@ Event = (
     | StageFinished
     | TimeLeft
     | Warned
+    | BlockStarted
     | RunFinished
 )
 Progress = Callable[[Event], None]

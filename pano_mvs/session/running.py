@@ -33,6 +33,7 @@ from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.session import Session, check_output, open_session
+from pano_mvs.session.spans import Spans
 from pano_mvs.session.sudden_exit import exit_text
 from pano_mvs.session.summarise import summarise
 from pano_mvs.session.time_estimator import EventObserver
@@ -56,6 +57,7 @@ class Execution:
         min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
             of $PANO_MVS_MIN_FREE, or else 200 MB.
         durable: whether to flush every result to disk.
+        otel: whether to send the run, its stages and units as spans to an OpenTelemetry collector.
     """
 
     executor: str = ""
@@ -65,6 +67,7 @@ class Execution:
     queue: Path | None = None
     min_free: str = ""
     durable: bool = False
+    otel: bool = False
 
 
 @names_arguments
@@ -164,16 +167,17 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
         queue=execution.queue,
     )
     try:
-        return _run_and_report(session, store, executor, progress=progress)
+        return _run_and_report(session, store, executor, progress=progress, otel=execution.otel)
     finally:
         executor.close()
 
 
-def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
+def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress, otel: bool) -> RunOutput:
     """Run, and report the first and the last event."""
     clock = time.perf_counter()
     log = EventLog(progress)
-    observer = EventObserver(log, executor=executor)
+    report = Spans(log) if otel else log
+    observer = EventObserver(report, executor=executor)
     observer.report(
         RunStarted(
             workflow=session.workflow.name,
@@ -203,7 +207,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         end = replace(_counted(run, end), exit_code=INTERRUPTED, stopped="interrupted")
         raise
     finally:
-        log(replace(end, seconds=round(time.perf_counter() - clock, 3)))
+        report(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
 def _new_run(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> Run:

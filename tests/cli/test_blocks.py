@@ -19,6 +19,8 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.event_log import EventReader
+from pano_mvs.session.progress import BlockStarted, RunFinished
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
@@ -93,6 +95,28 @@ def test_blocks_run_one_after_the_other_and_are_merged(pano_mvs: Command, runs: 
     assert result.text.endswith("next:\n  pano-mvs view out\n")
     assert read_poses(Path("out")).names == tuple(names)
     assert load(Path("out")).summary.source_folder == walk
+
+
+def test_events_name_the_blocks_and_the_end(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert pano_mvs(*command).code == 0
+    *blocks, end = [event for _, event in EventReader(Path("out/blocks")).read()[1]]
+    assert blocks == [
+        BlockStarted("block_1", 1, 3, images=12, images_left=24),
+        BlockStarted("block_2", 2, 3, images=12, images_left=12),
+        BlockStarted("block_3", 3, 3, images=12, images_left=0),
+    ]
+    assert isinstance(end, RunFinished)
+    assert end.exit_code == 0
+    runs.ends["block_2"] = KeyboardInterrupt()
+    assert pano_mvs(*command).code == 130
+    *blocks, end = [event for _, event in EventReader(Path("out/blocks")).read()[1]]
+    assert len(blocks) == 2
+    assert isinstance(end, RunFinished)
+    assert end.exit_code == 130
+    result = pano_mvs("watch", "out")
+    assert result.code == 130
+    assert result.flat.startswith("block 2 of 3, 12 images")
 
 
 def test_the_same_command_resumes_and_replaces_the_links(pano_mvs: Command, runs: Runs, walk: Path) -> None:

@@ -12,6 +12,7 @@ from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.results.records import Finding, Tile, Verdict
 from pano_mvs.session.event_log import EVENTS_FILE, EventLog, EventReader, event_from_line, line_from_event
 from pano_mvs.session.progress import (
+    BlockStarted,
     Event,
     Forecast,
     KernelsCompiled,
@@ -41,6 +42,7 @@ EVENTS: tuple[Event, ...] = (
     StageFinished("depth", "depth.sweep", 4, 3, 0, 1, 0, 2.0, 4.0, {"kept": 0.5}),
     TimeLeft(12.5, at_least=True, done=0.25, unknown=("depth",)),
     Warned("disk"),
+    BlockStarted("block_2", 2, 3, images=12, images_left=12),
     RunFinished(3, "", run=3, failed=1, seconds=9.0, out=Path("out"), verdict=VERDICT, doubts={"a": "b"}),
 )
 

@@ -130,6 +130,7 @@ _USES = {
     "crate": "crate",
     "queues": "--executor slurm",
     "notify": "--notify",
+    "otel": "--otel",
     "heic": "HEIC images",
     "exr": "OpenEXR files",
     "remote": "cache push and pull",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from rich.markup import escape
 
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import InputError, PanoMvsError, UsageError
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.text import duration_text
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 
@@ -69,10 +69,7 @@ def notified(urls: Sequence[str], out: Path) -> Iterator[None]:
 
 
 def _messenger(urls: Sequence[str]) -> Any:
-    try:
-        messenger = importlib.import_module("apprise").Apprise()
-    except ImportError as error:
-        raise UsageError("--notify needs apprise: pip install 'pano-mvs[notify]'") from error
+    messenger = import_extra("apprise", "--notify", "notify").Apprise()
     for url in urls:
         if not messenger.add(url):
             raise UsageError(

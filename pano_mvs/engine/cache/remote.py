@@ -20,6 +20,7 @@ from typing import Any
 
 from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import PanoMvsError, StoreError, UsageError
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import CACHE_MARK, read_regular, remove_whole, replacing
 from pano_mvs.core.paths import below, is_file, is_link
 from pano_mvs.engine.cache.blobs import SUFFIX
@@ -67,13 +68,10 @@ class RemoteCache:
         Raises:
             UsageError: if fsspec or the library for this kind of URL is not installed, or the URL is not valid.
         """
-        try:
-            from fsspec.core import url_to_fs
-        except ImportError as error:
-            raise UsageError("cache push and pull need fsspec: pip install 'pano-mvs[remote]'") from error
         self.url = url
+        fsspec = import_extra("fsspec.core", "copying a cache", "remote")
         try:
-            self._files, self._root = url_to_fs(url, use_listings_cache=False, skip_instance_cache=True)
+            self._files, self._root = fsspec.url_to_fs(url, use_listings_cache=False, skip_instance_cache=True)
         except (ImportError, ValueError) as error:
             raise UsageError(f"{url}: {error}") from error
         self._made: set[str] = set()

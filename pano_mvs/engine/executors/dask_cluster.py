@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 import pano_mvs
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import temporary_prefix
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.core.paths import below, children, is_file
@@ -231,18 +232,6 @@ def _check_address(scheduler: str) -> None:
         is_complete = False
     if not is_complete:
         raise UsageError(f"--scheduler {scheduler}: must be an address such as tcp://host:8786")
-
-
-def import_extra(library: str, option: str, extra: str) -> Any:
-    """Return an optional library.
-
-    Raises:
-        UsageError: if it is not installed, with the command that installs it.
-    """
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise UsageError(f"{option} needs {library}: pip install 'pano-mvs[{extra}]'") from error
 
 
 def with_waiting(places: int) -> int:

@@ -21,10 +21,11 @@ from typing import Any
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import remove_whole, temporary_prefix
 from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.dask_cluster import DaskExecutor, import_extra, with_waiting
+from pano_mvs.engine.executors.dask_cluster import DaskExecutor, with_waiting
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.executors.threads import WORKER_BYTES, share_cores
 from pano_mvs.engine.workflows.extends import read_text

@@ -27,13 +27,10 @@ from pano_mvs.results.records import (
     WorkflowSummary,
 )
 from pano_mvs.results.stored_values import StoredValues
-from pano_mvs.results.summary import FAILED_ITEMS, RunSummary
+from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, RunSummary
 from pano_mvs.scene import Poses
 from pano_mvs.session.merging.files import Block, MergeFiles, load_blocks
 from pano_mvs.session.summarise import poses_summary
-
-BLOCKS = "blocks"
-"""Folder in the output folder in which `pano-mvs run --block-size` computes the blocks."""
 
 _STAGE = "merge"
 _MERGED_NAMES = {

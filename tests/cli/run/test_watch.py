@@ -7,17 +7,19 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.watch_command import RunView, watch_run
+from pano_mvs.cli.watch_command import BlocksView, RunView, _updated, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.session.event_log import EventLog
+from pano_mvs.session.event_log import EventLog, EventReader
 from pano_mvs.session.progress import (
+    BlockStarted,
     Event,
     Forecast,
     RunFinished,
@@ -41,7 +43,7 @@ def started(folder: Path) -> RunStarted:
     return RunStarted("lobby", NAMES, "slurm", workers=6, threads=2, out=folder, cache=folder)
 
 
-def text_of(view: RunView) -> str:
+def text_of(view: RunView | BlocksView) -> str:
     stream = io.StringIO()
     Console(file=stream, width=120).print(view.shown())
     return stream.getvalue()
@@ -96,6 +98,63 @@ def test_watch_ends_with_the_run(end: RunFinished, said: str, tmp_path: Path) ->
     assert watch_run(tmp_path, Console(file=stream, width=120)) == end.exit_code
     assert stream.getvalue().rstrip().endswith(said)
     assert "left" not in stream.getvalue()
+
+
+def log_in(folder: Path, *events: Event) -> EventLog:
+    """Begin a log in a folder, with these events."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = EventLog(ignore)
+    log.open(folder)
+    for event in events:
+        log(event)
+    return log
+
+
+def test_view_of_a_run_in_blocks(tmp_path: Path) -> None:
+    blocks = tmp_path / "blocks"
+    log_in(blocks / "block_2", started(blocks / "block_2"), RunFinished(4, "too few matches"))  # of an earlier run
+    time.sleep(0.01)  # times are in milliseconds
+    log = log_in(blocks, BlockStarted("block_1", 1, 2, images=10, images_left=5))
+    reader = EventReader(blocks)
+    view = _updated(BlocksView(blocks), reader)
+    assert view.left_text() == "block 1 of 2, 10 images; starting"
+
+    first = log_in(blocks / "block_1", started(blocks / "block_1"), FORECAST, StageStarted("images", 4))
+    view = _updated(view, reader)
+    # The block takes 1 s for its images, 10 s for its ranges, and the other one half of that.
+    in_all = r"all blocks: about 0:1[6-9] left, if the later ones take as long"
+    assert re.fullmatch(rf"block 1 of 2, 10 images; 0 %, about 0:1[01] left .*; {in_all}", view.left_text())
+    assert re.search(rf"^block 1 of 2.*images +0 of 4 .*{in_all}\n$", text_of(view), re.DOTALL)
+
+    first(RunFinished(3, "", seconds=60.0))
+    assert "block_1: finished, but some items failed" in text_of(_updated(view, reader))
+    log(BlockStarted("block_2", 2, 2, images=5, images_left=0))
+    view = _updated(view, reader)
+    assert view.left_text() == "block 2 of 2, 5 images; starting"
+    assert "too few matches" not in text_of(view)
+
+    second = log_in(blocks / "block_2", started(blocks / "block_2"), FORECAST)
+    view = _updated(view, reader)
+    assert re.fullmatch(r"block 2 of 2, 5 images; 0 %, about .*", view.left_text())
+    assert "all blocks" not in view.left_text()
+    second(RunFinished(0, "", seconds=50.0))
+    assert _updated(view, reader).left_text().endswith("; all blocks have run")
+    log(RunFinished(3, ""))
+    assert "all blocks" not in text_of(_updated(view, reader))
+
+
+def test_watch_ends_with_the_run_in_blocks(tmp_path: Path) -> None:
+    log = log_in(tmp_path / "blocks", BlockStarted("block_1", 1, 2, images=10, images_left=5))
+    log_in(tmp_path / "blocks/block_1", started(tmp_path), RunFinished(4, "the disk is full", seconds=5.0))
+    log(RunFinished(4, "", seconds=7.0))
+    stream = io.StringIO()
+    assert watch_run(tmp_path, Console(file=stream, width=120)) == 4
+    assert stream.getvalue().startswith("block 1 of 2, 10 images\n")
+    assert "check (exit code 4) after 5 s: the disk is full\n" in stream.getvalue()
+    assert stream.getvalue().rstrip().endswith("check (exit code 4) after 7 s")
+    # A run without blocks is the later one: one in blocks is refused in its folder.
+    log_in(tmp_path, started(tmp_path), FORECAST, RunFinished(0, "", seconds=9.0))
+    assert watch_run(tmp_path, Console(file=io.StringIO(), width=120)) == 0
 
 
 def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
