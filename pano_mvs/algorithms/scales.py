@@ -142,7 +142,7 @@ def _relative_detail(fine: FloatImage, coarse: FloatImage) -> float:
     textured = coarser >= np.quantile(coarser, 1 - _TEXTURED_SHARE)
     energy = float(coarser[textured].mean())
     noise = float(np.quantile(finer, _PLAIN_SHARE))
-    return float(np.sqrt(max(finer[textured].mean() - noise, 0.0) / energy)) if energy > 0 else 1.0
+    return float(np.sqrt(max(float(finer[textured].mean()) - noise, 0.0) / energy)) if energy > 0 else 1.0
 
 
 def _energy(detail: FloatImage, side: int) -> FloatImage:

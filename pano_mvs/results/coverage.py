@@ -147,7 +147,7 @@ def view_coverage(ranges: FloatArray, pose: Rigid3, others: Sequence[tuple[Float
     valid = np.isfinite(ranges)
     order = np.argsort(ranges[valid])
     middle = np.searchsorted(np.cumsum(weights[valid][order]), weights[valid].sum() / 2)
-    typical = float(ranges[valid][order][min(middle, len(order) - 1)])
+    typical = float(ranges[valid][order][min(int(middle), len(order) - 1)])
     alone = seen_alone(ranges, pose, others)
     areas = _areas(alone, ranges, pose, weights=weights)
     return ViewCoverage(typical, float(weights[alone].sum()), areas)

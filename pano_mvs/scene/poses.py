@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
+from pano_mvs.scene.record import Axis, Parts, Record, positions_fit, require, require_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +210,8 @@ class Poses(Record):
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
         require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")
         if tracks:
-            require(
-                0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"
-            )
-            require(
-                0 <= self.track_image_idx.min() <= self.track_image_idx.max() < images, self, "a track has no image"
-            )
+            require(positions_fit(self.track_point_idx, points), self, "a track has no point")
+            require(positions_fit(self.track_image_idx, images), self, "a track has no image")
         self._check_groups()
 
     def _check_groups(self) -> None:

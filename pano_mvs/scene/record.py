@@ -161,6 +161,11 @@ def require(condition: bool, kind: Record, what: str) -> None:
         raise ContractError(f"{kind.kind_name()}: {what}")
 
 
+def positions_fit(positions: NDArray[np.integer], count: int) -> bool:
+    """Return whether all positions (N,), N > 0, are among `count` entries."""
+    return bool(positions.min() >= 0 and positions.max() < count)
+
+
 def require_array(
     kind: Record, name: str, *, dtype: type[np.generic], shape: tuple[int | None, ...], finite: bool = True
 ) -> NDArray[Any]:

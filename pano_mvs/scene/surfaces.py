@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.scene.poses import Poses
-from pano_mvs.scene.record import Axis, Record, require, require_array
+from pano_mvs.scene.record import Axis, Record, positions_fit, require, require_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +116,8 @@ class TrackedPoints(Record):
         require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
         if tracks:
-            require(
-                0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"
-            )
-            inside = 0 <= self.track_image_idx.min() <= self.track_image_idx.max() < len(self.names)
-            require(inside, self, "a track has no image")
+            require(positions_fit(self.track_point_idx, points), self, "a track has no point")
+            require(positions_fit(self.track_image_idx, len(self.names)), self, "a track has no image")
 
     def joined_to(self, poses: Poses, *, keep_points: bool) -> Poses:
         """Return poses with these points, after their own points or instead of them.

@@ -77,7 +77,8 @@ def write_curve_picture(path: Path, inspection: Inspection) -> None:
 
 def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -> None:
     """Set the limits and ticks of the axes; hypotheses are evenly spaced."""
-    highest = max(float(np.nanmax(line.get_ydata())) for line in axes.lines if np.isfinite(line.get_ydata()).any())
+    drawn = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
+    highest = float(np.nanmax(drawn[~np.isinf(drawn)]))
     axes.set(xlim=(0, len(ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
     axes.yaxis.set_major_formatter("{x:.2f}")
     values = scale_ticks(float(ranges[0]), float(ranges[-1]))

@@ -95,7 +95,7 @@ class TestScores:
         size = (256, 512)
         views = [box_view((0.4, -0.3, 0.2), size), box_view((-0.5, 0.2, 0.6), size)]
         walls = view_points(views[0])
-        inwards = walls * (1 - off / np.abs(walls).max(axis=1, keepdims=True))
+        inwards = (walls * (1 - off / np.abs(walls).max(axis=1, keepdims=True))).astype(np.float32)
         surface = surface_of_views(views)
         tolerances = (off + 0.06, 0.5 * off)
         scores = score_cloud(cloud_distances(PointsInMemory(inwards), [walls], surface, limit=1), surface, tolerances)

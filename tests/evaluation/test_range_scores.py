@@ -55,8 +55,8 @@ def draw(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], np.random.Generator]:
     """An estimate and a truth with all that can be wrong in them."""
     rng = np.random.default_rng(seed)
-    truth = rng.choice([1.0, 2.0, 2.0 * 1.05**2, 3.0, *rng.uniform(0.1, 9, 6)], size_hw)
-    estimated = truth * rng.choice([1.0, 1.04, 0.8, 1.25, 3.0, 0.2], size_hw)
+    truth = rng.choice(np.array([1.0, 2.0, 2.0 * 1.05**2, 3.0, *rng.uniform(0.1, 9, 6)]), size_hw)
+    estimated = truth * rng.choice(np.array([1.0, 1.04, 0.8, 1.25, 3.0, 0.2]), size_hw)
     for array in (estimated, truth):
         where = rng.random(size_hw) < hard
         array[where] = rng.choice(HARD, where.sum())
@@ -218,7 +218,7 @@ class TestBestConstant:
     @pytest.mark.parametrize("seed", range(5))
     def test_the_median_too(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        true, weight = rng.lognormal(0.7, 0.5, 101), rng.choice([0.5, 1.0, 2.0], 101)
+        true, weight = rng.lognormal(0.7, 0.5, 101), rng.choice(np.array([0.5, 1.0, 2.0]), 101)
         tried = np.linspace(true.min(), true.max(), 20_000)
         least = min(weighted_median(np.abs(c - true) / true, weight) for c in tried)
         assert best_constant_median(true, weight) == pytest.approx(least, abs=2e-3)

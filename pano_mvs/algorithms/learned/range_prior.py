@@ -117,8 +117,8 @@ def fill_from_prior(
         error = np.abs(np.log(aligned / range_map.range[part]))
         errors.append(np.where(np.isfinite(error), error, np.inf))
         constants.append(np.abs(np.log(range_map.range[part] / np.median(range_map.range[other]))))
-    error, constant = (_NORMAL * float(np.median(np.concatenate(each))) for each in (errors, constants))
-    if not error < constant:
+    sigma, constant = (_NORMAL * float(np.median(np.concatenate(each))) for each in (errors, constants))
+    if not sigma < constant:
         return range_map, float("inf")
     laid = _aligned(range_map, guide, prior, weight=np.where(known, weight, 0), output=output)
     filled = laid.valid & (range_map.confidence < FILLED_CONFIDENCE[1]) & (True if valid is None else valid)
@@ -128,10 +128,10 @@ def fill_from_prior(
         np.where(filled, laid.confidence, range_map.confidence),
     )
     if result.uncertainty is not None:
-        sigma = np.clip(error, LEAST_UNCERTAINTY, MOST_UNCERTAINTY)
-        own = np.where(filled & result.valid, np.float16(sigma), result.uncertainty)
+        within = np.float16(min(max(sigma, LEAST_UNCERTAINTY), MOST_UNCERTAINTY))
+        own = np.where(filled & result.valid, within, result.uncertainty)
         result = replace(result, uncertainty=own)
-    return result, error
+    return result, sigma
 
 
 def _aligned(

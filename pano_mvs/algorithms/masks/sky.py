@@ -309,7 +309,7 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
         if not least <= sizes[label] <= most or beside.sum() < _MIN_BESIDE or light[area].mean() < _MIN_LIGHT:
             continue
         around = dilated(area, _BESIDE_PX) & ~dilated(area, 1)
-        is_open = (far & around).sum() >= _MIN_FAR_SHARE * max((known & around).sum(), 1)
+        is_open = (far & around).sum() >= _MIN_FAR_SHARE * max(int((known & around).sum()), 1)
         moved = np.quantile(worst[beside], _MOST_MOVED) >= _MIN_SEEN_BEHIND
         if is_open and moved and np.median(best[beside]) <= _MAX_BESIDE_ERROR:
             found |= area

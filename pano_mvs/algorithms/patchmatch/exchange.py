@@ -121,7 +121,7 @@ def exchange_ranges(
     better = np.flatnonzero(scores > own_scores[offers.pixels])
     # The last of a pixel counts: the best one, and of equals that of the first source.
     better = better[::-1][np.argsort(scores[better[::-1]], kind="stable")]
-    share = float(len(np.unique(offers.pixels[better])) / max(seen.sum(), 1))
+    share = len(np.unique(offers.pixels[better])) / max(int(seen.sum()), 1)
     return _replaced(range_map, offers.chosen(better)), share
 
 

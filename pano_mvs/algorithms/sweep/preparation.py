@@ -123,7 +123,7 @@ def pixels_with_valid_window(mask: NDArray[np.bool_], radius: int) -> NDArray[np
     height, width = mask.shape
     reach = column_offsets((height, width), radius, spherical=True)[:, -1]
     around = np.pad(reach, radius, mode="symmetric")  # the widest window of all those that look into a row
-    reach = np.max([around[shift : shift + height] for shift in range(2 * radius + 1)], axis=0)
+    reach = np.lib.stride_tricks.sliding_window_view(around, 2 * radius + 1).max(axis=1)
     wide, some_masked = np.zeros_like(mask), ~mask.all(axis=1)
     for columns in np.unique(reach):
         rows = (reach == columns) & some_masked

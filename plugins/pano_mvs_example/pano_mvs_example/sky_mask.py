@@ -56,8 +56,7 @@ def _contrast(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     padded = pad_panorama(grey, 1).astype(np.float32)
     center = padded[1:-1, 1:-1]
     neighbours = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
-    contrast: NDArray[np.float32] = np.max([np.abs(center - other) for other in neighbours], axis=0)
-    return contrast
+    return np.asarray(np.max([np.abs(center - other) for other in neighbours], axis=0), np.float32)
 
 
 def _joined_to_zenith(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:

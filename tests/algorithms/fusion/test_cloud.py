@@ -423,7 +423,7 @@ SOURCE_LIMITS = np.array([0.05, 0.2, 0.05, 1.05, 0.03, 100.0])
 FIELDS = ("yields", "counts", "violations", "confidence", "sums", "colors", "precisions")
 
 
-def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> np.ndarray:
+def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> NDArray[np.float32]:
     """Return the ranges of a sphere of radius 2 with noise, steps to both sides and holes."""
     ranges = 2 + rng.normal(0, 0.03, size_hw)
     ranges[rng.random(size_hw) < 0.1] *= 0.6
@@ -438,8 +438,8 @@ def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> Non
     rng = np.random.default_rng(20)
     ranges, source_ranges = rough_sphere(rng, TINY), rough_sphere(rng, SOURCE_SIZE)
     rays = ray_grid(TINY)
-    normals = -rays + rng.normal(0, 0.5, rays.shape)
-    normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
+    drawn = -rays + rng.normal(0, 0.5, rays.shape)
+    normals = (drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)).astype(np.float32)
     written = rng.random(TINY) < 0.8
     confidence = rng.integers(30, 200, SOURCE_SIZE).astype(np.uint8)
     image = rng.integers(0, 256, (*SOURCE_SIZE, 3)).astype(np.uint8)

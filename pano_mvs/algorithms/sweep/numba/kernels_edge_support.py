@@ -57,7 +57,7 @@ def average_planes(
     height, _, width = volume.shape
     side = along.shape[0]
     radius = side // 2
-    margin = max(1, columns.max())
+    margin = max(1, int(columns.max()))
     padded, total = np.empty(width + 2 * margin, np.uint8), np.empty(width, np.uint16)
     rows = np.empty((height + 2 * radius, width), np.uint8)
     for d in range(first, first + count):

@@ -229,14 +229,14 @@ def _wall(
             add(a, b, bottom, top, PANE, WHITE, half=0.01)
             for edge in np.linspace(a, b - 0.05, max(2, round((b - a) / 0.8) + 1)):
                 add(float(edge), float(edge) + 0.05, bottom, top, PLAIN, trim, half=0.035)
-            for edge in (bottom, top - 0.05):
-                add(a, b, edge, edge + 0.05, PLAIN, trim, half=0.037)
+            for low in (bottom, top - 0.05):
+                add(a, b, low, low + 0.05, PLAIN, trim, half=0.037)
             if kind == "window":
                 for fin in np.arange(a + 0.1, b - 0.1, 0.06):  # a radiator
                     add(float(fin), float(fin) + 0.045, 0.15, 0.7, PLAIN, WHITE, half=0.17)
         else:
-            for edge in (a, b - 0.05):
-                add(edge, edge + 0.05, 0.0, top, WOOD, trim, half=_WALL / 2 + 0.015)
+            for left in (a, b - 0.05):
+                add(left, left + 0.05, 0.0, top, WOOD, trim, half=_WALL / 2 + 0.015)
             add(a, b, top - 0.05, top, WOOD, trim, half=_WALL / 2 + 0.015)
             for low in (0.28, 1.08):  # a socket and a switch
                 add(b + 0.12, b + 0.2, low, low + 0.08, PLAIN, (0.6, 0.6, 0.58), half=_WALL / 2 + 0.008)
