@@ -30,7 +30,7 @@ from pano_mvs.session.session import Session, check_output
 _SHOWN_REASONS = 5
 
 
-def show_dry_run(session: Session, execution: Execution, console: Console, *, as_json: bool) -> None:
+def show_dry_run(session: Session, console: Console, *, execution: Execution, as_json: bool) -> None:
     """Print the plan of a run, for its number of workers.
 
     Raises:

@@ -1,7 +1,8 @@
-"""`pano-mvs run --block-size` runs a workflow block by block, and merges the blocks; the same command resumes it."""
+"""`pano-mvs run` in blocks runs a workflow block by block, and merges the blocks; the same command resumes it."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,9 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError
+import pano_mvs as pano_mvs_package
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.output_lock import output_lock
+from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import similarity_from_points
 from pano_mvs.io.images.captures import list_pictures
 from pano_mvs.io.poses.files import read_poses
@@ -20,7 +26,8 @@ from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.event_log import EventReader
-from pano_mvs.session.progress import BlockStarted, RunFinished
+from pano_mvs.session.planning import reference_times
+from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
@@ -69,7 +76,20 @@ class Runs:
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     found = Runs()
     monkeypatch.setattr("pano_mvs.cli.run.command.run_session", found)
+    monkeypatch.setattr("pano_mvs.session.captures.run_session", found)
     return found
+
+
+@pytest.fixture
+def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which the cloud of at most 12 of the images of `walk`, of one pixel each, fits into memory."""
+    params = Registry.installed().stages["fusion.vote"].params_type()
+    unit = reference_times().expected_unit(
+        "fusion.vote", CaptureSize(12, 1.0), settings=digest_from_value(key_fields(params)[0]), threads=1, whole=True
+    )
+    assert unit is not None
+    limit = "pano_mvs.session.merging.automatic.total_memory_bytes"
+    monkeypatch.setattr(limit, lambda: int(5 * unit.stored_bytes) + 1)
 
 
 @pytest.fixture
@@ -177,11 +197,129 @@ def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command,
     written = Path("out/run.json").read_bytes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pano_mvs.cli.run.command.run_session", run_session)
-        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", "--block-size", "0")
     assert result.code == 2
     assert "--out out: holds results that were merged from 3 blocks" in result.flat
-    assert "Give --block-size again" in result.flat
+    assert "Leave out --block-size 0" in result.flat
     assert Path("out/run.json").read_bytes() == written
+
+
+STOPPED = RunStoppedError("the disk is full")
+REASON = (
+    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage cloud would take about 0 MB of 0 MB of "
+    "memory; --block-size 0 forbids it"
+)
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_a_capture_that_memory_does_not_hold_is_divided(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.code == 0, result.text
+    assert result.flat.startswith(REASON)
+    assert [*runs.seen] == ["block_1", "block_2", "block_3"]
+    assert len(load(Path("out")).summary.poses.registered) == 26
+    first = EventReader(Path("out/blocks")).read()[1][0][1]
+    assert first == Divided(REASON)
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_plan_and_dry_run_say_how_a_capture_is_divided(pano_mvs: Command, walk: Path) -> None:
+    for command in (("plan",), ("run", "--dry-run")):
+        result = pano_mvs(*command, "quickstart", "--images", walk, "--out", "out")
+        assert result.code == 0, result.text
+        assert result.flat.startswith(REASON)
+        assert "block 3 of 3: 11 images, 015.png to 025.png, in out/blocks/block_3" in result.flat
+    assert not Path("out").exists()
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_block_size_0_runs_all_images_at_once(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.ends["out"] = STOPPED
+    pano_mvs("run", "quickstart", "--images", walk, "--out", "out", "--block-size", "0")
+    assert {block: len(names) for block, names in runs.seen.items()} == {"out": 26}
+
+
+def test_a_capture_that_memory_holds_is_not_divided(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.ends["out"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.text == "error: the disk is full\n"
+    assert [*runs.seen] == ["out"]
+
+
+def test_the_division_of_an_earlier_run_is_kept(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """Memory differs between machines, and forecasts learn: another division would compute everything again."""
+    runs.ends["block_2"] = RunStoppedError("the disk is full")
+    pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    runs.ends.clear()
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.code == 0, result.text
+    assert "out holds blocks of at most 12 images, in which this run continues" in result.flat
+    assert "block 3 of 3" in result.flat
+
+
+@pytest.mark.usefixtures("small_memory")
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--refresh", "depth:001.png"), "cannot be divided into blocks: --only and"),
+        (("--out", "mine"), "cannot be divided into blocks: --out mine: the folder holds something else"),
+    ],
+)
+def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
+    options: tuple[str, str], reason: str, pano_mvs: Command, runs: Runs, walk: Path
+) -> None:
+    Path("mine").mkdir()
+    Path("mine/notes.txt").touch()
+    runs.ends = {"quickstart": STOPPED, "mine": STOPPED}
+    result = pano_mvs("run", "quickstart", "--images", walk, *options)
+    assert result.flat.startswith("warning: all at once, stage cloud would take about")
+    assert reason in result.flat
+    assert len(runs.seen) == 1
+
+
+def test_even_small_blocks_may_not_fit(
+    pano_mvs: Command, runs: Runs, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pano_mvs.session.merging.automatic.total_memory_bytes", lambda: 1)
+    runs.ends["out"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert "even that of blocks of 7 images would not do" in result.flat
+    assert [*runs.seen] == ["out"]
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_the_memory_of_workers_counts(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    command = ("run", "quickstart", "--images", walk, "--out", "out")
+    runs.ends["out"] = STOPPED
+    assert "blocks" not in pano_mvs(*command, "--scheduler", "tcp://nowhere:1").text
+    Path("queue.yaml").write_text("{cores: 8, memory: 64GB, walltime: '04:00:00', jobs: 2}", encoding="utf-8")
+    assert "blocks" not in pano_mvs(*command, "--executor", "slurm", "--queue", "queue.yaml").text
+    assert [*runs.seen] == ["out"]
+
+
+def test_events_of_all_blocks_are_printed(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--json")
+    assert result.code == 0, result.text
+    events = [json.loads(line) for line in result.text.splitlines()]
+    assert [event["event"] for event in events] == [*["block_started"] * 3, "run_finished"]
+    runs.codes["block_2"] = 3
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--json")
+    assert result.code == json.loads(result.text.splitlines()[-1])["exit_code"] == 3
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_a_run_from_python_is_divided_as_well(runs: Runs, walk: Path, tmp_path: Path) -> None:
+    events: list[Event] = []
+    output = pano_mvs_package.run("quickstart", walk, tmp_path / "out", progress=events.append)
+    assert output.out == tmp_path / "out"
+    assert output.summary.merged is not None
+    assert events[0] == Divided(REASON)
+    runs.codes["block_2"] = 4
+    stopped = pano_mvs_package.run("quickstart", walk, tmp_path / "other", block_size=14, block_overlap=4)
+    assert stopped.summary.stopped == "too few matches"
+    assert stopped.out.name == "block_2"
+    with pytest.raises(UsageError, match=r"block_size=5: a block needs at least 7 images"):
+        pano_mvs_package.run("quickstart", walk, block_size=5)
 
 
 def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
@@ -203,12 +341,15 @@ def test_blocks_that_cannot_be_merged_are_named(pano_mvs: Command, runs: Runs, w
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--block-overlap", "5"), "--block-overlap: only blocks have this. Give --block-size N as well"),
+        (
+            ("--block-size", "0", "--block-overlap", "5"),
+            "--block-overlap: only blocks have this. Give --block-size N as well",
+        ),
         (("--block-loop", "--block-poses", "x"), "--block-loop, --block-poses: only blocks have this"),
         (("--block-size", "5"), "a block needs at least 7 images"),
         (("--block-size", "12", "--block-overlap", "6"), "must be less than half of the size of a block, 12"),
         (("--block-size", "26"), "its 26 images fit into one block of 26. Run them without blocks"),
-        ((*BLOCKS, "--json"), "--json reports one run, and each block is a run"),
+        ((*BLOCKS, "--json", "--dry-run"), "--dry-run prints a table, not events: leave out --json"),
         ((*BLOCKS, "--only", "depth:001.png"), "--images out/blocks/images/block_1 --out out/blocks/block_1"),
         ((*BLOCKS, "--refresh", "depth:001.png"), "name units of one run"),
         ((*BLOCKS, "--until", "features"), "--block-size --until features: blocks are merged by their poses"),
