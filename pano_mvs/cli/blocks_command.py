@@ -92,8 +92,9 @@ def _print_event(console: Console, event: Event) -> None:
 
 
 def _print_heading(run: BlockRun, *, console: Console) -> None:
+    what = ", rough poses" if run.session.out.parent != run.folder else ""
     console.say(
-        f"\n[bold]block {run.number} of {run.blocks}[/]: {len(run.names)} images, "
+        f"\n[bold]block {run.number} of {run.blocks}[/]{what}: {len(run.names)} images, "
         f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}"
     )
 
@@ -145,10 +146,11 @@ def show_blocks(
     assert decision.division is not None
     if decision.reason:
         console.say(escape(decision.reason))
-    blocks = divided(session, decision.division)
+    divisions = divided(session, decision.division)
     with tempfile.TemporaryDirectory() as folder:
-        for run in block_runs(session, blocks, Path(folder)):
-            shown = replace(run, session=replace(run.session, out=session.out / BLOCKS / run.name))
+        for run in block_runs(session, divisions, Path(folder)):
+            blocks = session.out / BLOCKS
+            shown = replace(run, session=replace(run.session, out=blocks / run.name), folder=blocks)
             _print_heading(shown, console=console)
             show(shown.session, console)
 

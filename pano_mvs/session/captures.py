@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.core.errors import InputError, PanoMvsError
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.results.run_output import RunOutput, load
-from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, INTERRUPTED
+from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED
 from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.merging.automatic import BlockDecision, decision_of
-from pano_mvs.session.merging.block_runs import BlockRun, divided, open_blocks
+from pano_mvs.session.merging.block_runs import (
+    BlockRun,
+    Division,
+    block_runs,
+    divided,
+    earlier_division,
+    first_poses,
+    open_blocks,
+    remember_division,
+)
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.progress import BlockStarted, Divided, Progress, RunFinished, ignore
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
@@ -140,7 +149,8 @@ def run_blocks(
 ) -> int:
     """Run the blocks of a capture one after the other, merge them if all have finished, and return the exit code.
 
-    Events of the blocks and of the end are also written to `blocks/logs/events.jsonl`.
+    Without rough poses, the poses of the blocks are solved first, and the blocks are divided again by these. Events of
+    the blocks and of the end are also written to `blocks/logs/events.jsonl`.
 
     Args:
         session: over the whole capture.
@@ -155,14 +165,14 @@ def run_blocks(
         StoreError: if the output folder cannot be written.
     """
     assert decision.division is not None
-    blocks = divided(session, decision.division)
-    with open_blocks(session, blocks, decision.division) as runs:
+    divided(session, decision.division)
+    with open_blocks(session) as folder:
         log, began, end = EventLog(progress), time.monotonic(), RunFinished(1, "internal error", out=session.out)
-        log.open(session.out / BLOCKS)
+        log.open(folder)
         try:
             if decision.reason:
                 log(Divided(decision.reason))
-            code = _run_and_merge(runs, run_block, merge, log=log, keep_going=session.run_options.keep_going)
+            code = _run_and_merge(_Blocks(session, folder, run_block, log), decision.division, merge)
             end = replace(end, exit_code=code, stopped="")
             return code
         except PanoMvsError as error:
@@ -175,25 +185,64 @@ def run_blocks(
             log(replace(end, seconds=round(time.monotonic() - began, 3)))
 
 
-def _run_and_merge(
-    runs: Sequence[BlockRun],
-    run_block: Callable[[BlockRun], int],
-    merge: Callable[[Sequence[Path]], int],
-    *,
-    log: Progress,
-    keep_going: bool,
-) -> int:
-    codes = []
-    for run in runs:
-        left = sum(len(later.names) for later in runs[run.number :])
-        log(BlockStarted(run.name, run.number, run.blocks, images=len(run.names), images_left=left))
-        codes.append(run_block(run))
-        if is_early(codes[-1]) and not keep_going:
-            return codes[-1]
+@dataclass(frozen=True)
+class _Blocks:
+    """How the blocks of a capture are run."""
+
+    session: Session
+    folder: Path
+    run_block: Callable[[BlockRun], int]
+    log: Progress
+
+    def run(self, runs: Sequence[BlockRun]) -> list[int]:
+        """Run blocks, and return their exit codes; one that ends early is the last, unless `keep_going` is set."""
+        codes = list[int]()
+        for run in runs:
+            left = sum(len(later.names) for later in runs[run.number :])
+            self.log(BlockStarted(run.name, run.number, run.blocks, images=len(run.names), images_left=left))
+            codes.append(self.run_block(run))
+            if is_early(codes[-1]) and not self.session.run_options.keep_going:
+                break
+        return codes
+
+
+def _run_and_merge(blocks: _Blocks, division: Division, merge: Callable[[Sequence[Path]], int]) -> int:
+    session = blocks.session
+    earlier = earlier_division(session.out)
+    if division.poses is None and earlier is not None and replace(earlier, poses=None) == division:
+        division = earlier
+    if division.poses is None:
+        division, code = _with_rough_poses(blocks, division)
+        if is_early(code):
+            return code
+    remember_division(division, session.out)
+    runs = block_runs(session, divided(session, division), blocks.folder)
+    codes = blocks.run(runs)
     if early := [code for code in codes if is_early(code)]:
         return max(early)
     merged = merge([run.session.out for run in runs])
     return merged if is_early(merged) else max(*codes, merged)
+
+
+_ROUGH = "rough"
+
+
+def _with_rough_poses(blocks: _Blocks, division: Division) -> tuple[Division, int]:
+    """Solve the poses of blocks, and return the division with these as rough poses, and the exit code.
+
+    With them, blocks overlap where the path returns to the place of another block. Otherwise the blocks would drift
+    apart there, since no image would be in both.
+    """
+    session = first_poses(blocks.session)
+    runs = block_runs(session, divided(session, division), blocks.folder, within=_ROUGH)
+    if early := [code for code in blocks.run(runs) if is_early(code)]:
+        return division, max(early)
+    merged = blocks.folder / _ROUGH / "merged"
+    try:
+        merge_outputs([run.session.out for run in runs], merged, cache=session.store_root)
+    except InputError:  # later stages may correct the poses; otherwise the last merge reports it
+        return division, 0
+    return replace(division, poses=merged.absolute()), 0
 
 
 def is_early(exit_code: int) -> bool:

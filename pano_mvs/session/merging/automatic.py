@@ -108,7 +108,10 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
     most_bytes, stage = needed(count)
     if most_bytes <= memory_bytes:
         return BlockDecision()
-    size = bisect_left(range(1, count), True, key=lambda images: needed(images)[0] > memory_bytes)
+    # Where the path returns, blocks get more images, about as many as they share with the next one.
+    size = bisect_left(
+        range(1, count), True, key=lambda images: needed(images + default_overlap(images))[0] > memory_bytes
+    )
     takes = f"all at once, stage {stage} would take about {size_text(round(most_bytes))} of {size_text(memory_bytes)}"
     try:
         require_free(session.out)

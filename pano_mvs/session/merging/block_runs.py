@@ -157,19 +157,21 @@ class BlockRun:
     Attributes:
         session: the workflow over its images.
         names: of its images, in the order of the capture.
+        folder: of all blocks; the block's output folder is in it.
         number: of the block, from 1.
         blocks: number of all blocks.
     """
 
     session: Session
     names: tuple[str, ...]
+    folder: Path
     number: int
     blocks: int
 
     @property
     def name(self) -> str:
-        """Name of the block, such as block_1."""
-        return self.session.out.name
+        """Name of the block, such as block_1: its output folder in that of all blocks."""
+        return self.session.out.relative_to(self.folder).as_posix()
 
 
 def divided(session: Session, division: Division) -> list[tuple[str, ...]]:
@@ -214,11 +216,8 @@ def earlier_division(out: Path) -> Division | None:
 
 
 @contextmanager
-def open_blocks(session: Session, blocks: Sequence[tuple[str, ...]], division: Division) -> Iterator[list[BlockRun]]:
-    """Write the links to the images of the blocks, and yield the blocks; no other command may run them meanwhile.
-
-    The links and the output folders are in `blocks` in the output folder of the session. Links of an earlier division
-    are replaced; results stay. The division is stored there for later runs.
+def open_blocks(session: Session) -> Iterator[Path]:
+    """Make the folder of the blocks, `blocks` in the output folder of a session; no other run may use it meanwhile.
 
     Raises:
         StoreError: if another run holds the folder, or it cannot be written.
@@ -230,22 +229,42 @@ def open_blocks(session: Session, blocks: Sequence[tuple[str, ...]], division: D
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}). Choose another folder with --out") from error
     with output_lock(folder):
-        remove_whole(folder / "images")
-        write_text(folder / _DIVISION, json.dumps(asdict(division), default=str))
-        yield block_runs(session, blocks, folder)
+        yield folder
 
 
-def block_runs(session: Session, blocks: Sequence[tuple[str, ...]], folder: Path) -> list[BlockRun]:
-    """Write the links to the images of the blocks below a folder, and return the blocks.
+def remember_division(division: Division, out: Path) -> None:
+    """Store the division of a run in blocks in its output folder, for `earlier_division`."""
+    write_text(out / BLOCKS / _DIVISION, json.dumps(asdict(division), default=str))
+
+
+def block_runs(
+    session: Session, blocks: Sequence[tuple[str, ...]], folder: Path, *, within: str = ""
+) -> list[BlockRun]:
+    """Write the links to the images of the blocks below a folder, in place of earlier ones, and return the blocks.
+
+    Args:
+        session: over the whole capture.
+        blocks: the images of each.
+        folder: of all blocks.
+        within: folder in it in which the links and the results are.
 
     Raises:
         StoreError: if a link cannot be made.
     """
-    linked = link_blocks(_images(session), folder / "images", blocks)
+    place = folder / within
+    remove_whole(place / "images")
+    linked = link_blocks(_images(session), place / "images", blocks)
     return [
-        BlockRun(_over(session, block.folder, folder / block.folder.name), block.names, number, len(linked))
+        BlockRun(_over(session, block.folder, place / block.folder.name), block.names, folder, number, len(linked))
         for number, block in enumerate(linked, start=1)
     ]
+
+
+def first_poses(session: Session) -> Session:
+    """Return the session limited to the first stage that makes poses."""
+    workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
+    stage = chain_of(workflow, graph, Poses)[0]
+    return replace(session, run_options=replace(session.run_options, until=(stage,)))
 
 
 def _over(session: Session, images: Path, out: Path) -> Session:
