@@ -24,7 +24,7 @@ from pano_mvs.session.merging.block_runs import (
     remember_division,
 )
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.progress import BlockStarted, Divided, Progress, RunFinished, ignore
+from pano_mvs.session.progress import BlockStarted, Divided, Progress, RunFinished, Warned, ignore
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session, open_session
@@ -104,9 +104,12 @@ def run(
     execution = replace(execution, workers=workers or execution.workers)
     poses = None if block_poses is None else Path(block_poses)
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=poses)
-    if decision.division is None:
-        return run_session(session, execution, progress or ignore)
-    return run_in_blocks(session, execution, decision, progress or ignore)
+    progress = progress or ignore
+    if decision.division is not None:
+        return run_in_blocks(session, execution, decision, progress)
+    if decision.reason:
+        progress(Warned(decision.reason))
+    return run_session(session, execution, progress)
 
 
 def run_in_blocks(session: Session, execution: Execution, decision: BlockDecision, progress: Progress) -> RunOutput:

@@ -19,7 +19,7 @@ from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.registry import Registry
-from pano_mvs.geometry import similarity_from_points
+from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.io.images.captures import list_pictures
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
@@ -27,11 +27,12 @@ from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.event_log import EventReader
 from pano_mvs.session.planning import reference_times
-from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished
+from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished, Warned
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
+from tests.algorithms.blocks.walked_blocks import walk as walked
 from tests.cli.conftest import Command, Outcome, deliverables, run_json
 from tests.session.merging.written_blocks import write_block
 
@@ -49,6 +50,9 @@ class Runs:
         codes: block to the exit code of its run, if it is not 0.
         registered: block to the numbers of its images that have a pose, if it is not all of them.
         rough: block to the stages of the run that solved its rough poses.
+        rough_ends: block to the error with which that run ends.
+        rough_registered: as `registered`, for these runs.
+        cameras: of the walk; None for a circle.
     """
 
     seen: dict[str, list[str]] = field(default_factory=dict)
@@ -56,6 +60,9 @@ class Runs:
     codes: dict[str, int] = field(default_factory=dict)
     registered: dict[str, list[int]] = field(default_factory=dict)
     rough: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rough_ends: dict[str, BaseException] = field(default_factory=dict)
+    rough_registered: dict[str, list[int]] = field(default_factory=dict)
+    cameras: dict[str, Rigid3] | None = None
 
     def __call__(self, session: Session, *_: Any) -> RunOutput:
         Store(session.store_root)
@@ -64,14 +71,18 @@ class Runs:
         images = sorted(path.name for path in params.path.iterdir())
         if out.parent.name == "rough":
             self.rough[block] = session.run_options.until
-            write_block(out, [int(name[:3]) for name in images], some_world(int(block[-1])))
+            if block in self.rough_ends:
+                raise self.rough_ends[block]
+            shutil.rmtree(out, ignore_errors=True)
+            chosen = self.rough_registered.get(block) or [int(name[:3]) for name in images]
+            write_block(out, chosen, some_world(int(block[-1])), cameras=self.cameras)
             return load(out)
         self.seen[block] = images
         if block in self.ends:
             raise self.ends[block]
         shutil.rmtree(out, ignore_errors=True)
         chosen = self.registered.get(block) or [int(name[:3]) for name in self.seen[block]]
-        write_block(out, chosen, some_world(int(block[-1])))
+        write_block(out, chosen, some_world(int(block[-1])), cameras=self.cameras)
         stage = StageOutcome(name="images", use="source.folder", params={"path": str(params.path)})
         code = self.codes.get(block, 0)
         update = {"stages": (stage,), "exit_code": code, "stopped": "too few matches" if code == 4 else ""}
@@ -327,8 +338,51 @@ def test_a_run_from_python_is_divided_as_well(runs: Runs, walk: Path, tmp_path: 
     stopped = pano_mvs_package.run("quickstart", walk, tmp_path / "other", block_size=14, block_overlap=4)
     assert stopped.summary.stopped == "too few matches"
     assert stopped.out.name == "block_2"
+    runs.ends["out"] = STOPPED
+    (tmp_path / "mine/out").mkdir(parents=True)
+    (tmp_path / "mine/out/notes.txt").touch()
+    warnings: list[Event] = []
+    with pytest.raises(RunStoppedError, match="the disk is full"):
+        pano_mvs_package.run("quickstart", walk, tmp_path / "mine/out", progress=warnings.append)
+    assert isinstance(warnings[0], Warned)
     with pytest.raises(UsageError, match=r"block_size=5: a block needs at least 7 images"):
         pano_mvs_package.run("quickstart", walk, block_size=5)
+
+
+def test_blocks_overlap_where_the_path_returns(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """The path goes to and fro, so the last images are beside the first."""
+    centers = [(float(min(idx, 29 - idx)), 0.0, 0.3 * (idx > 14)) for idx in range(30)]
+    rotations = [camera.rotation for camera in walked(30).values()]
+    runs.cameras = {
+        f"{idx:03d}.png": Rigid3.from_center(rotation, center)
+        for idx, (rotation, center) in enumerate(zip(rotations, centers, strict=True))
+    }
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert pano_mvs(*command).code == 0
+    assert sum(int(name[:3]) >= 14 for name in runs.seen["block_1"]) >= 3
+    assert sum(int(name[:3]) < 12 for name in runs.seen["block_3"]) >= 3
+    rough, runs.rough = runs.rough, {}
+    assert len(rough) == 3
+    seen = dict(runs.seen)
+    for again in (command, command[:-4]):
+        assert pano_mvs(*again).code == 0
+        assert not runs.rough, "rough poses are solved once"
+        assert runs.seen == seen
+
+
+def test_without_rough_poses_the_blocks_are_as_they_were(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """A later stage may correct what does not fit; the last merge says so otherwise."""
+    runs.rough_registered["block_3"] = list(range(20, 26))
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS).code == 0
+    assert [len(names) for names in runs.seen.values()] == [12, 12, 12]
+
+
+def test_a_block_without_rough_poses_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.rough_ends["block_2"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert result.code == 4
+    assert "error: rough/block_2: the disk is full" in result.flat
+    assert not runs.seen
 
 
 def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
