@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from pano_mvs.evaluation import evaluate_cloud, evaluate_depth, evaluate_poses, evaluate_run
     from pano_mvs.results.run_output import RunOutput, RunView, load
     from pano_mvs.results.summary import RunSummary
+    from pano_mvs.session.captures import run
     from pano_mvs.session.planning import RunPlan, plan
-    from pano_mvs.session.running import run
 
 __version__ = "0.1.0"
 
@@ -61,7 +61,7 @@ _HOMES = {
     "evaluate_run": "evaluation",
     "load": "results.run_output",
     "plan": "session.planning",
-    "run": "session.running",
+    "run": "session.captures",
 }
 
 

@@ -14,6 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import (
@@ -24,6 +26,7 @@ from pano_mvs.geometry import (
     nearest_rotation,
     rotation_from_rotvec,
     rotvec_from_rotation,
+    similarity_from_points,
 )
 from pano_mvs.scene import Poses
 
@@ -46,8 +49,8 @@ def divide_capture(
     `names`: all images, in the order in which they were taken. `size`: maximum number of images in a stretch.
     `overlap`: number of images that two consecutive stretches have in common. `loop`: whether the path ends where it
     began: the last block and the first one overlap, too. `positions`: rough positions (3,) of images in one frame, by
-    name. Where the path comes near a stretch of another block again, both blocks get the nearest images of each other,
-    at most `overlap` in all.
+    name. Where the path comes near an image of another block that is more than `overlap` images before or after it,
+    both blocks get the nearest such images of each other, at most `overlap` in all.
 
     Raises:
         UsageError: if the overlap is not less than half of the size, or fewer than three.
@@ -80,13 +83,18 @@ def _with_returns(
     steps = [np.linalg.norm(np.diff(own, axis=0), axis=1) for own in centers if len(own) > 1]
     reach = _NEAR * float(np.median(np.concatenate(steps))) if steps else 0.0
     found = [set(stretch) for stretch in stretches]
+    trees = [cKDTree(own) if len(own) else None for own in centers]
     for here, there in permutations(range(len(stretches)), 2):
-        if stretches[here] & stretches[there] or not len(centers[here]) or not len(centers[there]):
+        first, second = trees[there], trees[here]
+        if first is None or second is None:
             continue
-        distances = np.asarray(cKDTree(centers[here]).query(centers[there])[0])
-        nearest = [n for n in np.argsort(distances, kind="stable").tolist() if distances[n] <= reach]
-        added = {known[there][n] for n in nearest[: -(-overlap // 2)]}
-        found[here] |= added
+        near = first.sparse_distance_matrix(second, reach, output_type="ndarray")
+        there_idx, here_idx = np.array(known[there])[near["i"]], np.array(known[here])[near["j"]]
+        apart = np.abs(there_idx - here_idx)
+        returns = np.minimum(apart, len(names) - apart) > overlap
+        nearest = there_idx[returns][np.argsort(near["v"][returns], kind="stable")].tolist()
+        added = [idx for idx in dict.fromkeys(nearest) if idx not in stretches[here]]
+        found[here].update(added[: -(-overlap // 2)])
     return found
 
 
@@ -193,9 +201,8 @@ def similarity_from_cameras(source: Sequence[Rigid3], target: Sequence[Rigid3]) 
 
 def camera_spacing(centers: FloatArray) -> float:
     """Return the median distance between a camera and its nearest neighbour, of centres (N, 3)."""
-    apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return max(float(np.median(apart.min(axis=1))), 1e-12)
+    apart = np.asarray(cKDTree(centers).query(centers, k=[2])[0])  # the nearest one is the camera itself
+    return max(float(np.median(apart)), 1e-12)
 
 
 def _reference_points(cameras: Sequence[Rigid3]) -> FloatArray:
@@ -308,11 +315,25 @@ _MAX_ERROR_RAD = float(np.radians(0.5))
 class MergedBlocks:
     """The cameras and points of all blocks in one world.
 
-    `poses`: the merged poses. `owner`: (N,) position of the block to which each camera of `poses` belongs.
+    `poses`: the merged poses. `owner`: (N,) position of the block to which each camera of `poses` belongs. `before`:
+    the poses before all blocks were adjusted together; None if they were not.
     """
 
     poses: Poses
     owner: NDArray[np.intp]
+    before: Poses | None = None
+
+    def move(
+        self, points: NDArray[np.floating[Any]], vectors: NDArray[np.floating[Any]], camera_idx: NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return points (N, 3) in the world, and vectors (N, 3) at them, moved as each one's camera was adjusted."""
+        assert self.before is not None
+        turns = np.swapaxes(self.poses.rotations, 1, 2) @ self.before.rotations
+        chosen, old, new = turns[camera_idx], self.before.centers[camera_idx], self.poses.centers[camera_idx]
+        return (
+            new + np.einsum("nij,nj->ni", chosen, points - old),
+            np.einsum("nij,nj->ni", chosen, vectors),
+        )
 
 
 def owners_of(blocks: Sequence[Mapping[str, FloatArray]]) -> dict[str, int]:
@@ -392,6 +413,20 @@ def _shares(blocks: Sequence[Poses], names: Sequence[str], owner: Mapping[str, i
     return found
 
 
+def adjust_merged(merged: MergedBlocks) -> MergedBlocks:
+    """Return merged blocks after a bundle adjustment of all cameras and points together.
+
+    Blocks are rigid when they are aligned. Where they bend differently, the adjustment distributes the difference over
+    the cameras, so that it does not remain at the seams. The cameras as a whole stay in place. If the adjustment leaves
+    out a camera, the blocks are returned as they are.
+    """
+    refined = refine_poses(merged.poses)
+    if refined.names != merged.poses.names:
+        return merged
+    refined = moved_poses(refined, similarity_from_points(refined.centers, merged.poses.centers))
+    return replace(merged, poses=refined, before=merged.poses)
+
+
 @dataclass(frozen=True, eq=False)
 class _Observations:
     """Observations of all blocks: point, image and bearing of each, and the points with the blocks they come from."""
@@ -399,6 +434,7 @@ class _Observations:
     point_idx: NDArray[np.intp]
     image_idx: NDArray[np.intp]
     bearings: FloatArray
+    sigmas_rad: NDArray[np.float32] | None
     points: FloatArray
     block_of_point: NDArray[np.intp]
     colors: NDArray[np.uint8]
@@ -431,6 +467,7 @@ def _with_points(merged: Poses, blocks: Sequence[Poses], world_from_block: Seque
         track_point_idx=(np.cumsum(seen) - 1)[point_idx[used]].astype(np.int32),
         track_image_idx=image_idx[used].astype(np.int32),
         track_bearings=bearings[used],
+        track_sigmas_rad=None if everything.sigmas_rad is None else everything.sigmas_rad[first][used],
     )
 
 
@@ -438,10 +475,12 @@ def _gathered(merged: Poses, blocks: Sequence[Poses], world_from_block: Sequence
     position = {name: idx for idx, name in enumerate(merged.names)}
     first_point = np.cumsum([0, *(len(block.points_in_world) for block in blocks)])
     images = [np.array([position[name] for name in block.names], np.intp) for block in blocks]
+    sigmas = [block.track_sigmas_rad for block in blocks if block.track_sigmas_rad is not None]
     return _Observations(
         np.concatenate([block.track_point_idx + start for block, start in zip(blocks, first_point, strict=False)]),
         np.concatenate([own[block.track_image_idx] for own, block in zip(images, blocks, strict=True)]),
         np.concatenate([block.track_bearings for block in blocks]),
+        np.concatenate(sigmas) if len(sigmas) == len(blocks) else None,
         np.concatenate(
             [
                 similarity.apply(block.points_in_world)
@@ -470,9 +509,9 @@ def _joined_points(found: _Observations) -> tuple[NDArray[np.intp], NDArray[np.i
     return label, label[found.point_idx]
 
 
-def nearest_owners(points: NDArray[np.floating[Any]], centers: FloatArray, owner: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the block to which the camera nearest to each point (N, 3) belongs, (N,).
+def nearest_cameras(points: NDArray[np.floating[Any]], centers: FloatArray) -> NDArray[np.intp]:
+    """Return the camera that is nearest to each point (N, 3), (N,).
 
-    `points`: in the world. `centers`: (K, 3) of all cameras. `owner`: (K,) block of each.
+    `points`: in the world. `centers`: (K, 3) of all cameras.
     """
-    return np.asarray(owner[cKDTree(centers).query(points)[1]], np.intp)
+    return np.asarray(cKDTree(centers).query(points)[1], np.intp)

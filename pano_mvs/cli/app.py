@@ -149,15 +149,16 @@ def run(
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
     ] = False,
     block_size: Annotated[
-        int,
+        int | None,
         typer.Option(
             "--block-size",
             metavar="N",
             min=0,
-            help="Run overlapping blocks of at most N images one after the other, and merge them; default: no blocks.",
+            help="Run overlapping blocks of at most N images one after the other, and merge them; 0: all images at "
+            "once. Default: blocks if all at once would take more memory than there is.",
             show_default=False,
         ),
-    ] = 0,
+    ] = None,
     block_overlap: Annotated[
         int,
         typer.Option(
@@ -179,11 +180,12 @@ def run(
     ] = None,
 ) -> None:
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.blocks_command import division_of, run_in_blocks
+    from pano_mvs.cli.blocks_command import run_blocks_shown
     from pano_mvs.cli.plan_commands import show_dry_run
     from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
+    from pano_mvs.session.merging.automatic import decision_of
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
@@ -193,12 +195,14 @@ def run(
         workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
     )
     execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable, otel)
-    division = division_of(block_size, block_overlap, loop=block_loop, poses=block_poses)
+    decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=block_poses)
     with notified([] if dry_run else notify or [], session.out):
-        if division is not None:
-            raise typer.Exit(run_in_blocks(session, execution, division, as_json=as_json, dry_run=dry_run))
+        if decision.division is not None:
+            raise typer.Exit(run_blocks_shown(session, execution, decision, as_json=as_json, dry_run=dry_run))
+        if decision.reason:
+            Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
         if dry_run:
-            show_dry_run(session, execution, Console(), as_json=as_json)
+            show_dry_run(session, Console(), execution=execution, as_json=as_json)
             return
         raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
@@ -226,8 +230,11 @@ def plan(
     ] = "",
 ) -> None:
     """Show what a run would compute, and why; nothing is written to the output folder."""
+    from pano_mvs.cli.blocks_command import show_blocks
     from pano_mvs.cli.plan_commands import explain_unit, show_plan
     from pano_mvs.engine.planning.plan import RunOptions
+    from pano_mvs.session.merging.automatic import decide_blocks
+    from pano_mvs.session.running import Execution
     from pano_mvs.session.session import check_output, open_session
 
     run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
@@ -237,8 +244,14 @@ def plan(
     check_output(session)
     if explain:
         explain_unit(session, explain, Console())
-    else:
-        show_plan(session, Console())
+        return
+    decision = decide_blocks(session, Execution())
+    if decision.division is not None:
+        show_blocks(session, decision, Console(), show_plan)
+        return
+    if decision.reason:
+        Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
+    show_plan(session, Console())
 
 
 @app.command()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,112 +13,88 @@ from rich.markup import escape
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.plan_commands import show_dry_run
-from pano_mvs.cli.run.command import interrupted_by_termination, run_shown
+from pano_mvs.cli.run.command import interrupted_by_termination, run_shown, run_with_events
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, INTERRUPTED
+from pano_mvs.results.summary import BLOCKS
+from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
 from pano_mvs.session.commands import run_command
-from pano_mvs.session.event_log import EventLog
-from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, open_blocks, split_images
+from pano_mvs.session.merging.automatic import BlockDecision
+from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, split_images
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.progress import BlockStarted, Event, RunFinished, Warned
+from pano_mvs.session.progress import Divided, Event, RunFinished, Warned
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
-_MIN_SIZE = 7
 _SAME_COMMAND = "give the same command again; finished results are reused"
 
 
-def division_of(size: int, overlap: int, *, loop: bool, poses: Path | None) -> Division | None:
-    """Return the division that the options of `run` state, or None without blocks.
-
-    Args:
-        size: maximum number of images of a block; 0 for no blocks.
-        overlap: images that consecutive blocks share; 0 for a quarter of the size, between 3 and 100.
-        loop: whether the path ends where it began.
-        poses: rough poses.
-
-    Raises:
-        UsageError: if the options do not fit together.
-    """
-    if size == 0:
-        given = {"--block-overlap": overlap, "--block-loop": loop, "--block-poses": poses}
-        if names := [name for name, value in given.items() if value]:
-            raise UsageError(f"{', '.join(names)}: only blocks have this. Give --block-size N as well")
-        return None
-    if size < _MIN_SIZE:
-        raise UsageError(f"--block-size {size}: a block needs at least {_MIN_SIZE} images")
-    return Division(size, overlap or min(100, max(3, size // 4)), loop, poses)
-
-
-def run_in_blocks(
-    session: Session, execution: Execution, division: Division, *, as_json: bool = False, dry_run: bool = False
+def run_blocks_shown(
+    session: Session, execution: Execution, decision: BlockDecision, *, as_json: bool = False, dry_run: bool = False
 ) -> int:
     """Run a workflow for each block of its images, merge the blocks, and return the exit code.
 
     A block that ends early ends the command, or, with `--keep-going`, is left for a later command. The blocks are
     merged when none did.
 
+    Args:
+        session: over the whole capture.
+        execution: how units are computed.
+        decision: with a division.
+        as_json: print events instead.
+        dry_run: only print the plan of each block.
+
     Raises:
         UsageError: if the session cannot be run in blocks, or an option does not go with blocks.
         InputError: if there are no images.
         StoreError: if the output folder cannot be written.
     """
-    if as_json:
-        raise UsageError(
-            "--json reports one run, and each block is a run. Divide the capture with pano-mvs split, and give --json "
-            "to the run of each block"
-        )
-    console = Console()
-    blocks = divided(session, division)
     if dry_run:
-        _show_dry_run(session, execution, blocks, console=console)
+        if as_json:
+            raise UsageError("--dry-run prints a table, not events: leave out --json")
+        show_blocks(session, decision, Console(), partial(show_dry_run, execution=execution, as_json=False))
         return 0
-    with interrupted_by_termination(), open_blocks(session, blocks) as runs:
-        log, began, code = EventLog(partial(_print_warning, console)), time.monotonic(), 1
-        log.open(session.out / BLOCKS)
-        try:
-            code = _run_and_merge(session, execution, runs, log=log, console=console)
-            return code
-        except KeyboardInterrupt:
-            code = INTERRUPTED
-            raise
-        finally:
-            log(RunFinished(code, "", seconds=round(time.monotonic() - began, 3), out=session.out))
+    if as_json:
+        return _run_with_events(session, execution, decision)
+    console, codes = Console(), dict[str, int]()
+
+    def run_block(run: BlockRun) -> int:
+        _print_heading(run, console=console)
+        codes[run.name] = _run_block(run, execution, console)
+        return codes[run.name]
+
+    with interrupted_by_termination():
+        merge = partial(_merge, session=session, console=console)
+        code = run_blocks(session, decision, run_block=run_block, merge=merge, progress=partial(_print_event, console))
+    early = [name for name, ended in codes.items() if is_early(ended)]
+    if early and session.run_options.keep_going:
+        console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")
+    return code
 
 
-def _print_warning(console: Console, event: Event) -> None:
+def _run_with_events(session: Session, execution: Execution, decision: BlockDecision) -> int:
+    """Run and merge blocks, print all events, and return the exit code, that of the last event."""
+    codes = [1]
+
+    def watch(event: Event) -> None:
+        if isinstance(event, RunFinished):
+            codes.append(event.exit_code)
+
+    run_with_events(lambda progress: run_in_blocks(session, execution, decision, progress), watch)
+    return codes[-1]
+
+
+def _print_event(console: Console, event: Event) -> None:
     if isinstance(event, Warned):
         console.say(f"[yellow]warning:[/] {escape(event.text)}")
+    elif isinstance(event, Divided):
+        console.say(escape(event.reason))
 
 
-def _run_and_merge(
-    session: Session, execution: Execution, runs: Sequence[BlockRun], *, log: EventLog, console: Console
-) -> int:
-    codes = []
-    for number, run in enumerate(runs, start=1):
-        left = sum(len(later.names) for later in runs[number:])
-        log(BlockStarted(run.name, number, len(runs), images=len(run.names), images_left=left))
-        _print_heading(run, number, len(runs), console=console)
-        code = _run_block(run, execution, console)
-        codes.append(code)
-        if _is_early(code) and not session.run_options.keep_going:
-            return code
-    if early := [run.name for run, code in zip(runs, codes, strict=True) if _is_early(code)]:
-        console.print(f"not merged, because {', '.join(early)} did not finish. To continue, {_SAME_COMMAND}")
-        return max(filter(_is_early, codes))
-    merged = _merge(session, runs, console)
-    return merged if _is_early(merged) else max(*codes, merged)
-
-
-def _is_early(code: int) -> bool:
-    """Return whether a run with an exit code ended before it was finished."""
-    return code not in (0, FAILED_ITEMS)
-
-
-def _print_heading(run: BlockRun, number: int, count: int, *, console: Console) -> None:
+def _print_heading(run: BlockRun, *, console: Console) -> None:
+    what = ", rough poses" if run.session.out.parent != run.folder else ""
     console.say(
-        f"\n[bold]block {number} of {count}[/]: {len(run.names)} images, "
+        f"\n[bold]block {run.number} of {run.blocks}[/]{what}: {len(run.names)} images, "
         f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}"
     )
 
@@ -131,7 +106,7 @@ def _run_block(run: BlockRun, execution: Execution, console: Console) -> int:
         code, reason = summary.exit_code, summary.stopped
     except PanoMvsError as error:
         code, reason = error.exit_code, str(error)
-    if _is_early(code):
+    if is_early(code):
         Console(stderr=True).say(
             f"[red]error:[/] {run.name}: {escape(reason)}\n"
             f"To continue, remove the cause and {_SAME_COMMAND}. This block alone:\n"
@@ -140,11 +115,10 @@ def _run_block(run: BlockRun, execution: Execution, console: Console) -> int:
     return code
 
 
-def _merge(session: Session, runs: Sequence[BlockRun], console: Console) -> int:
-    console.print(f"\n[bold]merging {len(runs)} blocks[/] into {escape(str(session.out))}", highlight=False)
-    outs = tuple(run.session.out for run in runs)
+def _merge(outs: Sequence[Path], *, session: Session, console: Console) -> int:
+    console.print(f"\n[bold]merging {len(outs)} blocks[/] into {escape(str(session.out))}", highlight=False)
     try:
-        return merge_blocks_command(outs, session.out, cache=session.store_root, console=console)
+        return merge_blocks_command(tuple(outs), session.out, cache=session.store_root, console=console)
     except PanoMvsError as error:
         Console(stderr=True).say(
             f"[red]error:[/] {escape(str(error))}\nAll blocks have run; their results are in "
@@ -154,15 +128,31 @@ def _merge(session: Session, runs: Sequence[BlockRun], console: Console) -> int:
         return error.exit_code
 
 
-def _show_dry_run(
-    session: Session, execution: Execution, blocks: Sequence[tuple[str, ...]], *, console: Console
+def show_blocks(
+    session: Session, decision: BlockDecision, console: Console, show: Callable[[Session, Console], object]
 ) -> None:
-    """Print the plan of each block as it would be with the results that are cached now; nothing is written."""
+    """Print why a capture is divided, and the plan of each block with the results that are cached now.
+
+    Args:
+        session: over the whole capture.
+        decision: with a division.
+        console: where to print.
+        show: prints the plan of a block.
+
+    Raises:
+        UsageError: if the session cannot be run in blocks.
+        InputError: if there are no images.
+    """
+    assert decision.division is not None
+    if decision.reason:
+        console.say(escape(decision.reason))
+    divisions = divided(session, decision.division)
     with tempfile.TemporaryDirectory() as folder:
-        for number, run in enumerate(block_runs(session, blocks, Path(folder)), start=1):
-            shown = replace(run, session=replace(run.session, out=session.out / BLOCKS / run.name))
-            _print_heading(shown, number, len(blocks), console=console)
-            show_dry_run(shown.session, execution, console, as_json=False)
+        for run in block_runs(session, divisions, Path(folder)):
+            blocks = session.out / BLOCKS
+            shown = replace(run, session=replace(run.session, out=blocks / run.name), folder=blocks)
+            _print_heading(shown, console=console)
+            show(shown.session, console)
 
 
 def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:

@@ -30,7 +30,7 @@ from pano_mvs.session.session import Session, check_output
 _SHOWN_REASONS = 5
 
 
-def show_dry_run(session: Session, execution: Execution, console: Console, *, as_json: bool) -> None:
+def show_dry_run(session: Session, console: Console, *, execution: Execution, as_json: bool) -> None:
     """Print the plan of a run, for its number of workers.
 
     Raises:
@@ -201,6 +201,8 @@ def show_status(
 ) -> None:
     """Print the outcome of the latest run into an output folder, then what its workflow would compute now.
 
+    Of a folder of merged blocks, the outcome of the merge and of each block is printed instead.
+
     Args:
         target: a workflow, or an output folder, whose run.json states workflow, settings, images and cache.
         out: output folder of a workflow; None for the default.
@@ -213,7 +215,12 @@ def show_status(
         InputError: if an output folder has no run.json, or its workflow is missing.
     """
     if is_folder(Path(target)):
-        _print_latest(Path(target), console)
+        latest = _print_latest(Path(target), console)
+        if latest is not None and latest.merged is not None:
+            for block in latest.merged.blocks:
+                console.say(escape(f"block {block}:"))
+                _print_latest(Path(block), console)
+            return
     session = reopen(target, overrides=overrides, images=images, cache=cache)
     session = session if out is None else replace(session, out=out)
     if not is_folder(Path(target)):
@@ -224,21 +231,27 @@ def show_status(
         console.say(f"  {escape(run_command(session))}")
 
 
-def _print_latest(out: Path, console: Console) -> None:
+def _print_latest(out: Path, console: Console) -> RunSummary | None:
+    """Print how the latest run into a folder ended, and return what its run.json holds; None if it cannot be read."""
     if not is_file(out / RUN_JSON):
         console.print(f"no finished run in {escape(str(out))}", highlight=False)
-        return
+        return None
     try:
         latest = RunSummary.read(out)
     except InputError as error:
         console.say(escape(str(error)))
-        return
-    units = latest.units
-    text = f"exit code {latest.exit_code}, {units.run} computed, {units.cached} cached, {units.failed} failed"
-    console.print(f"latest run {latest.started}: {text}", highlight=False)
+        return None
+    if latest.merged is not None:
+        text = f"merged {latest.started} from {len(latest.merged.blocks)} blocks: exit code {latest.exit_code}"
+    else:
+        units = latest.units
+        counts = f"{units.run} computed, {units.cached} cached, {units.failed} failed"
+        text = f"latest run {latest.started}: exit code {latest.exit_code}, {counts}"
+    console.print(text, highlight=False)
     for failure in latest.failures:
         console.say(escape(f"  {failure.label}: {failure.cause}"))
     if latest.stopped:
         console.say(escape(f"  stopped: {latest.stopped}"))
     if latest.verdict is not None:
         print_verdict(latest.verdict, console)
+    return latest

@@ -1,4 +1,4 @@
-"""Free memory of this host, and sizes such as "2GB"."""
+"""Memory of this host, and sizes such as "2GB"."""
 
 from __future__ import annotations
 
@@ -47,35 +47,65 @@ def free_memory_bytes() -> int:
     return min(found, default=0)
 
 
+def total_memory_bytes() -> int:
+    """Return the memory of this host, or of the container if that is less; 0 if unknown."""
+    found = [size for size in (_total_of_system(), _limit_of_container()) if size]
+    return min(found, default=0)
+
+
 def _free_of_system() -> int:
     if sys.platform == "win32":
-        return _free_of_windows()
+        return _of_windows(2)
     if sys.platform == "darwin":
         # macOS fills free memory with cached files, so that its figure says little: most of the memory is available.
+        return _total_of_system() * 3 // 4
+    return _of_meminfo("MemAvailable")
+
+
+def _total_of_system() -> int:
+    if sys.platform == "win32":
+        return _of_windows(1)
+    if sys.platform == "darwin":
         found = subprocess.run(["/usr/sbin/sysctl", "-n", "hw.memsize"], capture_output=True, check=False).stdout
-        return int(found) * 3 // 4 if found.strip().isdigit() else 0
+        return int(found) if found.strip().isdigit() else 0
+    return _of_meminfo("MemTotal")
+
+
+def _of_meminfo(field: str) -> int:
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), 0)
+        return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{field}:")), 0)
+    except (OSError, ValueError):
+        return 0
+
+
+_CONTAINER = Path("/sys/fs/cgroup")
+
+
+def _limit_of_container() -> int:
+    """Return the memory limit of the container; 0 without one."""
+    try:
+        limit = (_CONTAINER / "memory.max").read_text(encoding="ascii").strip()
+        return 0 if limit == "max" else int(limit)
     except (OSError, ValueError):
         return 0
 
 
 def _free_of_container() -> int:
-    folder = Path("/sys/fs/cgroup")
+    limit = _limit_of_container()
+    if not limit:
+        return 0
     try:
-        limit, used = ((folder / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
-        if limit == "max":
-            return 0
-        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+        used = int((_CONTAINER / "memory.current").read_text(encoding="ascii"))
+        lines = (_CONTAINER / "memory.stat").read_text(encoding="ascii").splitlines()
         files = sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
-        return max(1, int(limit) - int(used) + files)  # memory of cached files is released when needed
+        return max(1, limit - used + files)  # memory of cached files is released when needed
     except (OSError, ValueError):
         return 0
 
 
-def _free_of_windows() -> int:
+def _of_windows(field: int) -> int:
     status = (ctypes.c_ulonglong * 8)()  # MEMORYSTATUSEX: two 32-bit fields, then seven of 64 bits
     ctypes.memmove(status, ctypes.byref(ctypes.c_uint32(ctypes.sizeof(status))), 4)
     kernel = getattr(ctypes, "windll").kernel32  # noqa: B009 (exists on Windows alone)
-    return int(status[2]) if os.name == "nt" and kernel.GlobalMemoryStatusEx(status) else 0
+    return int(status[field]) if os.name == "nt" and kernel.GlobalMemoryStatusEx(status) else 0

@@ -3,6 +3,9 @@
 A run reports `RunStarted` and `Forecast`, then events of its stages and units, and now and then `KernelsCompiled` and
 `TimeLeft`, then `RunFinished`, which is always the last. Stages overlap. If a damaged file is found in the cache, the
 run starts over: `StageStarted` is repeated for every stage, and earlier counts no longer apply.
+
+A run in blocks reports `Divided` if nobody asked for blocks, then for each block `BlockStarted` and the events of its
+run, and at last `RunFinished` with its own output folder.
 """
 
 from __future__ import annotations
@@ -188,8 +191,16 @@ class Warned:
 
 
 @dataclass(frozen=True, slots=True)
+class Divided:
+    """The capture is run in blocks although nobody asked for it; `reason` states in one line how and why."""
+
+    kind: ClassVar[str] = "divided"
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class BlockStarted:
-    """`pano-mvs run --block-size` begins with a block, which is a run with events of its own.
+    """A run in blocks begins with a block, which is a run with events of its own.
 
     Attributes:
         block: its name, such as block_2.
@@ -249,6 +260,7 @@ Event = (
     | StageFinished
     | TimeLeft
     | Warned
+    | Divided
     | BlockStarted
     | RunFinished
 )

@@ -15,8 +15,8 @@ Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
 _SETTING = re.compile(r"(?<![^\s(])--set ([^\s=:]+)")
-_WITH_VALUE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|until|only|refresh) (?=\S)")
-_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|workers)\b")
+_WITH_VALUE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|until|only|refresh|block-\w+) (?=\S)")
+_ALONE = re.compile(r"(?<![^\s(])--(images|out|cache|executor|queue|workers|block-\w+)\b")
 _MIN_FREE = re.compile(r"(?<![^\s(])--min-free\b")  # not an argument
 
 
@@ -46,8 +46,13 @@ def arguments_from_options(message: str) -> str:
     "settings['depth.planes']=x: must be a number; use fewer workers"
     """
     message = _SETTING.sub(r"settings['\1']", message)
-    message = _ALONE.sub(r"\1", _WITH_VALUE.sub(r"\1=", message))
+    message = _WITH_VALUE.sub(lambda found: f"{_argument(found[1])}=", message)
+    message = _ALONE.sub(lambda found: _argument(found[1]), message)
     return _MIN_FREE.sub("$PANO_MVS_MIN_FREE", message)
+
+
+def _argument(option: str) -> str:
+    return option.replace("-", "_")
 
 
 def overrides_from_settings(settings: Mapping[str, object]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +19,6 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.report.page import gather_report, write_page
@@ -31,8 +30,7 @@ from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
-from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
-from pano_mvs.session.session import Session, check_output, open_session
+from pano_mvs.session.session import Session, check_output
 from pano_mvs.session.spans import Spans
 from pano_mvs.session.sudden_exit import exit_text
 from pano_mvs.session.summarise import summarise
@@ -70,70 +68,6 @@ class Execution:
     otel: bool = False
 
 
-@names_arguments
-def run(
-    workflow: str | Path,
-    images: str | Path | None = None,
-    out: str | Path | None = None,
-    *,
-    settings: Mapping[str, object] | None = None,
-    cache: str | Path | None = None,
-    executor: str | Execution = "",
-    workers: int | None = None,
-    until: Sequence[str] = (),
-    only: Sequence[str] = (),
-    refresh: Sequence[str] = (),
-    keep_going: bool = False,
-    progress: Progress | None = None,
-) -> RunOutput:
-    """Run a workflow and return its output; cached results are reused.
-
-    Units that fail do not raise an error: they are in `summary.failures`, and `summary.ok` is False. The same holds
-    for a quality threshold that stops the run (`summary.stopped`).
-
-    Without `images`, presets run on their samples:
-
-    >>> import pano_mvs
-    >>> run = pano_mvs.run("quickstart", out="out", settings={"depth.planes": 96})
-    >>> run.ok, run.summary.poses.registered
-    (True, ('000.png', '001.png', '002.png', '003.png'))
-    >>> run.views["000.png"].range_map.shape
-    (512, 1024)
-
-    Args:
-        workflow: name of a preset, or a workflow file.
-        images: folder of panoramas; None for that of the workflow.
-        out: output folder; None for out/<name of the workflow> in the current folder.
-        settings: `STAGE.PARAM` to a Python value, or to a string in the syntax of `--set`.
-        cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
-            current folder if the workflow is a preset).
-        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`; or an `Execution`, for
-            other settings, such as a queueing system.
-        workers: number of units at a time; None for one per core, if memory permits.
-        until: run only these stages and those that they need.
-        only: run only these units, as `STAGE:ITEM`, and those that they need.
-        refresh: stages or units to recompute even if they are cached.
-        keep_going: continue after failures even if a stage has `on_error: stop`.
-        progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
-
-    Raises:
-        UsageError: if the workflow, a setting or a folder cannot be used.
-        InputError: if the images cannot be read.
-        StoreError: if the cache or the output folder cannot be written.
-    """
-    run_options = RunOptions(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
-    session = open_session(
-        workflow,
-        overrides=overrides_from_settings(settings or {}),
-        images=images,
-        cache=cache,
-        out=out,
-        run_options=run_options,
-    )
-    execution = executor if isinstance(executor, Execution) else Execution(executor)
-    return run_session(session, replace(execution, workers=workers or execution.workers), progress or ignore)
-
-
 def _check_not_merged(out: Path) -> None:
     """Check that a run does not replace the run.json and the report of merged blocks.
 
@@ -147,12 +81,12 @@ def _check_not_merged(out: Path) -> None:
     if merged is not None:
         raise UsageError(
             f"--out {out}: holds results that were merged from {len(merged.blocks)} blocks, of which a run would "
-            "replace a part. Give --block-size again, or choose another folder"
+            "replace a part. Leave out --block-size 0, or choose another folder"
         )
 
 
 def run_session(session: Session, execution: Execution = Execution(), progress: Progress = ignore) -> RunOutput:
-    """Run an open session; see `run`."""
+    """Run an open session, all images at once; see `pano_mvs.run`."""
     check_output(session)
     _check_not_merged(session.out)
     set_aside_foreign_files(session.out)

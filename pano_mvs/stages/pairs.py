@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +49,8 @@ class AutoParams(Params):
     """Settings of pairs.auto."""
 
 
-def _memory_of_auto(params: AutoParams, inputs: Mapping[str, Any]) -> int:
-    count = len(inputs["descriptors"])
+def _memory_of_auto(params: AutoParams, count: int) -> int:
+    """Return the memory for pairs of this number of images."""
     return _BYTES_OF_A_PAIR * count**2 if most_pairs(count, _candidates(params)) < count * (count - 1) // 2 else 0
 
 
@@ -60,7 +59,10 @@ def _candidates(params: AutoParams) -> int:
 
 
 @stage(
-    "pairs.auto", memory=_memory_of_auto, expected_units=lambda params, images: most_pairs(images, _candidates(params))
+    "pairs.auto",
+    memory=lambda params, inputs: _memory_of_auto(params, len(inputs["descriptors"])),
+    expected_units=lambda params, images: most_pairs(images, _candidates(params)),
+    expected_memory=lambda params, images, _: _memory_of_auto(params, images),
 )
 def automatic(
     descriptors: All[GlobalDescriptor],

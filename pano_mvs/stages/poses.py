@@ -50,7 +50,8 @@ class ScaledTranslationParams(Params):
     )
 
 
-@stage("poses.scaled_translation")
+# Measured: most of it for the test of loop closures.
+@stage("poses.scaled_translation", expected_memory=lambda _params, _images, stored_bytes: 12 * stored_bytes)
 def scaled_translation(
     features: All[Features],
     matches: All[TwoView],
@@ -142,7 +143,7 @@ class RefineParams(Params):
     align: bool = Field(default=True, description="refine observations by aligning image patches, and adjust once more")
 
 
-@stage("poses.refine")
+@stage("poses.refine", expected_memory=lambda _params, _images, stored_bytes: 6 * stored_bytes)
 def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: Context) -> Poses:
     """Refine all poses and points by angular bundle adjustment, with errors in degrees on the sphere instead of pixels.
 

@@ -1,7 +1,8 @@
-"""`pano-mvs run --block-size` runs a workflow block by block, and merges the blocks; the same command resumes it."""
+"""`pano-mvs run` in blocks runs a workflow block by block, and merges the blocks; the same command resumes it."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,21 +11,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError
+import pano_mvs as pano_mvs_package
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.geometry import similarity_from_points
+from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.io.images.captures import list_pictures
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.event_log import EventReader
-from pano_mvs.session.progress import BlockStarted, RunFinished
+from pano_mvs.session.planning import reference_times
+from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished, Warned
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.algorithms.blocks.walked_blocks import some_world
+from tests.algorithms.blocks.walked_blocks import walk as walked
 from tests.cli.conftest import Command, Outcome, deliverables, run_json
 from tests.session.merging.written_blocks import write_block
 
@@ -41,23 +49,40 @@ class Runs:
         ends: block to the error with which its run ends.
         codes: block to the exit code of its run, if it is not 0.
         registered: block to the numbers of its images that have a pose, if it is not all of them.
+        rough: block to the stages of the run that solved its rough poses.
+        rough_ends: block to the error with which that run ends.
+        rough_registered: as `registered`, for these runs.
+        cameras: of the walk; None for a circle.
     """
 
     seen: dict[str, list[str]] = field(default_factory=dict)
     ends: dict[str, BaseException] = field(default_factory=dict)
     codes: dict[str, int] = field(default_factory=dict)
     registered: dict[str, list[int]] = field(default_factory=dict)
+    rough: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rough_ends: dict[str, BaseException] = field(default_factory=dict)
+    rough_registered: dict[str, list[int]] = field(default_factory=dict)
+    cameras: dict[str, Rigid3] | None = None
 
     def __call__(self, session: Session, *_: Any) -> RunOutput:
         Store(session.store_root)
         params: Any = session.workflow.stages["images"].params
         block, out = session.out.name, session.out
-        self.seen[block] = sorted(path.name for path in params.path.iterdir())
+        images = sorted(path.name for path in params.path.iterdir())
+        if out.parent.name == "rough":
+            self.rough[block] = session.run_options.until
+            if block in self.rough_ends:
+                raise self.rough_ends[block]
+            shutil.rmtree(out, ignore_errors=True)
+            chosen = self.rough_registered.get(block) or [int(name[:3]) for name in images]
+            write_block(out, chosen, some_world(int(block[-1])), cameras=self.cameras)
+            return load(out)
+        self.seen[block] = images
         if block in self.ends:
             raise self.ends[block]
         shutil.rmtree(out, ignore_errors=True)
         chosen = self.registered.get(block) or [int(name[:3]) for name in self.seen[block]]
-        write_block(out, chosen, some_world(int(block[-1])))
+        write_block(out, chosen, some_world(int(block[-1])), cameras=self.cameras)
         stage = StageOutcome(name="images", use="source.folder", params={"path": str(params.path)})
         code = self.codes.get(block, 0)
         update = {"stages": (stage,), "exit_code": code, "stopped": "too few matches" if code == 4 else ""}
@@ -69,7 +94,20 @@ class Runs:
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     found = Runs()
     monkeypatch.setattr("pano_mvs.cli.run.command.run_session", found)
+    monkeypatch.setattr("pano_mvs.session.captures.run_session", found)
     return found
+
+
+@pytest.fixture
+def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which the cloud of at most 15 of the images of `walk`, of one pixel each, fits into memory."""
+    params = Registry.installed().stages["fusion.vote"].params_type()
+    unit = reference_times().expected_unit(
+        "fusion.vote", CaptureSize(15, 1.0), settings=digest_from_value(key_fields(params)[0]), threads=1, whole=True
+    )
+    assert unit is not None
+    limit = "pano_mvs.session.merging.automatic.total_memory_bytes"
+    monkeypatch.setattr(limit, lambda: int(5 * unit.stored_bytes) + 1)
 
 
 @pytest.fixture
@@ -102,9 +140,9 @@ def test_events_name_the_blocks_and_the_end(pano_mvs: Command, runs: Runs, walk:
     assert pano_mvs(*command).code == 0
     *blocks, end = [event for _, event in EventReader(Path("out/blocks")).read()[1]]
     assert blocks == [
-        BlockStarted("block_1", 1, 3, images=12, images_left=24),
-        BlockStarted("block_2", 2, 3, images=12, images_left=12),
-        BlockStarted("block_3", 3, 3, images=12, images_left=0),
+        BlockStarted(f"{folder}block_{number}", number, 3, images=12, images_left=36 - 12 * number)
+        for folder in ("rough/", "")
+        for number in (1, 2, 3)
     ]
     assert isinstance(end, RunFinished)
     assert end.exit_code == 0
@@ -177,11 +215,174 @@ def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command,
     written = Path("out/run.json").read_bytes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pano_mvs.cli.run.command.run_session", run_session)
-        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+        result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", "--block-size", "0")
     assert result.code == 2
     assert "--out out: holds results that were merged from 3 blocks" in result.flat
-    assert "Give --block-size again" in result.flat
+    assert "Leave out --block-size 0" in result.flat
     assert Path("out/run.json").read_bytes() == written
+
+
+STOPPED = RunStoppedError("the disk is full")
+REASON = (
+    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage cloud would take about 0 MB of 0 MB of "
+    "memory; --block-size 0 forbids it"
+)
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_a_capture_that_memory_does_not_hold_is_divided(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.code == 0, result.text
+    assert result.flat.startswith(REASON)
+    assert [*runs.seen] == ["block_1", "block_2", "block_3"]
+    assert len(load(Path("out")).summary.poses.registered) == 26
+    first = EventReader(Path("out/blocks")).read()[1][0][1]
+    assert first == Divided(REASON)
+    assert runs.rough == dict.fromkeys(runs.seen, ("poses",))
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_plan_and_dry_run_say_how_a_capture_is_divided(pano_mvs: Command, walk: Path) -> None:
+    for command in (("plan",), ("run", "--dry-run")):
+        result = pano_mvs(*command, "quickstart", "--images", walk, "--out", "out")
+        assert result.code == 0, result.text
+        assert result.flat.startswith(REASON)
+        assert "block 3 of 3: 11 images, 015.png to 025.png, in out/blocks/block_3" in result.flat
+    assert not Path("out").exists()
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_block_size_0_runs_all_images_at_once(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.ends["out"] = STOPPED
+    pano_mvs("run", "quickstart", "--images", walk, "--out", "out", "--block-size", "0")
+    assert {block: len(names) for block, names in runs.seen.items()} == {"out": 26}
+    assert not runs.rough
+
+
+def test_a_capture_that_memory_holds_is_not_divided(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.ends["out"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.text == "error: the disk is full\n"
+    assert [*runs.seen] == ["out"]
+
+
+def test_the_division_of_an_earlier_run_is_kept(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """Memory differs between machines, and forecasts learn: another division would compute everything again."""
+    runs.ends["block_2"] = RunStoppedError("the disk is full")
+    pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    runs.ends.clear()
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert result.code == 0, result.text
+    assert "out holds blocks of at most 12 images, in which this run continues" in result.flat
+    assert "block 3 of 3" in result.flat
+
+
+@pytest.mark.usefixtures("small_memory")
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--refresh", "depth:001.png"), "cannot be divided into blocks: --only and"),
+        (("--out", "mine"), "cannot be divided into blocks: --out mine: the folder holds something else"),
+    ],
+)
+def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
+    options: tuple[str, str], reason: str, pano_mvs: Command, runs: Runs, walk: Path
+) -> None:
+    Path("mine").mkdir()
+    Path("mine/notes.txt").touch()
+    runs.ends = {"quickstart": STOPPED, "mine": STOPPED}
+    result = pano_mvs("run", "quickstart", "--images", walk, *options)
+    assert result.flat.startswith("warning: all at once, stage cloud would take about")
+    assert reason in result.flat
+    assert len(runs.seen) == 1
+
+
+def test_even_small_blocks_may_not_fit(
+    pano_mvs: Command, runs: Runs, walk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pano_mvs.session.merging.automatic.total_memory_bytes", lambda: 1)
+    runs.ends["out"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
+    assert "even that of blocks of 7 images would not do" in result.flat
+    assert [*runs.seen] == ["out"]
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_the_memory_of_workers_counts(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    command = ("run", "quickstart", "--images", walk, "--out", "out")
+    runs.ends["out"] = STOPPED
+    assert "blocks" not in pano_mvs(*command, "--scheduler", "tcp://nowhere:1").text
+    Path("queue.yaml").write_text("{cores: 8, memory: 64GB, walltime: '04:00:00', jobs: 2}", encoding="utf-8")
+    assert "blocks" not in pano_mvs(*command, "--executor", "slurm", "--queue", "queue.yaml").text
+    assert [*runs.seen] == ["out"]
+
+
+def test_events_of_all_blocks_are_printed(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--json")
+    assert result.code == 0, result.text
+    events = [json.loads(line) for line in result.text.splitlines()]
+    assert [event["event"] for event in events] == [*["block_started"] * 6, "run_finished"]
+    runs.codes["block_2"] = 3
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS, "--json")
+    assert result.code == json.loads(result.text.splitlines()[-1])["exit_code"] == 3
+
+
+@pytest.mark.usefixtures("small_memory")
+def test_a_run_from_python_is_divided_as_well(runs: Runs, walk: Path, tmp_path: Path) -> None:
+    events: list[Event] = []
+    output = pano_mvs_package.run("quickstart", walk, tmp_path / "out", progress=events.append)
+    assert output.out == tmp_path / "out"
+    assert output.summary.merged is not None
+    assert events[0] == Divided(REASON)
+    runs.codes["block_2"] = 4
+    stopped = pano_mvs_package.run("quickstart", walk, tmp_path / "other", block_size=14, block_overlap=4)
+    assert stopped.summary.stopped == "too few matches"
+    assert stopped.out.name == "block_2"
+    runs.ends["out"] = STOPPED
+    (tmp_path / "mine/out").mkdir(parents=True)
+    (tmp_path / "mine/out/notes.txt").touch()
+    warnings: list[Event] = []
+    with pytest.raises(RunStoppedError, match="the disk is full"):
+        pano_mvs_package.run("quickstart", walk, tmp_path / "mine/out", progress=warnings.append)
+    assert isinstance(warnings[0], Warned)
+    with pytest.raises(UsageError, match=r"block_size=5: a block needs at least 7 images"):
+        pano_mvs_package.run("quickstart", walk, block_size=5)
+
+
+def test_blocks_overlap_where_the_path_returns(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """The path goes to and fro, so the last images are beside the first."""
+    centers = [(float(min(idx, 29 - idx)), 0.0, 0.3 * (idx > 14)) for idx in range(30)]
+    rotations = [camera.rotation for camera in walked(30).values()]
+    runs.cameras = {
+        f"{idx:03d}.png": Rigid3.from_center(rotation, center)
+        for idx, (rotation, center) in enumerate(zip(rotations, centers, strict=True))
+    }
+    command = ("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert pano_mvs(*command).code == 0
+    assert sum(int(name[:3]) >= 14 for name in runs.seen["block_1"]) >= 3
+    assert sum(int(name[:3]) < 12 for name in runs.seen["block_3"]) >= 3
+    rough, runs.rough = runs.rough, {}
+    assert len(rough) == 3
+    seen = dict(runs.seen)
+    for again in (command, command[:-4]):
+        assert pano_mvs(*again).code == 0
+        assert not runs.rough, "rough poses are solved once"
+        assert runs.seen == seen
+
+
+def test_without_rough_poses_the_blocks_are_as_they_were(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    """A later stage may correct what does not fit; the last merge says so otherwise."""
+    runs.rough_registered["block_3"] = list(range(20, 26))
+    assert pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS).code == 0
+    assert [len(names) for names in runs.seen.values()] == [12, 12, 12]
+
+
+def test_a_block_without_rough_poses_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
+    runs.rough_ends["block_2"] = STOPPED
+    result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out", *BLOCKS)
+    assert result.code == 4
+    assert "error: rough/block_2: the disk is full" in result.flat
+    assert not runs.seen
 
 
 def test_an_interrupt_ends_the_command(pano_mvs: Command, runs: Runs, walk: Path) -> None:
@@ -203,12 +404,15 @@ def test_blocks_that_cannot_be_merged_are_named(pano_mvs: Command, runs: Runs, w
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (("--block-overlap", "5"), "--block-overlap: only blocks have this. Give --block-size N as well"),
+        (
+            ("--block-size", "0", "--block-overlap", "5"),
+            "--block-overlap: only blocks have this. Give --block-size N as well",
+        ),
         (("--block-loop", "--block-poses", "x"), "--block-loop, --block-poses: only blocks have this"),
         (("--block-size", "5"), "a block needs at least 7 images"),
         (("--block-size", "12", "--block-overlap", "6"), "must be less than half of the size of a block, 12"),
         (("--block-size", "26"), "its 26 images fit into one block of 26. Run them without blocks"),
-        ((*BLOCKS, "--json"), "--json reports one run, and each block is a run"),
+        ((*BLOCKS, "--json", "--dry-run"), "--dry-run prints a table, not events: leave out --json"),
         ((*BLOCKS, "--only", "depth:001.png"), "--images out/blocks/images/block_1 --out out/blocks/block_1"),
         ((*BLOCKS, "--refresh", "depth:001.png"), "name units of one run"),
         ((*BLOCKS, "--until", "features"), "--block-size --until features: blocks are merged by their poses"),

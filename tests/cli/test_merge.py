@@ -84,11 +84,17 @@ def test_a_merge_in_metres_is_corrected_by_its_blocks(pano_mvs: Command, merged:
     assert "is in metres (metres, by GPS). To correct the lengths, correct each block" in result.flat
 
 
-@pytest.mark.parametrize("command", [("status",), ("inspect", "000.png", "1", "1")])
-def test_commands_that_need_a_workflow_name_the_blocks(
-    command: tuple[str, ...], pano_mvs: Command, merged: Path
-) -> None:
-    result = pano_mvs(command[0], merged, *command[1:])
+def test_the_status_of_merged_blocks_is_that_of_each(pano_mvs: Command, merged: Path) -> None:
+    result = pano_mvs("status", merged)
+    assert result.code == 0, result.text
+    assert result.flat.startswith("merged ")
+    assert "from 2 blocks: exit code 0" in result.flat
+    for name in ("one", "two"):
+        assert f"block {merged.parent / name}: latest run" in result.flat
+
+
+def test_a_command_that_needs_a_workflow_names_the_blocks(pano_mvs: Command, merged: Path) -> None:
+    result = pano_mvs("inspect", merged, "000.png", "1", "1")
     assert result.code == 2
     assert f"is merged from blocks, each of which is a run of its own. Give a block: {merged.parent}" in result.flat
 

@@ -13,6 +13,7 @@ from pano_mvs.results.records import Finding, Tile, Verdict
 from pano_mvs.session.event_log import EVENTS_FILE, EventLog, EventReader, event_from_line, line_from_event
 from pano_mvs.session.progress import (
     BlockStarted,
+    Divided,
     Event,
     Forecast,
     KernelsCompiled,
@@ -42,6 +43,7 @@ EVENTS: tuple[Event, ...] = (
     StageFinished("depth", "depth.sweep", 4, 3, 0, 1, 0, 2.0, 4.0, {"kept": 0.5}),
     TimeLeft(12.5, at_least=True, done=0.25, unknown=("depth",)),
     Warned("disk"),
+    Divided("26 panoramas are run in 3 blocks"),
     BlockStarted("block_2", 2, 3, images=12, images_left=12),
     RunFinished(3, "", run=3, failed=1, seconds=9.0, out=Path("out"), verdict=VERDICT, doubts={"a": "b"}),
 )

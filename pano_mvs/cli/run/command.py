@@ -5,8 +5,9 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from types import FrameType
 from typing import TextIO
 
@@ -14,9 +15,10 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
+from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.event_log import line_from_event
-from pano_mvs.session.progress import Event
+from pano_mvs.session.progress import Event, Progress, ignore
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
@@ -24,13 +26,34 @@ from pano_mvs.session.session import Session
 
 def run_workflow(session: Session, execution: Execution, *, as_json: bool = False) -> int:
     """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code."""
+    if as_json:
+        return run_with_events(partial(run_session, session, execution)).summary.exit_code
     stream = apart(sys.stdout)
     try:
         with interrupted_by_termination():
-            if as_json:
-                with redirect_stdout(sys.stderr):  # a plugin may print in this process
-                    return run_session(session, execution, JsonEvents(stream)).summary.exit_code
             return run_shown(session, execution, Console(file=stream), advise=True).exit_code
+    finally:
+        if stream is not sys.stdout:
+            stream.close()
+
+
+def run_with_events(run: Callable[[Progress], RunOutput], watch: Progress = ignore) -> RunOutput:
+    """Call a function that runs something with a callback for events, print these, and return its output.
+
+    Args:
+        run: the function.
+        watch: receives the events as well.
+    """
+    stream = apart(sys.stdout)
+    events = JsonEvents(stream)
+
+    def report(event: Event) -> None:
+        events(event)
+        watch(event)
+
+    try:
+        with interrupted_by_termination(), redirect_stdout(sys.stderr):  # a plugin may print in this process
+            return run(report)
     finally:
         if stream is not sys.stdout:
             stream.close()

@@ -91,6 +91,42 @@ def forecast(
     )
 
 
+def expected_memory(
+    workflow: Workflow, graph: Graph, *, size: CaptureSize, histories: Sequence[UnitTimes], threads: int
+) -> dict[str, float]:
+    """Return the bytes that the units for the whole capture are expected to need in memory, by stage.
+
+    Only stages that declare it are included, unless the workflow states the memory of a unit.
+
+    Args:
+        workflow: that would be run.
+        graph: likewise.
+        size: of the capture.
+        histories: as in `forecast`.
+        threads: that a unit may use.
+    """
+    found = {}
+    for name in graph.order:
+        entry = workflow.stages[name]
+        if entry.spec.expected_memory is not None and not entry.policy.memory_bytes:
+            unit = _expected_unit(entry, Axis.ONE, size=size, histories=histories, threads=threads)
+            stored_bytes = 0.0 if unit is None else unit.stored_bytes
+            found[name] = entry.spec.expected_memory(entry.params, size.images, stored_bytes)
+    return found
+
+
+def _expected_unit(
+    entry: StageEntry, axis: Axis, *, size: CaptureSize, histories: Sequence[UnitTimes], threads: int
+) -> ExpectedUnit | None:
+    """Return what a unit is expected to take, by the first history that has samples of the stage."""
+    settings, whole = settings_digest(entry), axis is Axis.ONE
+    found = (
+        history.expected_unit(entry.spec.name, size, settings=settings, threads=threads, whole=whole)
+        for history in histories
+    )
+    return next((one for one in found if one is not None), None)
+
+
 def _of_stage(
     plan: StagePlan,
     entry: StageEntry,
@@ -102,16 +138,12 @@ def _of_stage(
     histories: Sequence[UnitTimes],
     threads: int,
 ) -> StageForecast:
-    settings, whole = settings_digest(entry), axis is Axis.ONE
-    found = (
-        history.expected_unit(plan.use, size, settings=settings, threads=threads, whole=whole) for history in histories
-    )
-    unit: ExpectedUnit | None = next((one for one in found if one is not None), None)
+    unit = _expected_unit(entry, axis, size=size, histories=histories, threads=threads)
     return StageForecast(
         plan.name,
         after,
         cached=len(plan.cached),
-        units=_units(plan, axis, size.images, index=index, histories=histories, settings=settings),
+        units=_units(plan, axis, size.images, index=index, histories=histories, settings=settings_digest(entry)),
         unit_s=None if unit is None else unit.seconds,
         unit_bytes=None if unit is None else unit.stored_bytes,
     )

@@ -117,6 +117,10 @@ MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
 ExpectedUnits = Callable[[Any, int], int]
 """Returns the number of units that an index is expected to hold, given its params and the number of images."""
 
+ExpectedMemory = Callable[[Any, int, float], float]
+"""Returns the bytes that the one unit of a stage is expected to need in memory, before any of its inputs exists, given
+its params, the number of images and the bytes that it is expected to store."""
+
 
 @dataclass(frozen=True, slots=True)
 class StageSpec:
@@ -138,6 +142,7 @@ class StageSpec:
         every_image: whether the stage has a unit for images without neighbours as well; see `stage`.
         needs: distributions that must be installed, by the module that each provides.
         expected_units: of a stage that returns an index, for plans; None if only earlier runs show it.
+        expected_memory: of a stage with one unit, whose memory grows with the capture; None if it does not.
     """
 
     name: str
@@ -155,6 +160,7 @@ class StageSpec:
     every_image: bool = False
     needs: Mapping[str, str] = field(default_factory=dict)
     expected_units: ExpectedUnits | None = None
+    expected_memory: ExpectedMemory | None = None
 
     @property
     def doc(self) -> str:
@@ -209,6 +215,7 @@ def stage(
     every_image: bool = False,
     needs: Mapping[str, str] | None = None,
     expected_units: ExpectedUnits | None = None,
+    expected_memory: ExpectedMemory | None = None,
 ) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
@@ -228,6 +235,10 @@ def stage(
     `expected_units` is for a stage that returns an index, such as the pairs to match: a function `(params, images) ->
     units` by which `plan` states the work of the stages that follow it, before the index exists.
 
+    `expected_memory` is for a stage with one unit whose memory grows with the number of images: a function `(params,
+    images, stored_bytes) -> bytes`, by which `run` divides captures into blocks before any input of the unit exists.
+    `stored_bytes` is the expected size of its result; 0 if no earlier run shows it.
+
     Raises:
         PluginError: if the function does not have the signature of a stage.
     """
@@ -237,7 +248,13 @@ def stage(
         spec = _spec(name, function, signature, version=version, memory=memory)
         if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
             raise PluginError(f"stage {name!r} ({spec.origin}): every_image needs ports annotated Each and Near")
-        spec = replace(spec, every_image=every_image, needs=dict(needs or {}), expected_units=expected_units)
+        spec = replace(
+            spec,
+            every_image=every_image,
+            needs=dict(needs or {}),
+            expected_units=expected_units,
+            expected_memory=expected_memory,
+        )
         setattr(function, _ATTRIBUTE, spec)
         return function
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks import divide_capture
 from pano_mvs.core.errors import InputError, StoreError, UsageError
-from pano_mvs.core.files import OUTPUT_MARK, remove_whole
+from pano_mvs.core.files import OUTPUT_MARK, read_regular, remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import files_of
@@ -89,12 +90,7 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
         UsageError: if a setting cannot be used, or all images fit into one block.
         InputError: if there are no images, or the poses are of other images.
     """
-    left_out = [path.absolute() for path in ignored]
-    names = tuple(
-        path.relative_to(images).as_posix()
-        for path in list_pictures(images)
-        if not any(path.absolute().is_relative_to(place) for place in left_out)
-    )
+    names = tuple(path.relative_to(images).as_posix() for path in _pictures(images, ignored))
     positions = None if division.poses is None else _positions(division.poses, names)
     blocks = divide_capture(
         names, size=division.size, overlap=division.overlap, loop=division.loop, positions=positions
@@ -104,6 +100,12 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
             f"{images}: its {len(names)} images fit into one block of {division.size}. Run them without blocks"
         )
     return [tuple(block) for block in blocks]
+
+
+def _pictures(images: Path, ignored: Sequence[Path]) -> list[Path]:
+    left_out = [path.absolute() for path in ignored]
+    found = list_pictures(images)
+    return [path for path in found if not any(path.absolute().is_relative_to(place) for place in left_out)]
 
 
 def link_blocks(images: Path, to: Path, blocks: Sequence[Sequence[str]]) -> list[ImageBlock]:
@@ -155,15 +157,21 @@ class BlockRun:
     Attributes:
         session: the workflow over its images.
         names: of its images, in the order of the capture.
+        folder: of all blocks; the block's output folder is in it.
+        number: of the block, from 1.
+        blocks: number of all blocks.
     """
 
     session: Session
     names: tuple[str, ...]
+    folder: Path
+    number: int
+    blocks: int
 
     @property
     def name(self) -> str:
-        """Name of the block, such as block_1."""
-        return self.session.out.name
+        """Name of the block, such as block_1: its output folder in that of all blocks."""
+        return self.session.out.relative_to(self.folder).as_posix()
 
 
 def divided(session: Session, division: Division) -> list[tuple[str, ...]]:
@@ -175,18 +183,41 @@ def divided(session: Session, division: Division) -> list[tuple[str, ...]]:
     """
     check_output(session)
     require_free(session.out)
-    _require_mergeable(session)
+    require_mergeable(session)
+    return divide_images(_images(session), division, ignored=_ignored(session))
+
+
+def pictures_of(session: Session) -> list[Path]:
+    """Return the images of a capture that can be divided; none if it is not read from a folder of images.
+
+    Raises:
+        InputError: if the folder has no images.
+    """
+    entry = session.workflow.stages.get("images")
+    return [] if entry is None or entry.spec.name != _SOURCE else _pictures(_images(session), _ignored(session))
+
+
+def _ignored(session: Session) -> list[Path]:
     params = session.workflow.stages["images"].params
-    ignored = [path for name, paths in files_of(params).items() if name != "path" for path in paths]
-    return divide_images(_images(session), division, ignored=ignored)
+    return [path for name, paths in files_of(params).items() if name != "path" for path in paths]
+
+
+_DIVISION = "division.json"
+
+
+def earlier_division(out: Path) -> Division | None:
+    """Return the division of an earlier run in blocks into an output folder; None without one."""
+    try:
+        value = json.loads(read_regular(out / BLOCKS / _DIVISION))
+        poses = None if value["poses"] is None else Path(value["poses"])
+        return Division(int(value["size"]), int(value["overlap"]), bool(value["loop"]), poses)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 @contextmanager
-def open_blocks(session: Session, blocks: Sequence[tuple[str, ...]]) -> Iterator[list[BlockRun]]:
-    """Write the links to the images of the blocks, and yield the blocks; no other command may run them meanwhile.
-
-    The links and the output folders are in `blocks` in the output folder of the session. Links of an earlier division
-    are replaced; results stay.
+def open_blocks(session: Session) -> Iterator[Path]:
+    """Make the folder of the blocks, `blocks` in the output folder of a session; no other run may use it meanwhile.
 
     Raises:
         StoreError: if another run holds the folder, or it cannot be written.
@@ -198,18 +229,42 @@ def open_blocks(session: Session, blocks: Sequence[tuple[str, ...]]) -> Iterator
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written ({error.strerror}). Choose another folder with --out") from error
     with output_lock(folder):
-        remove_whole(folder / "images")
-        yield block_runs(session, blocks, folder)
+        yield folder
 
 
-def block_runs(session: Session, blocks: Sequence[tuple[str, ...]], folder: Path) -> list[BlockRun]:
-    """Write the links to the images of the blocks below a folder, and return the blocks.
+def remember_division(division: Division, out: Path) -> None:
+    """Store the division of a run in blocks in its output folder, for `earlier_division`."""
+    write_text(out / BLOCKS / _DIVISION, json.dumps(asdict(division), default=str))
+
+
+def block_runs(
+    session: Session, blocks: Sequence[tuple[str, ...]], folder: Path, *, within: str = ""
+) -> list[BlockRun]:
+    """Write the links to the images of the blocks below a folder, in place of earlier ones, and return the blocks.
+
+    Args:
+        session: over the whole capture.
+        blocks: the images of each.
+        folder: of all blocks.
+        within: folder in it in which the links and the results are.
 
     Raises:
         StoreError: if a link cannot be made.
     """
-    linked = link_blocks(_images(session), folder / "images", blocks)
-    return [BlockRun(_over(session, block.folder, folder / block.folder.name), block.names) for block in linked]
+    place = folder / within
+    remove_whole(place / "images")
+    linked = link_blocks(_images(session), place / "images", blocks)
+    return [
+        BlockRun(_over(session, block.folder, place / block.folder.name), block.names, folder, number, len(linked))
+        for number, block in enumerate(linked, start=1)
+    ]
+
+
+def first_poses(session: Session) -> Session:
+    """Return the session limited to the first stage that makes poses."""
+    workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
+    stage = chain_of(workflow, graph, Poses)[0]
+    return replace(session, run_options=replace(session.run_options, until=(stage,)))
 
 
 def _over(session: Session, images: Path, out: Path) -> Session:
@@ -232,7 +287,12 @@ def _images(session: Session) -> Path:
     return path
 
 
-def _require_mergeable(session: Session) -> None:
+def require_mergeable(session: Session) -> None:
+    """Check that a session can be run in blocks.
+
+    Raises:
+        UsageError: if it cannot.
+    """
     entry = session.workflow.stages.get("images")
     if entry is None or entry.spec.name != _SOURCE:
         use = "no stage of this name" if entry is None else entry.spec.name

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.blocks import MergedBlocks, nearest_owners
+from pano_mvs.algorithms.blocks import MergedBlocks, nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.core.files import copy_file, replacing, write_text
@@ -258,12 +258,22 @@ class MergeFiles:
         return path
 
     def _cloud_parts(self) -> Iterator[PointCloud]:
-        centers = self.merged.poses.centers
+        merged = self.merged
+        centers = (merged.before or merged.poses).centers
         for number, (block, similarity) in enumerate(zip(self.blocks, self.world_from_block, strict=True)):
             for part in block.cloud_parts():
                 moved = _moved(part, similarity)
-                own = nearest_owners(moved.points_in_world, centers, self.merged.owner) == number
-                yield _selected(moved, own)
+                camera_idx = nearest_cameras(moved.points_in_world, centers)
+                own = merged.owner[camera_idx] == number
+                moved, camera_idx = _selected(moved, own), camera_idx[own]
+                if merged.before is not None:
+                    points, normals = merged.move(moved.points_in_world, moved.normals_in_world, camera_idx)
+                    moved = replace(
+                        moved,
+                        points_in_world=points.astype(np.float32),
+                        normals_in_world=normals.astype(np.float32),
+                    )
+                yield moved
 
     def _image_path(self, name: str, number: int) -> str:
         path = self.blocks[number].run.summary.source_file(name)

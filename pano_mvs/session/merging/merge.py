@@ -8,8 +8,19 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 import pano_mvs
-from pano_mvs.algorithms.blocks import MIN_COMMON, BlockAlignment, BlockLink, MergedBlocks, align_blocks, merge_blocks
+from pano_mvs.algorithms.blocks import (
+    MIN_COMMON,
+    BlockAlignment,
+    BlockLink,
+    MergedBlocks,
+    adjust_merged,
+    align_blocks,
+    camera_spacing,
+    merge_blocks,
+)
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.core.files import OUTPUT_MARK
@@ -33,6 +44,7 @@ from pano_mvs.session.merging.files import Block, MergeFiles, load_blocks
 from pano_mvs.session.summarise import poses_summary
 
 _STAGE = "merge"
+_ADJUSTS = "poses.refine"  # without it, blocks have poses that are to be kept
 _MERGED_NAMES = {
     *(OUTPUT_MARK, LOCK_NAME, BLOCKS, "cloud.ply", "colmap", "transforms.json", "poses.json"),
     *("range", "confidence", "uncertainty", "preview"),
@@ -87,6 +99,8 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     similarities = [similarity for similarity in alignment.world_from_block if similarity is not None]
     order = sorted({name for block in blocks for name in block.poses.names}, key=natural_key)
     merged = merge_blocks([block.poses for block in blocks], similarities, order=order, reference=reference)
+    if all(any(stage.use == _ADJUSTS for stage in block.run.summary.stages) for block in blocks):
+        merged = adjust_merged(merged)
     doubts = camera_doubts(blocks, alignment)
     merged = replace(merged, poses=replace(merged.poses, doubts={**merged.poses.doubts, **doubts}))
     to.mkdir(parents=True, exist_ok=True)
@@ -137,7 +151,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
     points = files.write_cloud()
     files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    notes = _notes(blocks, alignment)
+    notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged))
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     rejected = _rejected(blocks, poses)
     warnings = (*_disagreements(blocks, alignment), *_failures(blocks, rejected))
@@ -219,6 +233,16 @@ def _notes(blocks: Sequence[Block], alignment: BlockAlignment) -> tuple[str, ...
                 f"{plural(count, 'is', 'are')} not merged"
             )
     return (*notes, *scale_notes(blocks, alignment))
+
+
+def _adjustment_notes(merged: MergedBlocks) -> list[str]:
+    if merged.before is None:
+        return []
+    moved = np.linalg.norm(merged.poses.centers - merged.before.centers, axis=1) / camera_spacing(merged.before.centers)
+    return [
+        f"all {len(moved)} cameras were adjusted together; they moved by {_small(100 * float(np.median(moved)))} % of "
+        f"the distance between neighbouring cameras in the median, and by {_small(100 * float(moved.max()))} % at most"
+    ]
 
 
 def _links(blocks: Sequence[Block]) -> tuple[PairLink, ...]:

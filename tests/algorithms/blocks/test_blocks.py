@@ -45,8 +45,10 @@ def test_blocks_share_images_where_the_path_returns() -> None:
     closed = divide_capture(NAMES[:100], size=40, overlap=6, positions=places)
     assert len(plain) == len(closed) == 3
     assert not set(plain[0]) & set(plain[2])
-    assert 3 <= len(set(closed[0]) & set(closed[2])) <= 6
     assert all(set(before) <= set(after) for before, after in zip(plain, closed, strict=True))
+    assert all(len(set(after) - set(before)) <= 6 for before, after in zip(plain, closed, strict=True))
+    assert len(set(closed[0]) - set(plain[0]) - set(plain[1])) == 3
+    assert len(set(closed[0]) & set(plain[1]) - set(plain[0])) == 3, "the next block comes back, too"
 
 
 def test_settings_that_cannot_work() -> None:

@@ -15,8 +15,8 @@ from pano_mvs.results.records import CloudSummary, Finding, StageOutcome, Verdic
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.captures import run as run_workflow
 from pano_mvs.session.commands import reopen, run_command
-from pano_mvs.session.running import run as run_workflow
 from pano_mvs.session.session import open_session
 from tests.cli.conftest import Command
 from tests.engine.conftest import Toy, toy

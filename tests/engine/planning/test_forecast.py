@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize, Sample, UnitTimes
-from pano_mvs.engine.planning.forecast import StageForecast, forecast, makespan, settings_digest
+from pano_mvs.engine.planning.forecast import StageForecast, expected_memory, forecast, makespan, settings_digest
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.resolve import SourceListing
+from pano_mvs.engine.workflows.workflow import Workflow
 from tests.engine.conftest import Toy, toy
 
 __all__ = ["toy"]
@@ -74,6 +76,26 @@ def test_the_first_history_with_the_stage_counts(toy: Toy) -> None:
     unit_s = forecast_of(toy, "scaled.by=8")["scaled"].unit_s
     assert unit_s is not None
     assert unit_s != 99.0
+
+
+def test_the_memory_of_stages_for_the_whole_capture_grows_with_it(toy: Toy) -> None:
+    """Without experience, and where a stage does not declare it, nothing is known."""
+    session, reference = toy.session(), UnitTimes(toy.folder / "reference.json")
+    entry = session.workflow.stages["all"]
+    spec = replace(entry.spec, expected_memory=lambda _params, images, stored_bytes: 1000 * images + 3 * stored_bytes)
+    stages = {**session.workflow.stages, "all": replace(entry, spec=spec)}
+    workflow = replace(session.workflow, stages=stages)
+
+    def memory(images: int, workflow: Workflow = workflow) -> dict[str, float]:
+        size = CaptureSize(images, 2.0)
+        return expected_memory(workflow, session.graph, size=size, histories=(reference,), threads=1)
+
+    assert memory(10) == {"all": 10_000.0}
+    reference.add(spec.name, Sample(settings_digest(entry), 1, 5, 1.0, 1, seconds=9.0, stored_bytes=100.0))
+    assert memory(10) == {"all": 10_000.0 + 3 * 400.0}
+    assert memory(10, session.workflow) == {}
+    stated = replace(stages["all"], policy=entry.policy.model_copy(update={"memory": "2GB"}))
+    assert memory(10, replace(workflow, stages={**stages, "all": stated})) == {}, "the workflow knows better"
 
 
 def test_the_slowest_of_four_units_is_left_out_of_what_is_remembered(toy: Toy) -> None:

@@ -10,18 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.blocks import nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, similarity_from_points
+from pano_mvs.io.colmap.writer import write_colmap_model
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import Poses
 from pano_mvs.session.merging.files import MergeFiles, load_blocks
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
-from tests.session.merging.written_blocks import CLOUD, RANGE, write_block
+from tests.session.merging.written_blocks import CLOUD, RANGE, SIZE_HW, write_block
 
 RANGES = (range(14), range(8, 24), range(20, 34))
 """A closed walk of 30 cameras in three blocks; the last one meets the first."""
@@ -308,3 +311,57 @@ def test_a_run_of_a_newer_version_is_refused(folder: Path, tmp_path: Path) -> No
     (tmp_path / "block_0/run.json").write_text(json.dumps(run | {"schema": 99}))
     with pytest.raises(InputError, match=r"written by a newer version of pano_mvs \(schema 99"):
         merge_outputs([tmp_path / "block_0", folder / "block_1"], tmp_path / "merged")
+
+
+def bent_blocks(folder: Path, use: str) -> list[Path]:
+    """Write blocks that bend differently, although their observations are exact; they end with this stage."""
+    for number, chosen in enumerate(RANGES):
+        out = folder / f"block_{number}"
+        poses = write_block(out, list(chosen), some_world(number))
+        cameras = bent(poses.cameras, turn_deg=0.1 * (number + 1), stretch=0.001).values()
+        centers = [camera.center for camera in cameras]
+        rotations = np.array([camera.rotation for camera in cameras])
+        found = replace(poses, rotations=rotations, translations=-np.einsum("nij,nj->ni", rotations, centers))
+        write_colmap_model(out / "colmap/sparse/0", found, dict.fromkeys(poses.names, SIZE_HW))
+        stage = StageOutcome(name="last", use=use)
+        RunSummary.read(out).model_copy(update={"stages": (stage,)}).write(out)
+    return [folder / f"block_{number}" for number in range(len(RANGES))]
+
+
+def test_blocks_that_were_adjusted_are_adjusted_together(tmp_path: Path) -> None:
+    outs = bent_blocks(tmp_path, "poses.refine")
+    found = merge_outputs(outs, tmp_path / "merged").merged
+    assert found.before is not None
+    truth = np.array([camera.center for camera in walk(30).values()])
+
+    def worst(poses: Poses) -> float:
+        moved = similarity_from_points(poses.centers, truth).apply(poses.centers)
+        return float(np.linalg.norm(moved - truth, axis=1).max())
+
+    assert worst(found.poses) < 0.1 * worst(found.before)
+    np.testing.assert_allclose(similarity_from_points(found.before.centers, found.poses.centers).scale, 1, atol=1e-6)
+    summary = load(tmp_path / "merged").summary
+    assert any("all 30 cameras were adjusted together" in note for note in summary.notes)
+    np.testing.assert_allclose(read_poses(tmp_path / "merged").centers, found.poses.centers, atol=1e-5)
+
+
+def test_the_cloud_moves_with_the_cameras(tmp_path: Path) -> None:
+    """A point stays where its camera sees it: the ranges of the camera do not change."""
+    outs = bent_blocks(tmp_path, "poses.refine")
+    found = merge_outputs(outs, tmp_path / "merged").merged
+    assert found.before is not None
+    rng = np.random.default_rng(3)
+    points, normals = rng.normal(0, 5, (40, 3)), rng.normal(size=(40, 3))
+    idx = rng.integers(30, size=40)
+    moved, turned = found.move(points, normals, idx)
+    for camera, *vectors in zip(idx, points, normals, moved, turned, strict=True):
+        before, after = found.before.cam_from_world(camera), found.poses.cam_from_world(camera)
+        np.testing.assert_allclose(after.apply(vectors[2]), before.apply(vectors[0]), atol=1e-9)
+        np.testing.assert_allclose(after.rotation @ vectors[3], before.rotation @ vectors[1], atol=1e-9)
+    cloud = read_ply(tmp_path / "merged/cloud.ply").points_in_world
+    plain = merge_outputs(bent_blocks(tmp_path / "kept", "poses.from_model"), tmp_path / "plain").merged
+    still = read_ply(tmp_path / "plain/cloud.ply").points_in_world
+    assert plain.before is None, "known poses are kept"
+    assert np.abs(cloud - still).max() > 0.01
+    followed, _ = found.move(still, still, nearest_cameras(still, found.before.centers))
+    np.testing.assert_allclose(cloud, followed, atol=1e-4)
