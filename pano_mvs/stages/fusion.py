@@ -40,8 +40,7 @@ class FusionParams(Params):
     """Settings of `fusion.vote`."""
 
 
-# Measured: the parts of the cloud, their join, and the cells of the points that are smoothed.
-@stage("fusion.vote", expected_memory=lambda _params, _images, stored_bytes: 5 * stored_bytes)
+@stage("fusion.vote")
 def vote(
     ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: FusionParams, ctx: Context
 ) -> PointCloud:

@@ -100,14 +100,18 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
 
 @pytest.fixture
 def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine on which the cloud of at most 15 of the images of `walk`, of one pixel each, fits into memory."""
-    params = Registry.installed().stages["fusion.vote"].params_type()
+    """A machine on which at most 15 of the images of `walk`, of one pixel each, are solved within memory."""
+    params = Registry.installed().stages["poses.scaled_translation"].params_type()
     unit = reference_times().expected_unit(
-        "fusion.vote", CaptureSize(15, 1.0), settings=digest_from_value(key_fields(params)[0]), threads=1, whole=True
+        "poses.scaled_translation",
+        CaptureSize(15, 1.0),
+        settings=digest_from_value(key_fields(params)[0]),
+        threads=1,
+        whole=True,
     )
     assert unit is not None
     limit = "pano_mvs.session.merging.automatic.total_memory_bytes"
-    monkeypatch.setattr(limit, lambda: int(5 * unit.stored_bytes) + 1)
+    monkeypatch.setattr(limit, lambda: int(12 * unit.stored_bytes) + 1)
 
 
 @pytest.fixture
@@ -224,7 +228,7 @@ def test_a_run_without_blocks_does_not_replace_merged_results(pano_mvs: Command,
 
 STOPPED = RunStoppedError("the disk is full")
 REASON = (
-    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage cloud would take about 0 MB of 0 MB of "
+    "26 panoramas are run in 3 blocks of at most 11, since all at once, stage poses would take about 0 MB of 0 MB of "
     "memory; --block-size 0 forbids it"
 )
 
@@ -292,7 +296,7 @@ def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
     Path("mine/notes.txt").touch()
     runs.ends = {"quickstart": STOPPED, "mine": STOPPED}
     result = pano_mvs("run", "quickstart", "--images", walk, *options)
-    assert result.flat.startswith("warning: all at once, stage cloud would take about")
+    assert result.flat.startswith("warning: all at once, stage poses would take about")
     assert reason in result.flat
     assert len(runs.seen) == 1
 
