@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.structure.lay import lay_structure
-from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY
+from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_of
 from pano_mvs.algorithms.structure.planes import find_structure
+from pano_mvs.algorithms.structure.view import ScenePlane, plane_view
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap
@@ -122,6 +123,24 @@ def test_walls_without_any_match_stand_where_their_creases_are(turn_deg: float) 
     assert (result.confidence[wall] < 128).all()
     confirmed = replace(box.maps["0.png"], confidence=np.full(wall.shape, TRUSTED, np.uint8))
     np.testing.assert_array_equal(box.laid(structure, range_map=confirmed).range[wall], confirmed.range[wall])
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_of_two_rooms_of_one_shape_the_supported_one_is_taken(box: Box, first: bool) -> None:
+    """Seen from the camera, both have their creases at the same pixels."""
+    center = np.array(CENTERS[0])
+    right, smaller = [], []
+    for normal in np.concatenate([np.eye(3), -np.eye(3)]):
+        offset, at = float(-np.abs(normal) @ HALF), float(normal @ center)
+        is_level = normal[1] != 0
+        right.append(ScenePlane(normal, offset, 2.0, 0.0, uncertainty=0.01, is_level=is_level))
+        smaller.append(ScenePlane(normal, at + 0.9 * (offset - at), 1.0, 0.0, uncertainty=0.01, is_level=is_level))
+    planes = right + smaller if first else smaller + right
+    own = box.maps["0.png"]
+    unsure = replace(own, confidence=np.full(SIZE, FILLED_CONFIDENCE[1], np.uint8))
+    room = room_of(plane_view(unsure, lambda: box.pictures["0.png"], box.cams["0.png"]), planes)
+    assert room is not None
+    assert planes[room.floor].support == planes[room.ceiling].support == 2
 
 
 def test_what_stands_before_a_wall_stays(box: Box, planes: Structure) -> None:

@@ -43,7 +43,7 @@ _DISTANCES = np.geomspace(0.35, 9.0, 110)
 _TURNS_RAD, _FINE_TURNS_RAD = np.radians(np.arange(0.0, 90.0, 3.0)), np.radians(np.arange(-2.0, 2.1, 1.0))
 # The turn is searched at every fourth azimuth of some views, with planes that are clear over 36°.
 _TURN_VIEWS, _TURN_STEP, _TURN_SPAN = 6, 4, 9
-_LEAST_MARGIN, _MOST_ROOMS = 0.1, 6
+_LEAST_MARGIN, _MOST_ROOMS, _NEARLY = 0.1, 6, 0.95
 _SAME_RAD, _SAME_DISTANCE = np.radians(4.0), 0.05
 OUTLINE_UNCERTAINTY = 0.03
 """Relative standard deviation of ranges on a wall that creases of single views alone show."""
@@ -135,9 +135,8 @@ def room_of(view: PlaneView, planes: Sequence[ScenePlane]) -> Room | None:
     one = _around(view, planes)
     if not upright or not one.rooms:
         return None
-    tried = [(room, *_known_walls(one, planes, room)) for room in one.rooms]
-    (floor, ceiling), distance, clear = max(tried, key=lambda found: float(np.maximum(found[2].max(axis=0), 0).sum()))
-    walls = best_walls(clear, distance)
+    (floor, ceiling), distance, clarity = _clearest([(room, *_known_walls(one, planes, room)) for room in one.rooms])
+    walls = best_walls(clarity, distance)
     return Room(floor, ceiling, np.where(walls < 0, -1, np.array(upright)[walls]))
 
 
@@ -175,6 +174,9 @@ def outline_planes(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> 
     return found
 
 
+_Tried = tuple[tuple[int, int], FloatArray, FloatArray]  # floor and ceiling, level distances, and clarity of walls
+
+
 class _Around(NamedTuple):
     """A view, what it shows, and the pairs of level planes that may be floor and ceiling, best first."""
 
@@ -200,6 +202,15 @@ def _rooms(planes: Sequence[ScenePlane], center: FloatArray) -> list[tuple[int, 
     )
     pairs = [(floor, ceiling) for floor in floors for ceiling in ceilings]
     return sorted(pairs, key=lambda pair: -planes[pair[0]].support * planes[pair[1]].support)[:_MOST_ROOMS]
+
+
+def _clearest(tried: Sequence[_Tried]) -> _Tried:
+    """Return the first of some rooms whose creases are nearly as clear as those of the clearest.
+
+    A room and a smaller one of the same shape look the same in one view, so that support decides.
+    """
+    totals = [float(np.maximum(clarity.max(axis=0), 0).sum()) for _, _, clarity in tried]
+    return next(found for found, total in zip(tried, totals, strict=True) if total >= _NEARLY * max(totals))
 
 
 def _total(around: Sequence[_Around], planes: Sequence[ScenePlane], turn: float) -> float:
@@ -242,8 +253,7 @@ def _known_walls(one: _Around, planes: Sequence[ScenePlane], room: tuple[int, in
 def _walls_of(one: _Around, planes: Sequence[ScenePlane], turn: float) -> list[tuple[float, ScenePlane, FloatArray]]:
     """Return the walls of a view that are clearer than those at other distances, with weights and the centre."""
     center = one.view.cam_from_world.center
-    tried = [(room, *_search(one, planes, room, turn)) for room in one.rooms]
-    room, distance, clarity = max(tried, key=lambda found: float(found[2].max(axis=0).sum()))
+    room, distance, clarity = _clearest([(room, *_search(one, planes, room, turn)) for room in one.rooms])
     down, up = _heights(one, planes, room)
     searched, (known, known_clarity) = len(distance), _known_walls(one, planes, room)
     distance, clarity = np.concatenate([distance, known]), np.concatenate([clarity, known_clarity])
