@@ -247,7 +247,7 @@ def plan(
         return
     decision = decide_blocks(session, Execution())
     if decision.division is not None:
-        show_blocks(session, decision, Console(), show_plan)
+        show_blocks(session, decision, Console(), show=show_plan)
         return
     if decision.reason:
         Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")

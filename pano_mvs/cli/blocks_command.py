@@ -52,7 +52,7 @@ def run_blocks_shown(
     if dry_run:
         if as_json:
             raise UsageError("--dry-run prints a table, not events: leave out --json")
-        show_blocks(session, decision, Console(), partial(show_dry_run, execution=execution, as_json=False))
+        show_blocks(session, decision, Console(), show=partial(show_dry_run, execution=execution, as_json=False))
         return 0
     if as_json:
         return _run_with_events(session, execution, decision)
@@ -80,7 +80,7 @@ def _run_with_events(session: Session, execution: Execution, decision: BlockDeci
         if isinstance(event, RunFinished):
             codes.append(event.exit_code)
 
-    run_with_events(lambda progress: run_in_blocks(session, execution, decision, progress), watch)
+    run_with_events(lambda progress: run_in_blocks(session, execution, decision, progress=progress), watch)
     return codes[-1]
 
 
@@ -129,7 +129,7 @@ def _merge(outs: Sequence[Path], *, session: Session, console: Console) -> int:
 
 
 def show_blocks(
-    session: Session, decision: BlockDecision, console: Console, show: Callable[[Session, Console], object]
+    session: Session, decision: BlockDecision, console: Console, *, show: Callable[[Session, Console], object]
 ) -> None:
     """Print why a capture is divided, and the plan of each block with the results that are cached now.
 

@@ -106,13 +106,13 @@ def run(
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=poses)
     progress = progress or ignore
     if decision.division is not None:
-        return run_in_blocks(session, execution, decision, progress)
+        return run_in_blocks(session, execution, decision, progress=progress)
     if decision.reason:
         progress(Warned(decision.reason))
     return run_session(session, execution, progress)
 
 
-def run_in_blocks(session: Session, execution: Execution, decision: BlockDecision, progress: Progress) -> RunOutput:
+def run_in_blocks(session: Session, execution: Execution, decision: BlockDecision, *, progress: Progress) -> RunOutput:
     """Run a workflow for each block of its images, merge the blocks, and return the merged output.
 
     If the run of a block ends early, its output is returned.

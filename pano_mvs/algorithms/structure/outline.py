@@ -217,7 +217,7 @@ def _total(around: Sequence[_Around], planes: Sequence[ScenePlane], turn: float)
     """Return how clear the creases of the clearest walls of four directions are around some views."""
     total = 0.0
     for one in around:
-        clarity = np.maximum(_search(one, planes, one.rooms[0], turn)[1], 0)
+        clarity = np.maximum(_search(one, planes, one.rooms[0], turn=turn)[1], 0)
         total += float(_along(clarity[..., None], _TURN_SPAN // 2).max(axis=0).sum())
     return total
 
@@ -228,7 +228,7 @@ def _heights(one: _Around, planes: Sequence[ScenePlane], room: tuple[int, int]) 
 
 
 def _search(
-    one: _Around, planes: Sequence[ScenePlane], room: tuple[int, int], turn: float
+    one: _Around, planes: Sequence[ScenePlane], room: tuple[int, int], *, turn: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return level distances (L, A) of walls of four directions, and how clear their creases are."""
     down, up = _heights(one, planes, room)
@@ -253,7 +253,7 @@ def _known_walls(one: _Around, planes: Sequence[ScenePlane], room: tuple[int, in
 def _walls_of(one: _Around, planes: Sequence[ScenePlane], turn: float) -> list[tuple[float, ScenePlane, FloatArray]]:
     """Return the walls of a view that are clearer than those at other distances, with weights and the centre."""
     center = one.view.cam_from_world.center
-    room, distance, clarity = _clearest([(room, *_search(one, planes, room, turn)) for room in one.rooms])
+    room, distance, clarity = _clearest([(room, *_search(one, planes, room, turn=turn)) for room in one.rooms])
     down, up = _heights(one, planes, room)
     searched, (known, known_clarity) = len(distance), _known_walls(one, planes, room)
     distance, clarity = np.concatenate([distance, known]), np.concatenate([clarity, known_clarity])
