@@ -155,7 +155,7 @@ def run(
             metavar="N",
             min=0,
             help="Run overlapping blocks of at most N images one after the other, and merge them; 0: all images at "
-            "once. Default: blocks if all at once would take more memory than there is.",
+            "once. Default: blocks if pairs or poses would take more memory than there is.",
             show_default=False,
         ),
     ] = None,

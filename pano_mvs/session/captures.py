@@ -80,8 +80,8 @@ def run(
         keep_going: continue after failures even if a stage has `on_error: stop`.
         progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
         block_size: run overlapping blocks of at most this number of images, and merge them; 0 to run all images at
-            once. None: in blocks if all at once would take more memory than there is. If the run of a block ends early,
-            its output is returned.
+            once. None: in blocks if pairs or poses would take more memory than there is. If the run of a block ends
+            early, its output is returned.
         block_overlap: images that consecutive blocks share; 0 for a quarter of the block size, between 3 and 100.
         block_loop: whether the path ends where it began, so that the last block overlaps the first one.
         block_poses: rough poses, with which blocks also overlap where the path returns.
