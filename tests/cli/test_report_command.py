@@ -28,7 +28,7 @@ def pictures(page: Page) -> dict[str | None, str | None]:
 
 @pytest.mark.slow
 def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, tmp_path: Path) -> None:
-    write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=(48, 96))
+    write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), size_hw=(96, 192))
     truth = tmp_path / "capture" / "truth"
     command = (
         "known_poses",

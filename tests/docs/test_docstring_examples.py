@@ -13,7 +13,7 @@ import pano_mvs
 PACKAGE = Path(pano_mvs.__file__).parent
 # Each runs the sample, or needs what the one before has left.
 COMPUTING = (
-    "pano_mvs.session.running",
+    "pano_mvs.session.captures",
     "pano_mvs.session.planning",
     "pano_mvs.results.run_output",
     "pano_mvs.share.share",
