@@ -88,14 +88,15 @@ def whose_temporary(path: Path) -> str:
     return f"of process {match[2]} on this host, which is {state}"
 
 
-def clear_abandoned(folder: Path) -> None:
+def clear_abandoned(folder: Path, pattern: str = ".tmp-*") -> None:
     """Remove the temporary files and folders of processes that were killed.
 
-    Those of processes that are known to have ended are removed at once. Where this cannot be known (another host or
-    container, Windows, other names), they are removed after seven days: no unit takes that long.
+    Those of processes that are known to have ended are removed at once, and those of running ones never, whatever the
+    clock says. Where this cannot be known (another host or container, Windows, other names), they are removed after
+    seven days: no unit takes that long.
     """
     with suppress(OSError):
-        for path in children(folder, ".tmp-*"):
+        for path in children(folder, pattern):
             if _is_abandoned(path):
                 remove_whole(path)
 

@@ -29,15 +29,13 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import (
     CACHE_MARK,
     clear_abandoned,
-    is_older,
     make_room,
     read_regular,
-    remove_whole,
     replacing,
     temporary_prefix,
     write_text,
 )
-from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
+from pano_mvs.core.paths import exists, is_folder, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packs import RECORD, Packed
@@ -133,7 +131,6 @@ _FOLDER_DIGITS = {1: 2, 2: 3}
 """Layout to the number of digits of a key or digest in a folder name. Older caches keep their 256 folders."""
 
 MIN_FREE_BYTES = 200_000_000
-_ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
 
 
@@ -470,11 +467,7 @@ class Store:
 
     def _clear_abandoned(self) -> None:
         """Remove temporary files of runs that were killed."""
-        folder = self.root / "tmp"
-        clear_abandoned(folder)
-        for path in children(folder):
-            if is_older(path, _ABANDONED_AFTER_S):
-                remove_whole(path)
+        clear_abandoned(self.root / "tmp", "*")
 
     def _create(self, path: Path) -> None:
         try:
