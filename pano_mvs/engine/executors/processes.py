@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import queue
 import signal
@@ -125,7 +126,7 @@ class ProcessExecutor:
             job, request = taken
             try:
                 outcome = worker.run(request)
-            except OSError as error:  # not the fault of the unit
+            except (OSError, RuntimeError, MemoryError) as error:  # not the fault of the unit
                 outcome = JobOutcome(
                     "stopped",
                     cause=f"a worker cannot be started: {error}. Fix this and run the same command again",
@@ -174,6 +175,7 @@ class WorkerProcess:
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
+        self._left_s = math.inf
 
     def run(self, request: Mapping[str, Any]) -> JobOutcome:
         """Compute a unit and wait for it; if the process dies or takes too long, only this unit fails."""
@@ -183,16 +185,14 @@ class WorkerProcess:
         self.served += 1
         whose = {"nonce": uuid.uuid4().hex, "key": request["unit"]["key"]}
         timeout_s = float(request["timeout_s"])
-        timer = threading.Timer(timeout_s, self._end_late) if timeout_s else None
+        self._left_s = math.inf
         try:
             assert process.stdin is not None
             process.stdin.write(json.dumps({**request, "nonce": whose["nonce"]}).encode() + b"\n")
             process.stdin.flush()
-            outcome = self._listen(process, whose, timer)
+            outcome = self._listen(process, whose, timeout_s or math.inf)
         except OSError:
             outcome = None
-        if timer is not None:
-            timer.cancel()
         if outcome is None:
             return self._death(process, timeout_s)
         # It finished just when it was being ended, or nothing else may be computed after it.
@@ -235,7 +235,7 @@ class WorkerProcess:
         return self._process
 
     def _listen(
-        self, process: subprocess.Popen[bytes], whose: Mapping[str, str], timer: threading.Timer | None
+        self, process: subprocess.Popen[bytes], whose: Mapping[str, str], timeout_s: float
     ) -> JobOutcome | None:
         """Return the outcome from the worker, or None if it dies first, even if others hold its output open."""
         while (line := self._next_line(process)) is not None:
@@ -245,21 +245,25 @@ class WorkerProcess:
                 continue  # it is ready, or another process answered an earlier request
             if "outcome" in answer:
                 return JobOutcome.from_json(answer["outcome"])
-            if timer is not None:
-                timer.start()
+            self._left_s = timeout_s
         return None
 
     def _next_line(self, process: subprocess.Popen[bytes]) -> bytes | None:
+        """Return the next line from the worker, which is ended when its time is over; None if it has ended.
+
+        The time is that in which this process waits: a clock would go on while both processes are stopped.
+        """
         while True:
+            wait_s = min(_LISTEN_S, self._left_s)
             try:
-                return self._lines.get(timeout=_LISTEN_S)
+                return self._lines.get(timeout=wait_s)
             except queue.Empty:
                 if process.poll() is not None:
                     return None
-
-    def _end_late(self) -> None:
-        self._too_late = True
-        self.kill()
+            self._left_s -= wait_s
+            if self._left_s <= 0:
+                self._too_late, self._left_s = True, math.inf
+                self.kill()
 
     def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> JobOutcome:
         self._process = None

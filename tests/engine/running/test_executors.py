@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -304,6 +306,43 @@ def test_timeout_ends_the_unit_and_not_the_run(toy: Toy, monkeypatch: pytest.Mon
     assert "timeout_s: 1" in failure.cause
 
 
+def test_a_timeout_counts_only_the_time_in_which_the_main_process_waits(tmp_path: Path) -> None:
+    """After SIGSTOP and SIGCONT of all processes, as when a batch system suspends a job, units were ended at once."""
+    worker = worker_process.WorkerProcess(1, tmp_path / "errors.txt")
+    waits: list[float] = []
+
+    class Lines:
+        """Nothing comes for ten times; the process may have been stopped for hours in each."""
+
+        def get(self, timeout: float) -> bytes:
+            waits.append(timeout)
+            if len(waits) > 10:
+                return b"answer"
+            raise queue.Empty
+
+    class Process:
+        def poll(self) -> None:
+            return None
+
+    for left_s, is_late in ((6.0, False), (2.2, True)):
+        waits.clear()
+        worker._lines, worker._left_s, worker._too_late = Lines(), left_s, False  # type: ignore[assignment]
+        assert worker._next_line(Process()) == b"answer"  # type: ignore[arg-type]
+        assert worker._too_late is is_late
+        assert not is_late or sum(waits[:5]) == pytest.approx(2.2)
+
+
+def test_a_worker_without_threads_or_memory_stops_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that serves a worker ended, and the run waited for ever."""
+
+    def fail(self: worker_process.WorkerProcess) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(worker_process.WorkerProcess, "_start", fail)
+    with pytest.raises(StoreError, match="a worker cannot be started: can't start new thread"):
+        run_with(toy, two_processes)
+
+
 def test_serial_says_that_it_keeps_no_timeouts(toy: Toy) -> None:
     result = run_with(toy, SerialExecutor, "scaled.timeout_s=1")
     assert any("timeout_s of scaled has no effect" in warning for warning in result.warnings)
@@ -507,6 +546,9 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     )
     before = threading.active_count()
     assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
+    deadline = time.monotonic() + 30  # the threads that read from the workers end by themselves
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert threading.active_count() == before
 
 
