@@ -13,7 +13,8 @@ import typer
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.core.errors import PanoMvsError, StoreError, WorkflowError
+from pano_mvs.core.errors import PanoMvsError, RunStoppedError, StoreError, WorkflowError
+from pano_mvs.core.memory import require_address_space
 from pano_mvs.core.paths import reason_of
 from pano_mvs.session.sudden_exit import exit_text
 
@@ -27,6 +28,7 @@ def guarded(command: Command) -> Command:
     def run_guarded(*args: Any, **kwargs: Any) -> None:
         errors = Console(stderr=True)
         try:
+            require_address_space()
             command(*args, **kwargs)
         except PanoMvsError as error:
             for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
@@ -47,6 +49,12 @@ def guarded(command: Command) -> Command:
                 "finished results are kept"
             )
             raise typer.Exit(1) from None
+        except MemoryError:
+            errors.say(
+                "[red]error:[/] no memory is left, or a limit such as `ulimit -v` is reached; finished results are "
+                "kept. Use fewer --workers or smaller images, or raise the limit, and run the same command again"
+            )
+            raise typer.Exit(RunStoppedError.exit_code) from None
         except Exception as error:
             if isinstance(error, OSError) and error.filename is not None:  # no more specific message exists
                 problem = f"{error.filename}: {reason_of(error)}. Correct its permissions, or choose another path"

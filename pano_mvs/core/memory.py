@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pano_mvs.core.errors import RunStoppedError
+
 _UNITS = {
     "": 1,
     "B": 1,
@@ -21,6 +23,9 @@ _UNITS = {
     "GIB": 2**30,
     "TIB": 2**40,
 }
+_LIBRARIES_BYTES = 10**9
+"""Address space that a process takes which has loaded the libraries: 0.8 GB on Linux."""
+
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]*)\s*")
 
 
@@ -51,6 +56,25 @@ def total_memory_bytes() -> int:
     """Return the memory of this host, or of the container if that is less; 0 if unknown."""
     found = [size for size in (_total_of_system(), _limit_of_container()) if size]
     return min(found, default=0)
+
+
+def require_address_space() -> None:
+    """Refuse a limit of the address space (`ulimit -v`) below which some libraries never end to load.
+
+    Raises:
+        RunStoppedError: if the limit is smaller.
+    """
+    if sys.platform == "win32":
+        return
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _LIBRARIES_BYTES:
+        raise RunStoppedError(
+            f"each process may use at most {size_text(limit)} of address space (`ulimit -v`), but the libraries alone "
+            f"need up to {size_text(_LIBRARIES_BYTES)} of memory addresses. Raise the limit, such as with "
+            "`ulimit -v unlimited`"
+        )
 
 
 def _free_of_system() -> int:
