@@ -175,22 +175,26 @@ class Publisher:
         self._claims = FileClaims(self._order)
         self._stems: dict[str, str] = {}
         self._ranks: dict[str, int] = {}
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            kind = StoreError if is_full_disk(error) else UsageError
-            raise kind(_cannot_write(out, error.strerror or str(error))) from error
-        if not os.access(out, os.W_OK | os.X_OK):
-            raise UsageError(_cannot_write(out, "permission denied"))
-        try:
-            if is_link(out / OUTPUT_MARK):
-                (out / OUTPUT_MARK).unlink()  # do not follow it
-            (out / OUTPUT_MARK).touch()
-        except OSError as error:
-            raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
+        self._open()
         self._cleared: set[Path] = set()
         self._patterns: set[tuple[str, str]] = set()  # what stands before and after the name of an image
         self._clear(out)
+
+    def _open(self) -> None:
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            kind = StoreError if is_full_disk(error) else UsageError
+            raise kind(_cannot_write(self.out, error.strerror or str(error))) from error
+        if not os.access(self.out, os.W_OK | os.X_OK):
+            raise UsageError(_cannot_write(self.out, "permission denied"))
+        mark = self.out / OUTPUT_MARK
+        try:
+            if is_link(mark):
+                mark.unlink()  # do not follow it
+            mark.touch()
+        except OSError as error:
+            raise StoreError(_cannot_write(self.out, error.strerror or str(error))) from error
 
     def name_items(self, names: Iterable[str]) -> None:
         """Set the text for `{item}` for each image: its path without the extension, unless two images would collide."""
@@ -199,9 +203,20 @@ class Publisher:
 
     def begin_pass(self) -> None:
         """Start a new pass: what was published so far counts as that of an earlier run."""
+        self._open()
         self.earlier |= self.published
         self.published = {}
         self._claims = FileClaims(self._order)
+
+    def require_files(self) -> None:
+        """Check that everything which this pass has published is still there.
+
+        Raises:
+            DamagedBlobError: if somebody has removed files; another pass writes them again.
+        """
+        lost = [name for name in (OUTPUT_MARK, *self.published) if not is_file(self.out / name)]
+        if lost:
+            raise DamagedBlobError(f"{self.out / lost[-1]} was removed during the run; writing it again")
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
         """Write the files of one unit, unless they exist with the right bytes.

@@ -180,6 +180,8 @@ class Run:
             self._pass = RunPass(self, self._warnings)
             try:
                 self._pass.execute()
+                if not self.result.stopped:
+                    self.publisher.require_files()
                 return
             except DamagedBlobError as error:
                 for text in dict.fromkeys(self._pass.damaged or [str(error)]):
@@ -236,7 +238,7 @@ class Run:
         for name, new_name in self.publisher.set_aside.items():
             self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
         published = self.publisher.published
-        self.result.written = sorted(self.publisher.written)
+        self.result.written = sorted(set(self.publisher.written))
         self.result.published = published
         self.result.left_over = {
             name: digest

@@ -6,7 +6,11 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import InputError, RunStoppedError, StoreError, UsageError, WorkflowError
+from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache.latest_runs import RunHistory
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.events import Observer, StageSummary
+from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
 from tests.engine.workflows.test_wiring import MORE
@@ -313,3 +317,25 @@ def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: "from pano_mvs.stages.depth import nearest\n" + text)
     session = toy.session()
     assert session.registry.stages["views.nearest"].code_digest == ""
+
+
+def test_output_that_is_removed_during_the_run_is_written_again(toy: Toy) -> None:
+    """A run whose output folder was removed said that all was well, and the next one set its report aside."""
+
+    class Remover(Observer):
+        """Removes the output folder once, when some of its files are there."""
+
+        def stage_finished(self, summary: StageSummary) -> None:
+            if summary.name == "each" and not (toy.folder / "gone").exists():
+                (toy.folder / "out").rename(toy.folder / "gone")
+
+    toy.run()
+    expected = toy.deliverables()
+    remove_whole(toy.folder / "out")
+    session = toy.session(cache=toy.folder / "other")
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, observer=Remover())
+    result = run.execute()
+    assert result.exit_code == 0
+    assert toy.deliverables() == expected
+    assert any("was removed during the run; writing it again" in text for text in result.warnings)
+    assert len(result.written) == len(set(result.written))
