@@ -81,6 +81,35 @@ def test_commands_of_the_workflows_are_those_of_the_documentation(path: Path) ->
             assert re.fullmatch(r"actions/[\w-]+@v\d+", step.get("uses", "actions/checkout@v4"))
 
 
+def _systems(job: Any) -> list[str]:
+    return job["strategy"]["matrix"]["os"] if "matrix" in job["runs-on"] else [job["runs-on"]]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs bash")
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_jobs_have_what_github_requires_and_their_commands_are_valid(path: Path) -> None:
+    for job in loaded(path)["jobs"].values():
+        shell = job.get("defaults", {}).get("run", {}).get("shell", "")
+        for step in job["steps"]:
+            assert ("uses" in step) != ("run" in step)
+            assert step.keys() <= {"uses", "run", "with", "shell", "name", "id", "env", "if"}
+            if "run" not in step:
+                continue
+            windows = any(system.startswith("windows") for system in _systems(job))
+            assert not windows or step.get("shell", shell) == "bash", "PowerShell knows neither && nor these patterns"
+            assert subprocess.run(["bash", "-n", "-c", step["run"]], check=False).returncode == 0
+        assert set(re.findall(r"matrix\.(\w+)", str(job))) <= job.get("strategy", {}).get("matrix", {}).keys()
+
+
+def test_the_quickstart_runs_from_the_wheel_on_three_systems() -> None:
+    job = loaded(ROOT / ".github/workflows/ci.yml")["jobs"]["wheel"]
+    assert {system.partition("-")[0] for system in _systems(job)} == {"ubuntu", "macos", "windows"}
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    order = ["pip wheel", "pip install dist", "pano-mvs run quickstart", "0 units computed", "cloud.ply"]
+    places = [next(idx for idx, command in enumerate(commands) if part in command) for part in order]
+    assert places == sorted(places)
+
+
 def test_the_site_is_published_from_where_it_is_built() -> None:
     upload = [step for step in loaded(ROOT / ".github/workflows/docs.yml")["jobs"]["build"]["steps"] if "with" in step]
     site = re.search(r"^site_dir: (\S+)", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
