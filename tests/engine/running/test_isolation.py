@@ -54,9 +54,11 @@ def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_imp
     edit(
         toy,
         """import cv2, math
-if not cv2.useOptimized() or math.floor(1.5) != 1: raise ValueError("tainted")
+from pano_mvs.api import Panorama
+if not cv2.useOptimized() or math.floor(1.5) != 1 or Panorama.load is None: raise ValueError("tainted")
 cv2.setUseOptimized(False)
-math.floor = lambda x: 7""",
+math.floor = lambda x: 7
+Panorama.load = None""",
     )
     if at_import:
         change = "import cv2, math\ncv2.setUseOptimized(False)\nmath.floor = lambda x: 7\nimport time"
@@ -66,7 +68,8 @@ math.floor = lambda x: 7""",
     assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
     assert ran(result) == ran(clean) == ALL_UNITS
     notes = {note for stage in result.stages for note in stage.notes}
-    assert any("it changed OpenCV's optimisation, math.floor in its process; this was undone" in note for note in notes)
+    change = "OpenCV's optimisation, math.floor, pano_mvs.scene.panorama.Panorama.load"
+    assert any(f"it changed {change} in its process; this was undone" in note for note in notes)
 
 
 @pytest.mark.parametrize("how", ["returns", "raises"])
