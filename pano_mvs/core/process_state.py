@@ -15,7 +15,7 @@ import random
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, ValuesView
+from collections.abc import Callable, Iterator, Mapping, Sequence, ValuesView
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -164,12 +164,12 @@ class _Holder:
         name_of_owner = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
         for name, value in self.guarded.items():
             if present.get(name) is not value:
-                change(owner, name, value)  # type: ignore[arg-type]
+                change(owner, name, value)
                 yield f"{name_of_owner}.{name}"
         for name in present.keys() - self.guarded.keys():
             is_override = not isinstance(owner, ModuleType) or (name in vars(builtins) and not name.startswith("__"))
             if is_override and _is_guarded(owner, name, present[name]):
-                delete(owner, name)  # type: ignore[arg-type]
+                delete(owner, name)
                 yield f"{name_of_owner}.{name}"
         for function, code in self.codes.items():
             if function.__code__ is not code:
@@ -208,7 +208,7 @@ class _Libraries:
 
     modules: Mapping[str, ModuleType]
     holders: list[_Holder]
-    views: list[ValuesView[object]]
+    views: Sequence[ValuesView[object]]
     values: list[object]
     functions: list[FunctionType]
     codes: list[CodeType]
