@@ -29,8 +29,38 @@ from tests.io.images.pictures import app1, exif, full_sphere, picture, png_chunk
 NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 0x7F, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1]) | st.integers(0, 2**32 - 1)
 TAGS = st.sampled_from([0x0112, 0x8769, 0x8825, 0xA405, 700, 256, 257, *range(7)]) | st.integers(0, 0xFFFF)
 TEXTS = st.sampled_from(
-    ["", " ", "nan", "-inf", "1e308", "-1e308", "1e-320", "2e9", "-1", "0", "0.5", "64", "128", "4096", "8192", "1e9"]
-    + ["9" * 400, "9" * 5000, "0x40", "١٢٨", "1_000", "true", "128 px", "\U0001f600", "equirectangular", "cylindrical"]
+    [
+        *(
+            "",
+            " ",
+            "nan",
+            "-inf",
+            "1e308",
+            "-1e308",
+            "1e-320",
+            "2e9",
+            "-1",
+            "0",
+            "0.5",
+            "64",
+            "128",
+            "4096",
+            "8192",
+            "1e9",
+        ),
+        *(
+            "9" * 400,
+            "9" * 5000,
+            "0x40",
+            "١٢٨",
+            "1_000",
+            "true",
+            "128 px",
+            "\U0001f600",
+            "equirectangular",
+            "cylindrical",
+        ),
+    ]
 ) | st.text(st.characters(codec="utf-8", exclude_characters="<&>\"'\0", exclude_categories=["Cc", "Cs"]), max_size=8)
 FIELDS = [*full_sphere(1, 2), "PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees"]
 
