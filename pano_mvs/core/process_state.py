@@ -166,7 +166,7 @@ class _Holder:
             if present.get(name) is not value:
                 change(owner, name, value)
                 yield f"{name_of_owner}.{name}"
-        for name in present.keys() - self.guarded.keys():
+        for name in sorted(present.keys() - self.guarded.keys()):
             is_override = not isinstance(owner, ModuleType) or (name in vars(builtins) and not name.startswith("__"))
             if is_override and _is_guarded(owner, name, present[name]):
                 delete(owner, name)
