@@ -65,7 +65,7 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
             notes.append(str(error))
             continue
         if not np.isfinite(mesh.vertices).all():
-            notes.append(f"{run.out / name}: was left out: some of its corners are no finite numbers. Export it again")
+            notes.append(f"{run.out / name}: was left out: some of its corners are not finite numbers. Export it again")
         elif len(mesh.faces):
             return mesh, "; ".join(notes)
     return None, "; ".join(notes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -123,7 +124,7 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     ),
     "one pixel": lambda folder: write_png(folder / "images" / NAMES[0], np.zeros((1, 2, 3), np.uint8)),
     "damaged picture": lambda folder: (folder / "images" / NAMES[0]).write_bytes(b"\x89PNG\r\n\x1a\n"),
-    "no pictures": lambda folder: [(folder / "images" / name).unlink() for name in NAMES],
+    "no pictures": lambda folder: shutil.rmtree(folder / "images"),
     "ranges of NaN": lambda folder: ranges(folder, np.nan),
     "ranges of 1e38": lambda folder: ranges(folder, 1e38),
     "cut range": lambda folder: (folder / "out/range" / NAMES[0]).with_suffix(".tiff").write_bytes(b"II*\0"),
@@ -143,7 +144,8 @@ def browser() -> Iterator[Browser]:
 def test_hostile_outputs_are_refused_or_shown(browser: Browser, tmp_path: Path, what: str) -> None:
     folder = tmp_path / "run"
     box_run(folder, points=3000, mesh=True)
-    HOSTILE.get(what, lambda _: None)(folder)
+    if what in HOSTILE:
+        HOSTILE[what](folder)
     before = contents(tmp_path)
     title = MARKUP[1] * 3 if what == "title of markup" else ""
     try:
