@@ -17,3 +17,6 @@ HOSTILE_NAMES = (
     "e\x07.png",
     "e\x1b[2J.png",
 )
+
+LONG_NAMES = ("x" * 251 + ".png", "ü" * 125 + ".png", f"a/{'x' * 255}/b.png")
+"""Names that file systems allow, but not those of results, which are longer."""

@@ -1,11 +1,13 @@
 """What a plugin can change in its process so that later units compute something else: recorded, compared, restored.
 
 The state is that of OpenCV, numpy, the random numbers of Python and numpy, the floating-point unit, the locale, the
-working folder, the environment, the signal handlers, and the functions of the libraries that stages use.
+working folder, the environment, the signal handlers, and the functions and classes of the libraries that stages use,
+with the methods of these classes.
 """
 
 from __future__ import annotations
 
+import builtins
 import ctypes
 import locale
 import os
@@ -13,12 +15,13 @@ import random
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence, ValuesView
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from operator import attrgetter, is_
-from types import FunctionType, ModuleType
+from itertools import chain
+from operator import is_
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 _LIBRARIES = {
@@ -51,33 +54,23 @@ class ProcessState:
     libraries: _Libraries
 
     @staticmethod
-    def now() -> ProcessState:
-        """Return the present state."""
+    def now(*, compared: bool = False) -> ProcessState:
+        """Return the present state.
+
+        Args:
+            compared: whether the libraries were compared with their latest record a moment ago, and are not again.
+        """
         settings = {name: setting.read() for name, setting in _SETTINGS.items()}
-        return ProcessState(settings, _Libraries.now())
+        return ProcessState(settings, _Libraries.now(compared=compared))
 
     def restore(self) -> Changes:
         """Make the state as it was, and return what was different."""
+        replaced = tuple(self.libraries.put_back())  # first, since settings are read through these functions
         known = {name: value for name, value in self.settings.items() if value is not None}  # None: not loaded then
         settings = [name for name, value in known.items() if _SETTINGS[name].read() != value]
         for name in settings:
             _SETTINGS[name].write(self.settings[name])
-        modules = _library_modules()
-        if self.libraries.are_unchanged(modules):
-            return Changes(tuple(settings))
-        replaced = [f"{name}.{function}" for name, module in modules.items() for function in self._put_back(module)]
-        return Changes(tuple(settings), tuple(replaced))
-
-    def _put_back(self, module: ModuleType) -> Iterator[str]:
-        """Put the functions of a module back, and yield the names of those that were replaced."""
-        present = vars(module)
-        for name, known in self.libraries.functions.get(module.__name__, {}).items():
-            if present.get(name) is not known.value:
-                setattr(module, name, known.value)
-                yield name
-            if known.code is not None and known.value.__code__ is not known.code:
-                known.value.__code__ = known.code
-                yield name
+        return Changes(tuple(settings), replaced)
 
 
 @dataclass(frozen=True)
@@ -86,7 +79,7 @@ class Changes:
 
     Attributes:
         settings: names of settings, in words.
-        functions: functions and classes that were replaced, such as `cv2.remap`.
+        functions: functions, classes and methods that were replaced, such as `cv2.remap`.
     """
 
     settings: tuple[str, ...] = ()
@@ -129,53 +122,136 @@ _PLUGINS = _Plugins()
 
 
 @dataclass(frozen=True)
-class _Function:
-    value: Any
-    code: Any
+class _Holder:
+    """A module or a class of a library, and what it holds.
+
+    Attributes:
+        owner: the module or the class.
+        values: all its values, in their order.
+        guarded: those of its values by name that may not be replaced.
+        codes: its functions that are written in Python, with their code.
+        classes: the classes of libraries among the values of a module.
+    """
+
+    owner: ModuleType | type
+    values: list[object]
+    guarded: Mapping[str, object]
+    codes: Mapping[FunctionType, CodeType]
+    classes: list[type]
+
+    @staticmethod
+    def of(owner: ModuleType | type) -> _Holder:
+        """Return what a module or a class holds now."""
+        present, is_module = dict(vars(owner)), isinstance(owner, ModuleType)
+        guarded = {name: value for name, value in present.items() if _is_guarded(owner, name, value)}
+        codes = {value: value.__code__ for value in guarded.values() if type(value) is FunctionType}
+        classes = [value for value in guarded.values() if is_module and isinstance(value, type)]
+        return _Holder(owner, [*present.values()], guarded, codes, [*filter(_is_of_library, classes)])
+
+    def is_unchanged(self) -> bool:
+        """Return whether the owner holds the same objects, and functions have the same code."""
+        present = [*vars(self.owner).values()]
+        return (
+            len(present) == len(self.values)
+            and all(map(is_, present, self.values))
+            and all(function.__code__ is code for function, code in self.codes.items())
+        )
+
+    def put_back(self) -> Iterator[str]:
+        """Put back what was replaced, delete what overrides something, and yield the names of both."""
+        present, owner = dict(vars(self.owner)), self.owner
+        change, delete = (setattr, delattr) if isinstance(owner, ModuleType) else (type.__setattr__, type.__delattr__)
+        name_of_owner = owner.__name__ if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
+        for name, value in self.guarded.items():
+            if present.get(name) is not value:
+                change(owner, name, value)
+                yield f"{name_of_owner}.{name}"
+        for name in sorted(present.keys() - self.guarded.keys()):
+            is_override = not isinstance(owner, ModuleType) or (name in vars(builtins) and not name.startswith("__"))
+            if is_override and _is_guarded(owner, name, present[name]):
+                delete(owner, name)
+                yield f"{name_of_owner}.{name}"
+        for function, code in self.codes.items():
+            if function.__code__ is not code:
+                function.__code__ = code
+                yield f"{function.__module__}.{function.__qualname__}"
+
+
+def _is_guarded(owner: ModuleType | type, name: str, value: object) -> bool:
+    if isinstance(owner, type):
+        return callable(value) or hasattr(type(value), "__get__")
+    is_constant = name.isupper() and isinstance(value, int | float | str | tuple)
+    return callable(value) or (is_constant and owner.__name__.startswith("pano_mvs."))
+
+
+def _is_of_library(kind: type) -> bool:
+    """Return whether a class belongs to a library whose classes stages use, and can be changed."""
+    library = str(kind.__module__).partition(".")[0]
+    return library in _LIBRARIES and library != "numba" and not kind.__flags__ & _IMMUTABLE
+
+
+_IMMUTABLE = 1 << 8  # Py_TPFLAGS_IMMUTABLETYPE
 
 
 @dataclass(frozen=True)
 class _Libraries:
-    """What the loaded library modules hold: some 50,000 objects, which are compared without a loop in Python.
+    """What the loaded library modules and their classes hold: some 60,000 objects, compared in a few passes.
 
     Attributes:
-        modules: the modules.
-        content: of each module, its objects by name.
-        python: the functions that are written in Python.
+        modules: the modules by name.
+        holders: the modules and their classes.
+        views: the values of each, as they are at any time.
+        values: the values of all, in this order, when this was recorded.
+        functions: the functions that are written in Python.
         codes: the code of each of those.
-        functions: of each module, its functions and classes by name.
     """
 
-    modules: list[ModuleType]
-    content: list[dict[str, Any]]
-    python: list[FunctionType]
-    codes: list[object]
-    functions: Mapping[str, Mapping[str, _Function]]
+    modules: Mapping[str, ModuleType]
+    holders: list[_Holder]
+    views: Sequence[ValuesView[object]]
+    values: list[object]
+    functions: list[FunctionType]
+    codes: list[CodeType]
 
     @staticmethod
-    def now() -> _Libraries:
+    def now(*, compared: bool) -> _Libraries:
         """Return what the modules hold now; unless something has changed, this is the latest record."""
-        found = _library_modules()
-        if _LATEST and _LATEST[0].are_unchanged(found):
+        modules = _library_modules()
+        if _LATEST and _LATEST[0].modules is modules and (compared or _LATEST[0].are_unchanged()):
             return _LATEST[0]
-        modules = [*found.values()]
-        content = [dict(vars(module)) for module in modules]
-        functions = {name: _functions_of(module) for name, module in found.items()}
-        known = [known for module in functions.values() for known in module.values() if known.code is not None]
-        python, codes = [each.value for each in known], [each.code for each in known]
-        _LATEST[:] = [_Libraries(modules, content, python, codes, functions)]
+        known = {id(holder.owner): holder for holder in _LATEST[0].holders} if _LATEST else {}
+
+        def held(owner: ModuleType | type) -> _Holder:
+            holder = known.get(id(owner))
+            return holder if holder is not None and holder.is_unchanged() else _Holder.of(owner)
+
+        holders = [held(module) for module in modules.values()]
+        classes = {id(kind): kind for holder in holders for kind in holder.classes}
+        holders += [held(kind) for kind in classes.values()]
+        codes = {function: code for holder in holders for function, code in holder.codes.items()}
+        views = [vars(holder.owner).values() for holder in holders]
+        values = [*chain.from_iterable(views)]
+        _LATEST[:] = [_Libraries(modules, holders, views, values, [*codes], [*codes.values()])]
         return _LATEST[0]
 
-    def are_unchanged(self, modules: Mapping[str, ModuleType]) -> bool:
-        """Return whether the same modules hold the same objects, and functions have the same code."""
+    def are_unchanged(self) -> bool:
+        """Return whether modules and classes hold the same objects, and functions have the same code."""
         try:
-            return (
-                [*modules.values()] == self.modules
-                and [*map(vars, self.modules)] == self.content
-                and [*map(attrgetter("__code__"), self.python)] == self.codes
-            )
-        except Exception:  # another array, say, is neither equal nor different
+            present = [*chain.from_iterable(self.views)]
+            return present == self.values and [function.__code__ for function in self.functions] == self.codes
+        except Exception:  # another array, say, is neither equal nor different; or a thread has just changed a module
             return False
+
+    def put_back(self) -> Iterator[str]:
+        """Put back what was replaced, and yield the names."""
+        for name, module in self.modules.items():
+            if sys.modules.get(name) is not module:
+                sys.modules[name] = module
+                yield name
+        if not self.are_unchanged():
+            for holder in self.holders:
+                if not holder.is_unchanged():
+                    yield from holder.put_back()
 
 
 _LATEST: list[_Libraries] = []
@@ -201,14 +277,6 @@ def _library_modules() -> dict[str, ModuleType]:
 
 
 _CHOSEN: list[dict[str, ModuleType]] = []
-
-
-def _functions_of(module: ModuleType) -> dict[str, _Function]:
-    return {
-        name: _Function(value, value.__code__ if type(value) is FunctionType else None)
-        for name, value in list(vars(module).items())
-        if callable(value)
-    }
 
 
 def _library(name: str) -> Any:
@@ -300,6 +368,11 @@ _SETTINGS: Mapping[str, _Setting] = {
     "OpenCV's optimisation": _Setting(
         lambda: _library("cv2") and _library("cv2").useOptimized(),
         lambda value: _library("cv2").setUseOptimized(value),
+        decides=True,
+    ),
+    "OpenCV's threads": _Setting(
+        lambda: _library("cv2") and _library("cv2").getNumThreads(),
+        lambda value: _library("cv2").setNumThreads(value),
         decides=True,
     ),
     "numpy's handling of errors": _Setting(

@@ -64,7 +64,9 @@ def run_mesh(run: RunOutput) -> tuple[SharedMesh | None, str]:
         except InputError as error:
             notes.append(str(error))
             continue
-        if len(mesh.faces):
+        if not np.isfinite(mesh.vertices).all():
+            notes.append(f"{run.out / name}: was left out: some of its corners are not finite numbers. Export it again")
+        elif len(mesh.faces):
             return mesh, "; ".join(notes)
     return None, "; ".join(notes)
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.conftest import SMALL, Command, run_json
+from tests.cli.conftest import SMALL, Command, deliverables, run_json
+from tests.io.images.pictures import app1, full_sphere, xmp
 from tests.permissions import permissions_hold
 from tests.stored import read_picture
 
@@ -63,18 +64,21 @@ def test_one_image(pano_mvs: Command, capture: Path) -> None:
     assert "depth needs two or more panoramas" in result.flat
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "not 2:1"])
+@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "not 2:1", "huge sphere"])
 def test_one_bad_picture_among_good_ones(pano_mvs: Command, short: Path, capture: Path, damage: str) -> None:
     image = read_picture(capture / "images" / "001.png")
     (capture / "images" / "001.png").unlink()
     bad = capture / "images" / "001.jpg"
     cv2.imwrite(str(bad), image[:, : image.shape[1] - 64] if damage == "not 2:1" else image)
     data = bad.read_bytes()
-    if damage != "not 2:1":
-        bad.write_bytes({"truncated": data[: len(data) // 2], "text": b"not a picture", "empty": b""}[damage])
+    sphere = full_sphere(*image.shape[:2], FullPanoWidthPixels=2 * 10**9, FullPanoHeightPixels=10**9)
+    huge = data[:2] + app1(b"http://ns.adobe.com/xap/1.0/\0" + xmp(sphere)) + data[2:]
+    damaged = {"truncated": data[: len(data) // 2], "text": b"not a picture", "empty": b"", "huge sphere": huge}
+    bad.write_bytes(damaged.get(damage, data))
     result = pano_mvs("run", short, "--out", "out")
     assert result.code == 3, result.text
     assert "001.jpg" in result.flat
+    assert "001.jpg" in (Path("out") / "report.html").read_text()
     assert run_json(Path("out"))["stages"][1]["run"] == 3
     (capture / "images" / "001.jpg").unlink()
     cv2.imwrite(str(capture / "images" / "001.png"), image)
@@ -234,3 +238,20 @@ def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(
         assert "001.png has no mask in blinds" in text
         assert "000.png has no mask" not in text
     assert "has no mask" not in pano_mvs(*arguments).text
+
+
+@pytest.mark.slow
+def test_a_picture_that_never_registers_keeps_no_files_of_renamed_pictures(pano_mvs: Command, capture: Path) -> None:
+    """A capture with such a picture ends with exit code 3 each time, and kept files of renamed pictures."""
+    noise = np.random.default_rng(0).integers(0, 256, (160, 320, 3)).astype(np.uint8)
+    cv2.imwrite(str(capture / "images" / "999.png"), cv2.GaussianBlur(noise, (0, 0), 20))
+    command = ("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    assert pano_mvs(*command).code == 3
+    before = deliverables(Path("out"))
+    assert [name for name in before if "003" in name]
+    assert not [name for name in before if name.startswith("range/999")]
+    (capture / "images" / "003.png").rename(capture / "images" / "renamed.png")
+    assert pano_mvs(*command).code == 3
+    after = deliverables(Path("out"))
+    assert not [name for name in after if "003" in name]
+    assert {name.replace("renamed", "003") for name in after} == before.keys()

@@ -18,6 +18,8 @@ import pytest
 
 from pano_mvs.core import process_state, text
 from pano_mvs.core.process_state import ProcessState, loading_plugin
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Panorama
 
 _UPWARD = 0x800  # FE_UPWARD of x86
 
@@ -28,6 +30,7 @@ def _replace_code() -> None:
 
 CHANGES: dict[str, tuple[Callable[[], object], str]] = {
     "optimisation": (lambda: cv2.setUseOptimized(not cv2.useOptimized()), "OpenCV's optimisation"),
+    "threads": (lambda: cv2.setNumThreads(cv2.getNumThreads() + 1), "OpenCV's threads"),
     "numpy errors": (lambda: np.seterr(divide="ignore", over="raise"), "numpy's handling of errors"),
     "random": (lambda: random.seed(1), "the random numbers of Python"),
     "numpy random": (lambda: np.random.seed(1), "the random numbers of numpy"),  # noqa: NPY002
@@ -41,6 +44,17 @@ CHANGES: dict[str, tuple[Callable[[], object], str]] = {
     "own function": (lambda: setattr(text, "shortened", str), "pano_mvs.core.text.shortened"),
     "code": (_replace_code, "pano_mvs.core.text.plural"),
     "builtin": (lambda: setattr(math, "floor", math.ceil), "math.floor"),
+    "method": (lambda: setattr(Panorama, "load", None), "pano_mvs.scene.panorama.Panorama.load"),
+    "property": (lambda: setattr(Rigid3, "center", property(repr)), "pano_mvs.geometry.transforms.Rigid3.center"),
+    "inherited method": (lambda: setattr(Panorama, "__repr__", str), "pano_mvs.scene.panorama.Panorama.__repr__"),
+    "method of a library": (lambda: delattr(np.poly1d, "deriv"), "numpy.poly1d.deriv"),
+    "code of a method": (
+        lambda: setattr(Rigid3.inverse, "__code__", (lambda self: self).__code__),
+        "pano_mvs.geometry.transforms.Rigid3.inverse",
+    ),
+    "constant": (lambda: setattr(process_state, "_FENV_BYTES", 1), "pano_mvs.core.process_state._FENV_BYTES"),
+    "shadowed builtin": (lambda: setattr(text, "len", max), "pano_mvs.core.text.len"),
+    "module": (lambda: sys.modules.update(cv2=np), "cv2"),
     "rounding": (lambda: ctypes.CDLL(None).fesetround(_UPWARD), "the floating-point modes"),
 }
 

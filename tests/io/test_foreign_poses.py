@@ -359,3 +359,13 @@ def test_its_pixels_are_ours(tmp_path: Path) -> None:
 def test_what_cannot_be_used_is_named(tmp_path: Path, part: dict[str, Any], what: str) -> None:
     with pytest.raises(InputError, match=rf"reconstruction\.json: .*{what}"):
         read_poses(reconstruction_file(tmp_path, [part]))
+
+
+@pytest.mark.parametrize("folder", ["//host/share/photos/", "\\\\host\\share\\photos\\", "C:\\photos\\", "/", ""])
+def test_images_of_alicevision_lie_anywhere(tmp_path: Path, folder: str) -> None:
+    """Paths on a network share ended with a traceback."""
+    data = alicevision()
+    for view in data["views"]:
+        view["path"] = folder + view["path"].removeprefix("/photos/")
+    (tmp_path / "cameras.sfm").write_text(json.dumps(data))
+    assert read_poses(tmp_path).names == tuple(POSES)[:2]

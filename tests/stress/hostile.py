@@ -1,10 +1,15 @@
-"""Read damaged and hostile files of every kind.
+"""Meet whatever is hostile: a list of 150 tries, or damaged files of every kind.
 
-Mutations, seeded, of good files (lost ends, flipped bits, numbers at their extremes, text that is none), and beside
-them all files that were crafted by hand: headers that promise more than there is, compressed bombs, counts of
-thousands of digits, poses that are no numbers. Each is read in a process whose memory is limited. It must be read, or
-refused with an error of ours that names the file in few words: no traceback, no warning, no crash, no endless reading.
-Then all hostile pictures are given to a run, which must lose these and nothing else.
+The list has five groups: files that are read, what somebody put into the cache, plugins, commands, and outputs of runs
+that are shown in a page. Each try is a test of this package, which says what must hold: no traceback, the documented
+exit code, an error that names the file and the remedy, other results kept, nothing written outside.
+
+With a number, so many files are read instead: mutations, seeded, of good files (lost ends, flipped bits, numbers at
+their extremes, text that is none), and beside them all files that were crafted by hand: headers that promise more than
+there is, compressed bombs, counts of thousands of digits, poses that are no numbers. Each is read in a process whose
+memory is limited. It must be read, or refused with an error of ours that names the file in few words: no traceback, no
+warning, no crash, no endless reading. Then all hostile pictures are given to a run, which must lose these and nothing
+else.
 """
 
 from __future__ import annotations
@@ -25,6 +30,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pytest
 import typer
 
 from pano_mvs.core.errors import PanoMvsError
@@ -179,6 +185,14 @@ def faults_in_process(count: int, seed: int, scratch: Path) -> list[str]:
     ]
 
 
+def faults_of_kind(kind: str, count: int, scratch: Path) -> list[str]:
+    """Read all crafted inputs of a kind and some mutations in this process; return the faults."""
+    good = samples(scratch)
+    drawn = [case for case in cases(count * len(good), 0, scratch) if case.kind == kind]
+    found = [(case.name, fault(case, good[kind], scratch / f"{number}")) for number, case in enumerate(drawn)]
+    return [f"{name}\n{text}" for name, text in found if text]
+
+
 def serve(count: int, seed: int, scratch: Path, first: int, extra_bytes: int) -> None:
     """Read the inputs from one on with limited memory, and print the outcome of each in a line."""
     good, found = samples(scratch), cases(count, seed, scratch)
@@ -252,11 +266,98 @@ def faults_of_run(count: int, seed: int, folder: Path) -> tuple[int, list[str]]:
     return number, wrong
 
 
-def main(count: Annotated[int, typer.Argument()] = 400, seed: int = 0, memory_mb: int = 1500) -> int:
-    """Read `count` mutations, print what came of it, and return the exit code.
+@dataclass(frozen=True)
+class Group:
+    """Tries of one kind: the first ones, in this order, of the tests whose names begin with one of some texts."""
+
+    count: int
+    tests: tuple[str, ...]
+
+
+_READ, _STORE = "tests/cli/test_bad_input.py::test_", "tests/engine/cache/test_hostile_store.py::test_"
+_OUTPUTS, _EXECUTORS = (
+    "tests/session/merging/test_hostile_outputs.py::",
+    "tests/engine/running/test_executors.py::test_",
+)
+GROUPS = {
+    "inputs": Group(
+        60,
+        (
+            "tests/stress/test_stress.py::test_hostile_files_of_a_kind",
+            "tests/io/images/test_hostile_metadata.py",
+            *(
+                f"{_READ}{name}"
+                for name in ("one_bad", "only_bad", "names", "linked", "masks", "two_id", "what", "a_f")
+            ),
+            *(f"{_OUTPUTS}test_{name}" for name in ("hostile_names_in_run_json", "commands", "links")),
+            f"{_OUTPUTS}test_arrays",
+        ),
+    ),
+    "cache": Group(
+        20,
+        (
+            *(f"{_STORE}{name}" for name in ("planted_targets", "link", "what_stands", "record_that", "output_folder")),
+            f"{_STORE}planted_arrays",
+        ),
+    ),
+    "plugins": Group(
+        30,
+        (
+            "tests/engine/running/test_isolation.py",
+            *(f"{_EXECUTORS}{name}" for name in ("a_unit_that_ends", "an_import", "unit_that_kills", "whatever")),
+            "tests/core/test_process_state.py::test_changes",
+        ),
+    ),
+    "commands": Group(20, ("tests/cli/test_bad_paths.py", "tests/cli/workflows/test_every_mistake.py")),
+    "page": Group(20, ("tests/share/test_hostile_page.py",)),
+}
+MOST_FAULTS = 2
+
+
+class _Outcomes:
+    """Selects the tests of a group and records how they end; a plugin of pytest."""
+
+    def __init__(self, group: Group) -> None:
+        self.survived: dict[str, bool] = {}
+        self._group = group
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Keep the tries."""
+        ordered = [item for start in self._group.tests for item in items if item.nodeid.startswith(start)]
+        items[:] = dict.fromkeys(ordered).keys()
+        del items[self._group.count :]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Record an outcome; a test that is skipped has not been survived."""
+        self.survived[report.nodeid] = report.passed and self.survived.get(report.nodeid, True)
+
+
+def make_tries() -> int:
+    """Make all tries, print how many of each group were survived, and return the exit code."""
+    lost: list[str] = []
+    counts: dict[str, tuple[int, int]] = {}
+    for name, group in GROUPS.items():
+        outcomes = _Outcomes(group)
+        files = dict.fromkeys(start.partition("::")[0] for start in group.tests)
+        pytest.main([*files, "-q", "-m", "", "--tb=short", "-p", "no:cacheprovider"], plugins=[outcomes])
+        lost += [f"{name}: {test}" for test, survived in outcomes.survived.items() if not survived]
+        lost += [f"{name}: one more try is missing"] * (group.count - len(outcomes.survived))
+        counts[name] = sum(outcomes.survived.values()), group.count
+    for name, (survived, tried) in counts.items():
+        print(f"{name:9} {survived:4} of {tried}")
+    print(f"{'all':9} {sum(survived for survived, _ in counts.values()):4} of {sum(n for _, n in counts.values())}")
+    print(*lost, sep="\n")
+    return 1 if len(lost) > MOST_FAULTS else 0
+
+
+def main(count: Annotated[int, typer.Argument()] = 0, seed: int = 0, memory_mb: int = 1500) -> int:
+    """Make the tries of the list, or read `count` mutations; print what came of it, and return the exit code.
 
     Reading may take `memory_mb` beyond the program itself.
     """
+    if not count:
+        return make_tries()
     started, total, peak, wrong = time.monotonic(), 0, 0, list[str]()
     for text, bytes_used in outcomes(count, seed, memory_mb * 1_000_000):
         total, peak = total + 1, max(peak, bytes_used)

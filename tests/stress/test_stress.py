@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pano_mvs.io.ranges import has_exr
 from tests.stress import damage, hostile, kills, load
 
 
@@ -21,6 +22,21 @@ def test_what_is_flipped_or_cut_short_is_noticed_and_healed(tmp_path: Path, chec
 
 def test_hostile_files_are_read_or_refused_by_name(tmp_path: Path) -> None:
     assert hostile.faults_in_process(25, 1, tmp_path) == []
+
+
+PICTURES = ("jpeg", "jpeg_progressive", "jpeg_restarts", "png", "png16", "tiff", "tiff16", "webp", "webp_lossless")
+RANGES = ("range_tiff", "range_png", "range_npy", "range_npz", "range_exr", "normals", "colmap_map", "truth")
+MODELS = ("colmap_bin", "colmap_txt", "sphere_bin", "poses_json", "transforms_json", "reconstruction_json", "poses_csv")
+OTHERS = ("mask_png", "mask_jpeg", "ply", "ply_text", "ply_mesh", "workflow")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", PICTURES + RANGES + MODELS + OTHERS)
+def test_hostile_files_of_a_kind(tmp_path: Path, kind: str) -> None:
+    """Each is read, or refused by an error of ours that names the file in few words."""
+    if kind == "range_exr" and not has_exr():
+        pytest.skip("OpenEXR is not installed")
+    assert hostile.faults_of_kind(kind, 8, tmp_path) == []
 
 
 @pytest.mark.slow

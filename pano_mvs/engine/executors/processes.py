@@ -23,6 +23,7 @@ from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.started_processes import MARK, end_started
 from pano_mvs.engine.executors.threads import bound_environment
 from pano_mvs.engine.executors.unit_json import request_to_json
 
@@ -176,6 +177,7 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
         self._left_s = math.inf
+        self._mark = uuid.uuid4().hex
 
     def run(self, request: Mapping[str, Any]) -> JobOutcome:
         """Compute a unit and wait for it; if the process dies or takes too long, only this unit fails."""
@@ -204,7 +206,7 @@ class WorkerProcess:
         """End the process, which is idle."""
         process, self._process = self._process, None
         if process is not None:
-            _close(process)
+            _close(process, self._mark)
         with suppress(OSError):  # it stays if the cache cannot be written any more
             self.errors.unlink(missing_ok=True)
 
@@ -212,10 +214,11 @@ class WorkerProcess:
         """End the process and those that its unit started at once, from any thread."""
         process = self._process
         if process is not None:
-            _kill(process)
+            _kill(process, self._mark)
 
     def _start(self) -> subprocess.Popen[bytes]:
-        environment = dict(os.environ)
+        self._mark = uuid.uuid4().hex
+        environment = {**os.environ, MARK: self._mark}
         bound_environment(environment, self.threads)
         path = json.dumps([place for place in sys.path if place])  # "" would mean the current folder
         self.served, self.refused, self._ready, self._too_late = 0, False, False, False
@@ -267,7 +270,7 @@ class WorkerProcess:
 
     def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> JobOutcome:
         self._process = None
-        _close(process)
+        _close(process, self._mark)
         if self._too_late:
             return JobOutcome(
                 "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
@@ -287,24 +290,23 @@ def _read_lines(process: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes
     lines.put(None)
 
 
-def _close(process: subprocess.Popen[bytes]) -> None:
+def _close(process: subprocess.Popen[bytes], mark: str) -> None:
     """Close the input of a process, which ends it, and wait for that; end it and what it started in any case."""
     with suppress(OSError):  # unsent data is not needed any more
         if process.stdin is not None:
             process.stdin.close()
     with suppress(subprocess.TimeoutExpired):
         process.wait(_STOP_S)
-    _kill(process)
+    _kill(process, mark)
     process.wait()
 
 
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a process and all processes of its group, which may outlive it."""
+def _kill(process: subprocess.Popen[bytes], mark: str) -> None:
+    """End a process and all that it started, which may outlive it."""
     if os.name != "posix":
         process.kill()
         return
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
+    end_started(process.pid, mark)
 
 
 def _how(code: int) -> str:

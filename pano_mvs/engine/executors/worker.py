@@ -17,13 +17,16 @@ import threading
 from functools import partial
 from typing import Any, BinaryIO
 
+from pano_mvs.engine.executors.started_processes import MARK, adopt_orphans, end_started
+
 
 def main() -> None:
     """Serve requests until the input ends."""
     requests_in, answers_out = _take_streams()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles interrupts
+    adopt_orphans()
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(requests_in, requests), daemon=True).start()
+    threading.Thread(target=_read, args=(requests_in, requests, os.environ.get(MARK, "")), daemon=True).start()
     from pano_mvs.engine.executors.worker_requests import run_request  # after the streams, because imports may print
 
     _answer(answers_out, {"ready": True})
@@ -52,11 +55,11 @@ def _close(*descriptors: int) -> None:
         os.close(descriptor)
 
 
-def _read(requests_in: BinaryIO, requests: queue.SimpleQueue[bytes]) -> None:
+def _read(requests_in: BinaryIO, requests: queue.SimpleQueue[bytes], mark: str) -> None:
     for line in requests_in:
         requests.put(line)
     if os.name == "posix" and os.getpgrp() == os.getpid():
-        os.killpg(0, signal.SIGKILL)
+        end_started(os.getpid(), mark)
     os._exit(0)
 
 

@@ -24,8 +24,7 @@ from pano_mvs.engine.stages.stage import StageSpec
 
 def run_request(request: Mapping[str, Any]) -> JobOutcome:
     """Compute the unit of a request; see `request_to_json`."""
-    global _left
-    if _left is not None and (changes := _left.restore().deciding):
+    if _LEFT and (changes := _LEFT[0].restore().deciding):
         return JobOutcome("failed", cause=f"a plugin changed {changes} in its worker after a unit", died=True)
     try:
         store = _store(*request["store"])
@@ -35,15 +34,15 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
     outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
-    _left = ProcessState.now() if has_plugins() else None
+    _LEFT[:] = [ProcessState.now(compared=True)] if has_plugins() else []
     for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
     return outcome
 
 
-_left: ProcessState | None = None
-"""The state of this process after its last unit, if it has loaded plugins."""
+_LEFT: list[ProcessState] = []
+"""The state of this process after its last unit, if it has loaded plugins; a list, which is the same for each unit."""
 
 
 def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from pano_mvs.core.text import shortened
 from pano_mvs.scene.image_header import (
     PNG_START,
     Entry,
@@ -234,6 +235,7 @@ _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
 _PACKET_BYTES = 1 << 20
 _MAX_WARNINGS = 3
+_MAX_SHOWN = 80  # characters of a field in a message
 
 
 @dataclass(frozen=True)
@@ -342,7 +344,7 @@ def _gpano(fields: dict[str, str], warnings: list[str]) -> GPano:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            warnings.append(f"its GPano field {name} is {text!r}, not a number, and was ignored")
+            warnings.append(f"its GPano field {name} is {shortened(text, _MAX_SHOWN)!r}, not a number, and was ignored")
             return None
         return value
 
@@ -354,7 +356,8 @@ def _gpano(fields: dict[str, str], warnings: list[str]) -> GPano:
         warnings.append(f"its GPano cropped area {crop} does not lie within {full[1]}×{full[0]} px and was ignored")
         crop = None
     angles = (number("PoseHeadingDegrees"), number("PosePitchDegrees"), number("PoseRollDegrees"))
-    return GPano(fields.get("ProjectionType", "equirectangular").lower(), full, crop, *angles)
+    kind = shortened(fields.get("ProjectionType", "equirectangular").lower(), _MAX_SHOWN)
+    return GPano(kind, full, crop, *angles)
 
 
 def _pixels(first: float | None, second: float | None) -> tuple[int, int] | None:

@@ -187,7 +187,8 @@ def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         found.append((file.replace("\\", "/"), _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
     require_distinct([name for name, _ in found], path)
     shared = _shared_folder([PurePosixPath(name) for name, _ in found])
-    return {str(PurePosixPath(name).relative_to(shared)): pose for name, pose in found}
+    # Of a share on a network, the shared folder has one slash in front instead of two, and as many parts.
+    return {str(PurePosixPath(*PurePosixPath(name).parts[len(shared.parts) :])): pose for name, pose in found}
 
 
 def _shared_folder(files: list[PurePosixPath]) -> PurePosixPath:

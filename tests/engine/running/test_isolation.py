@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import queue
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.run import Run
-from tests.engine.conftest import Toy, ran
+from tests.engine.conftest import Toy, ran, start
 from tests.engine.running.test_executors import Make, files_below, run_with, told, two_processes
 from tests.engine.running.test_run import ALL_UNITS
 
@@ -54,9 +55,11 @@ def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_imp
     edit(
         toy,
         """import cv2, math
-if not cv2.useOptimized() or math.floor(1.5) != 1: raise ValueError("tainted")
+from pano_mvs.api import Panorama
+if not cv2.useOptimized() or math.floor(1.5) != 1 or Panorama.load is None: raise ValueError("tainted")
 cv2.setUseOptimized(False)
-math.floor = lambda x: 7""",
+math.floor = lambda x: 7
+Panorama.load = None""",
     )
     if at_import:
         change = "import cv2, math\ncv2.setUseOptimized(False)\nmath.floor = lambda x: 7\nimport time"
@@ -66,7 +69,8 @@ math.floor = lambda x: 7""",
     assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
     assert ran(result) == ran(clean) == ALL_UNITS
     notes = {note for stage in result.stages for note in stage.notes}
-    assert any("it changed OpenCV's optimisation, math.floor in its process; this was undone" in note for note in notes)
+    change = "OpenCV's optimisation, math.floor, pano_mvs.scene.panorama.Panorama.load"
+    assert any(f"it changed {change} in its process; this was undone" in note for note in notes)
 
 
 @pytest.mark.parametrize("how", ["returns", "raises"])
@@ -156,3 +160,47 @@ def test_answers_to_other_requests_are_ignored(tmp_path: Path) -> None:
     process.wait()
     assert found is not None
     assert found.cause == "mine"
+
+
+def leave_behind(toy: Toy, way: str, then: str = "") -> Path:
+    """Let the second unit of a stage leave a process of another session behind; return the file with its id."""
+    pids = toy.folder / "pids"
+    daemon = f"""if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
+        time.sleep(600)
+    os._exit(0)"""
+    command = f"""import subprocess
+child = subprocess.Popen(["sleep", "600"], start_new_session=True, env={{}})
+open({str(pids)!r}, "a").write(f"{{child.pid}} ")"""
+    lines = (
+        f"{daemon if way == 'daemon' else command}\nwhile not os.path.exists({str(pids)!r}): time.sleep(0.01)\n{then}"
+    )
+    edit(toy, "if x.value == 20:\n" + "\n".join(f"    {line}" for line in lines.splitlines()))
+    return pids
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not show what left the group of a process")
+@pytest.mark.parametrize(
+    ("way", "end"),  # nothing connects a command without environment with a worker that has died
+    [(way, end) for end in ("run", "timeout", "SIGTERM", "SIGKILL") for way in ("daemon", "command")]
+    + [("daemon", "death")],
+)
+def test_processes_of_other_sessions_end_with_the_run(toy: Toy, way: str, end: str) -> None:
+    """A child that had left the process group of its worker outlived the run."""
+    then = {"run": "", "death": "os._exit(3)"}.get(end, "time.sleep(600)")
+    pids = leave_behind(toy, way, then)
+    if not end.startswith("SIG"):
+        assert run_with(toy, two_processes, "scaled.timeout_s=3").exit_code == (0 if end == "run" else 3)
+    else:
+        process = start(toy, "--executor", "processes", "--workers", "2")
+        while not pids.exists():
+            assert process.poll() is None
+            time.sleep(0.05)
+        for _ in range(2):  # the second one does not wait for running units
+            process.send_signal(signal.Signals[end])
+            time.sleep(1)
+        process.communicate(timeout=30)
+    assert ended(pids)

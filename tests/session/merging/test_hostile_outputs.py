@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import pkgutil
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,20 +15,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pano_mvs
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.file_names import item_problem
 from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
 from pano_mvs.evaluation.ranges.evaluate import evaluate_depth
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
 from pano_mvs.io.colmap.writer import write_colmap_model
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.poses.metashape import write_metashape
+from pano_mvs.io.poses.other_json import write_openmvg
+from pano_mvs.io.rig_calibration import read_rig
 from pano_mvs.report.page import gather_report, write_page
 from pano_mvs.results.run_output import load
 from pano_mvs.results.stored_values import StoredValues
-from pano_mvs.scene import Poses
+from pano_mvs.scene import FilePart, Poses
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.session.merging.merge import merge_outputs
+from pano_mvs.share.maps import run_plans
 from pano_mvs.share.share import share_run
 from pano_mvs.viewer.shown_scene import open_scene
 from tests.algorithms.blocks.walked_blocks import some_world
-from tests.hostile_names import HOSTILE_NAMES
+from tests.hostile_names import HOSTILE_NAMES, LONG_NAMES
 from tests.session.merging.written_blocks import SIZE_HW, write_block
 
 
@@ -84,10 +96,83 @@ def _opensfm(out: Path, poses: Poses) -> None:
     (out / "reconstruction.json").write_text(json.dumps([{"cameras": cameras, "shots": shots}]))
 
 
+def _openmvg(out: Path, poses: Poses) -> None:
+    shutil.rmtree(out / "colmap/sparse")
+    write_openmvg(out / "sfm_data.json", poses, dict.fromkeys(poses.names, SIZE_HW))
+
+
+def _alicevision(out: Path, poses: Poses) -> None:
+    shutil.rmtree(out / "colmap/sparse")
+    views, placed = [], []
+    for number, (name, pose) in enumerate(poses.cameras.items()):
+        views.append({"viewId": str(number), "poseId": str(number), "intrinsicId": "0", "path": name})
+        transform = {"rotation": pose.rotation.T.ravel().tolist(), "center": pose.center.tolist()}
+        placed.append({"poseId": str(number), "pose": {"transform": transform}})
+    cameras = [{"intrinsicId": "0", "type": "equirectangular"}]
+    scene = {"version": ["1", "2", "3"], "views": views, "intrinsics": cameras, "poses": placed}
+    (out / "cameras.sfm").write_text(json.dumps(scene))
+
+
+def _metashape(out: Path, poses: Poses) -> None:
+    shutil.rmtree(out / "colmap/sparse")
+    text = replace(poses, names=tuple(name.translate(_NOT_XML) for name in poses.names))
+    write_metashape(out / "cameras.xml", text, dict.fromkeys(text.names, SIZE_HW), file_from_world=np.eye(3))
+
+
+_NOT_XML = {ord(sign): "" for sign in "\x07\x1b"}
 SECRET = b"what nobody may read"
-FORMATS: tuple[Callable[[Path, Poses], None], ...] = (
-    *(_colmap, _colmap_text, _transforms, _poses_json, _csv, _opensfm),
-)
+FORMATS: dict[str, Callable[[Path, Poses], None]] = {
+    "io.colmap.reader.read_colmap_model": _colmap,
+    "io.colmap.reader.read_colmap_model (text)": _colmap_text,
+    "io.poses.json_files.read_transforms": _transforms,
+    "io.poses.json_files.read_posed_views": _poses_json,
+    "io.poses.files.read_csv": _csv,
+    "io.poses.other_json.opensfm_poses": _opensfm,
+    "io.poses.other_json.openmvg_poses": _openmvg,
+    "io.poses.other_json.alicevision_poses": _alicevision,
+    "io.poses.metashape.read_metashape": _metashape,
+}
+"""Reader of poses to what writes a file for it. A new reader is added here."""
+
+_BY_WAY_OF_THESE = {
+    *(f"io.poses.files.{name}" for name in ("read_poses", "read_groups")),
+    *(f"io.colmap.reader.{name}" for name in ("read_cameras", "read_images", "read_points")),
+    *("evaluation.inputs.read_truth", "evaluation.inputs.read_cameras"),  # names of poses, matched with those of images
+}
+_OTHERS = {  # readers of files that state names, with the test of them; the readers of arrays and pictures state none
+    "results.run_output.load": "test_hostile_names_in_run_json_name_no_file",
+    "session.merging.files.load_blocks": "test_commands_write_nothing_for_hostile_names",
+    "viewer.shown_scene.open_scene": "test_commands_write_nothing_for_hostile_names",
+    "share.maps.run_plans": "test_hostile_names_of_floor_plans_are_left_out",
+    "io.ranges.keys_of_npz": "test_arrays_of_an_archive_are_not_names_of_files",
+    "io.rig_calibration.read_rig": "test_hostile_names_of_lenses_are_refused",
+}
+_NO_NAMES = {
+    *(f"io.ply.{name}" for name in ("read_ply", "read_ply_mesh", "read_ply_points", "open_ply_points")),
+    *(f"io.ranges.read_{name}" for name in ("range_tiff", "range_png", "normals", "confidence_png", "npy", "exr")),
+    *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.keyframe_file.read_times"),
+    *("io.images.metadata.read_container", "io.splats.open_mask", "share.mesh_file.read_glb"),
+    *(f"io.poses.json_files.{name}" for name in ("read_json", "read_json_value")),
+    *("report.cloud_renderer.read_pictures", "session.merging.block_runs.open_blocks", "session.session.open_session"),
+}
+
+
+def test_every_reader_is_here() -> None:
+    known = {name.partition(" ")[0] for name in FORMATS} | _BY_WAY_OF_THESE | _OTHERS.keys() | _NO_NAMES
+    found = set()
+    for package in ("io", "results", "share", "report", "viewer", "evaluation", "session"):
+        for module in pkgutil.walk_packages([str(Path(pano_mvs.__path__[0]) / package)], f"pano_mvs.{package}."):
+            path = Path(pano_mvs.__path__[0], *module.name.split(".")[1:])
+            source = path / "__init__.py" if module.ispkg else path.with_suffix(".py")
+            for node in ast.parse(source.read_text()).body:
+                name = f"{module.name.removeprefix('pano_mvs.')}.{getattr(node, 'name', '')}"
+                if isinstance(node, ast.FunctionDef) and re.fullmatch(_READER, name):
+                    found.add(name)
+    assert found == known
+    assert set(_OTHERS.values()) <= globals().keys()
+
+
+_READER = r"io\..*\.\w+_poses|.*\.((read|load|open)(_\w+)?|run_plans|keys_of_npz)"
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
@@ -104,19 +189,27 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("write", FORMATS)
-@pytest.mark.parametrize("name", HOSTILE_NAMES)
-def test_hostile_names_of_poses_are_refused(
-    blocks: Path, tmp_path: Path, name: str, write: Callable[[Path, Poses], None]
-) -> None:
+@pytest.mark.parametrize("reader", FORMATS)
+@pytest.mark.parametrize("name", HOSTILE_NAMES + LONG_NAMES)
+def test_hostile_names_of_poses_are_refused(blocks: Path, tmp_path: Path, name: str, reader: str) -> None:
+    """Hostile names are refused, or what they name is a file below the folder of images."""
     block = tmp_path / "block"
     (block / "colmap/sparse/0").mkdir(parents=True)
     shutil.copy(blocks / "block_0/run.json", block)
     poses = load(blocks / "block_0").poses
     assert poses is not None
-    write(block, replace(poses, names=(*poses.names[:-1], name)))
-    with pytest.raises(InputError, match=r"its name"):
-        load(block).poses  # noqa: B018
+    FORMATS[reader](block, replace(poses, names=(*poses.names[:-1], name)))
+    if (cameras := block / "cameras.xml").exists():  # these are read only by their own name, and matched with images
+        assert match_image_names(poses.names, read_poses(cameras).cameras).keys() <= set(poses.names)
+        return
+    try:
+        found = load(block).poses
+    except InputError as error:
+        assert "its name" in str(error)  # noqa: PT017  # some formats state the folder by itself
+        return
+    assert found is not None
+    assert "openmvg" in reader or "alicevision" in reader
+    assert not [name for name in found.names if item_problem(name)]
 
 
 def test_commands_write_nothing_for_hostile_names(blocks: Path, tmp_path: Path) -> None:
@@ -185,3 +278,40 @@ def test_arrays_of_an_archive_are_not_names_of_files(tmp_path: Path, name: str) 
     with pytest.raises(InputError, match="its name"):
         write_depth_pictures(out, evaluation)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", HOSTILE_NAMES + LONG_NAMES)
+def test_hostile_names_of_floor_plans_are_left_out(blocks: Path, tmp_path: Path, name: str) -> None:
+    runs = tmp_path / "deep" / "runs"
+    shutil.copytree(blocks, runs)
+    (tmp_path / "secret.png").write_bytes(SECRET)
+    block = runs / "block_0"
+    (block / "floor_plan").mkdir()
+    storey = {"png": name, "floor": 0.0, "cut": 1.0, "corner": [0, 0], "size_px": [4, 4], "metres_per_pixel": 1.0}
+    about = {"file_from_world": np.eye(3).tolist(), "storeys": [storey]}
+    (block / "floor_plan/floor_plan.json").write_text(json.dumps(about))
+    plans, note = run_plans(load(block), Rigid3.identity())
+    assert plans == []
+    assert "floor_plan.json was left out" in note
+
+
+def test_links_of_a_floor_plan_do_not_lead_outside(blocks: Path, tmp_path: Path) -> None:
+    block = tmp_path / "block"
+    shutil.copytree(blocks / "block_0", block)
+    (block / "floor_plan").mkdir()
+    write_png(tmp_path / "secret.png", np.zeros((4, 4, 3), np.uint8))
+    (block / "floor_plan/plan.png").symlink_to(tmp_path / "secret.png")
+    about = {"file_from_world": np.eye(3).tolist(), "storeys": [{"png": "plan.png"}]}
+    (block / "floor_plan/floor_plan.json").write_text(json.dumps(about))
+    assert "a link leads outside" in run_plans(load(block), Rigid3.identity())[1]
+
+
+@pytest.mark.parametrize("name", HOSTILE_NAMES + LONG_NAMES)
+def test_hostile_names_of_lenses_are_refused(tmp_path: Path, name: str) -> None:
+    """Pictures of lenses are found by the names of the lenses."""
+    lens = {"size_px": [64, 64], "focal_px": [20, 20], "centre_px": [32, 32], "distortion": [0, 0, 0, 0]}
+    rig = {"model": "opencv_fisheye", "first_pixel_px": 0.5, "lenses": {"front": lens, name: lens}}
+    path = tmp_path / "rig.yaml"
+    path.write_text(json.dumps(rig))
+    with pytest.raises(InputError, match=r"the name .* of a lens must consist of letters|rig.yaml:1:"):
+        read_rig(FilePart(path))

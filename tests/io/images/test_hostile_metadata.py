@@ -1,0 +1,218 @@
+"""Valid containers with hostile values in their fields: EXIF, GPano in XMP, and boxes of HEIC, AVIF and MP4 files.
+
+A picture is described, or refused by an error that names it; nothing else is raised, and nothing huge is allocated.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from functools import cache
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.images.captures import describe_picture
+from pano_mvs.io.images.metadata import focal_from_exif, orientation_from_exif, position_from_exif, read_container
+from pano_mvs.io.images.video import describe_video, frames_between
+from pano_mvs.scene.image_file import MAX_PIXELS
+from tests.io.images.pictures import app1, exif, full_sphere, picture, png_chunk, xmp
+
+NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 0x7F, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1]) | st.integers(0, 2**32 - 1)
+TAGS = st.sampled_from([0x0112, 0x8769, 0x8825, 0xA405, 700, 256, 257, *range(7)]) | st.integers(0, 0xFFFF)
+TEXTS = st.sampled_from(
+    [
+        *(
+            "",
+            " ",
+            "nan",
+            "-inf",
+            "1e308",
+            "-1e308",
+            "1e-320",
+            "2e9",
+            "-1",
+            "0",
+            "0.5",
+            "64",
+            "128",
+            "4096",
+            "8192",
+            "1e9",
+        ),
+        *(
+            "9" * 400,
+            "9" * 5000,
+            "0x40",
+            "١٢٨",
+            "1_000",
+            "true",
+            "128 px",
+            "\U0001f600",
+            "equirectangular",
+            "cylindrical",
+        ),
+    ]
+) | st.text(st.characters(codec="utf-8", exclude_characters="<&>\"'\0", exclude_categories=["Cc", "Cs"]), max_size=8)
+FIELDS = [*full_sphere(1, 2), "PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees"]
+
+
+@st.composite
+def hostile_exif(draw: st.DrawFn) -> bytes:
+    """Return a TIFF of three directories one behind the other, whose fields have any types, counts and values."""
+    order, is_big = draw(st.sampled_from("<>")), draw(st.booleans())
+    head = {"<": b"II", ">": b"MM"}[order]
+    word, entry, count_form = ("Q", "HHQQ", "Q") if is_big else ("I", "HHII", "H")
+    data = head + (struct.pack(order + "HHHQ", 43, 8, 0, 16) if is_big else struct.pack(order + "HI", 42, 8))
+    for _ in range(3):
+        entries = draw(st.lists(st.tuples(TAGS, st.integers(0, 20), NUMBERS, NUMBERS), max_size=4))
+        stated = draw(st.just(len(entries)) | st.sampled_from([0, 1000, 0xFFFF]))
+        inside = draw(st.booleans())
+        data += struct.pack(order + count_form, stated)
+        for tag, kind, count, value in entries:
+            data += struct.pack(
+                order + entry, tag, kind, count % 4 if inside else count, value % 80 if inside else value
+            )
+        data += struct.pack(order + word, 0)
+    return data + bytes(32)
+
+
+@given(hostile_exif())
+@settings(max_examples=100, deadline=None)
+def test_any_exif_is_read(data: bytes) -> None:
+    position = position_from_exif(data)
+    assert position is None or (abs(position[0]) <= 90 and abs(position[1]) <= 180)
+    assert 1 <= orientation_from_exif(data) <= 8
+    focal = focal_from_exif(data, (64, 128))
+    assert focal is None or focal > 0
+    read_container(data)
+
+
+@cache
+def plain(suffix: str) -> bytes:
+    return bytes(cv2.imencode(suffix, picture((64, 128)))[1])
+
+
+def with_packet(kind: str, packet: bytes) -> bytes:
+    """Return a picture with an XMP packet, in the way of its container."""
+    data = plain(f".{kind}")
+    if kind == "jpg":
+        return data[:2] + app1(b"http://ns.adobe.com/xap/1.0/\0" + packet) + data[2:]
+    if kind == "png":
+        return data[:33] + png_chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + packet) + data[33:]
+    if kind == "webp":
+        chunk = b"XMP " + struct.pack("<I", len(packet)) + packet + bytes(len(packet) % 2)
+        return data[:4] + struct.pack("<I", len(data) - 8 + len(chunk)) + data[8:] + chunk
+    return data + struct.pack(">I4s", 8 + len(packet), b"uuid") + packet
+
+
+PAIRS = st.tuples(NUMBERS, NUMBERS)
+ANGLES = st.tuples(PAIRS, PAIRS, PAIRS)
+
+
+@given(st.sampled_from("<>"), ANGLES, ANGLES, PAIRS, st.integers(0, 0xFFFF))
+@settings(max_examples=100, deadline=None)
+def test_any_position_is_read(order: str, latitude: Any, longitude: Any, altitude: Any, orientation: int) -> None:
+    data = exif(order, latitude=latitude, longitude=longitude, altitude=altitude, orientation=orientation)
+    position = position_from_exif(data)
+    assert position is None or (abs(position[0]) <= 90 and abs(position[1]) <= 180)
+    assert 1 <= orientation_from_exif(data) <= 8
+
+
+KINDS, FORMS = st.sampled_from(["jpg", "png", "webp", "avif"]), st.sampled_from(["element", "attribute"])
+
+
+@given(st.dictionaries(st.sampled_from(FIELDS), TEXTS), KINDS, FORMS)
+@settings(max_examples=100, deadline=None)
+def test_any_gpano_costs_at_most_its_picture(fields: dict[str, str], kind: str, form: str) -> None:
+    """A GPano field of 2·10⁹ columns ended the run of all pictures."""
+    described_or_refused(with_packet(kind, xmp(full_sphere(64, 128) | fields, form=form)))
+
+
+def described_or_refused(data: bytes) -> None:
+    path = Path("folder/hostile.img")
+    try:
+        info = describe_picture(path, data)
+    except InputError as error:
+        assert str(path) in str(error)  # noqa: PT017
+        assert len(str(error)) < 3000  # noqa: PT017
+        return
+    assert info.size_hw[0] * info.size_hw[1] <= MAX_PIXELS
+
+
+def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, start of the contents and end of all boxes of an ISO file, those inside boxes too."""
+    at, end = start, len(data) if end is None else end
+    while at + 8 <= end:
+        size, kind = struct.unpack_from(">I4s", data, at)
+        if size < 8 or at + size > end:
+            return
+        yield kind, at + 8, at + size
+        if kind in {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"dinf", b"edts", b"iprp", b"ipco", b"meta", b"iinf"}:
+            yield from boxes(data, at + 8 + (4 if kind == b"meta" else 0), at + size)
+        at += size
+
+
+def with_hostile_fields(data: bytes, changes: list[tuple[int, int, int, int]]) -> bytes:
+    """Return an ISO file in which words of boxes, or their sizes, are replaced: (box, word, value, width)."""
+    changed, found = bytearray(data), list(boxes(data))
+    for box, word, value, width in changes:
+        kind, start, end = found[box % len(found)]
+        at = start - 8 + width * (word % max(1, (min(end, start + 120) - start + 8) // width))
+        if kind != b"mdat" and at + width <= len(changed):
+            changed[at : at + width] = (value & (256**width - 1)).to_bytes(width, "big")
+    return bytes(changed)
+
+
+CHANGES = st.lists(
+    st.tuples(st.integers(0, 60), st.integers(0, 40), NUMBERS, st.sampled_from([1, 2, 4, 8])), min_size=1, max_size=3
+)
+
+
+@given(CHANGES)
+@settings(max_examples=60, deadline=None)
+def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]]) -> None:
+    described_or_refused(with_hostile_fields(plain(".avif"), changes))
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=3), hostile_exif())
+@settings(max_examples=40, deadline=None)
+def test_any_stated_sizes_of_a_picture_are_read(sizes: list[tuple[int, int]], about: bytes) -> None:
+    ispe = b"".join(struct.pack(">I4sIII", 20, b"ispe", 0, width, height) for width, height in sizes)
+    ftyp = struct.pack(">I4s4sI4s", 20, b"ftyp", b"heic", 0, b"mif1")
+    described_or_refused(ftyp + ispe + struct.pack(">I4s", 8 + len(about), b"mdat") + b"Exif\0\0" + about)
+
+
+@cache
+def video() -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
+        form: Any = cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(path), form, 5.0, (128, 64))
+        for number in range(6):
+            writer.write(np.full((64, 128, 3), 40 * number, np.uint8))
+        writer.release()
+        return path.read_bytes()
+
+
+@pytest.mark.slow
+@given(CHANGES)
+@settings(max_examples=150, deadline=None)
+def test_any_boxes_of_a_video_are_read(changes: list[tuple[int, int, int, int]]) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
+        path.write_bytes(with_hostile_fields(video(), changes))
+        try:
+            describe_video(path)
+            for _, frame in islice(frames_between(path, 0.0, 10.0), 10):
+                assert frame.size <= 3 * MAX_PIXELS
+        except InputError as error:
+            assert str(path) in str(error)  # noqa: PT017
