@@ -11,7 +11,7 @@ from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid
-from pano_mvs.io.images.captures import is_tour, list_scenes
+from pano_mvs.io.images.tours import is_tour, list_scenes
 from pano_mvs.session.session import open_session
 from pano_mvs.stages.source import TourParams, list_tour, tour
 from tests.io.images.tours import LAYOUTS, NAMES, color_of, face_of, write, write_tour
@@ -81,7 +81,7 @@ def test_a_preset_reads_the_scenes_of_a_tour_that_it_is_given(tmp_path: Path, la
     assert stage.spec.name == "source.tour"
     assert isinstance(stage.params, TourParams)
     notes = next(iter(list_tour(stage.params))).notes
-    assert notes == ("2 scenes of a virtual tour are read from the faces of their cubes",)
+    assert notes == ("2 scenes of a virtual tour are read",)
 
 
 def test_a_tour_keeps_the_settings_that_both_sources_have(tmp_path: Path) -> None:
@@ -111,7 +111,9 @@ def test_panoramas_are_not_taken_for_a_tour(tmp_path: Path) -> None:
     assert not is_tour(tmp_path / "dates")
     folder = write_tour(tmp_path / "tour", "Marzipano")
     assert is_tour(folder)
-    write(folder / "panorama.png", face_of("f"))
+    write(folder / "plan.png", face_of("f"))
+    assert is_tour(folder)
+    write(folder / "panorama.png", np.tile(face_of("f"), (1, 2, 1)))
     assert not is_tour(folder)
     write_tour(tmp_path / "one", "Marzipano", ("hall",))
     assert not is_tour(tmp_path / "one")
