@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.faces.arrangement import arranged_faces
 from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
@@ -222,7 +223,9 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
     """
     if _WHOLE in item.files:
         return _equirectangular(item, params, ctx)
-    faces = {face: _joined(item, face) for face in FACES}
+    faces, rearranged = arranged_faces({face: _joined(item, face) for face in FACES})
+    if rearranged:
+        ctx.note("the faces of {count} cubes did not fit together and were put in the order in which their edges do")
     side = faces["f"].shape[0]
     width = min(params.max_width, 4 * side) // 4 * 4
     kept = ctx.scratch / "panorama.png"

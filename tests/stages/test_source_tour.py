@@ -127,3 +127,26 @@ def test_a_named_source_and_plain_pictures_are_not_taken_for_a_tour(tmp_path: Pa
         write(tmp_path / f"faces/hall_{face}.png", face_of(face))
     assert not is_tour(tmp_path / "faces")
     assert not is_tour(tmp_path / "nothing")
+
+
+SKYBOX = dict(zip("ufrbld", range(6), strict=True))
+
+
+@pytest.mark.parametrize("form", ["{scene}_skybox{number}_sami.png", "{scene}/skybox{number}.png"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_skyboxes_of_matterport_are_read(tmp_path: Path, form: str, turned: bool) -> None:
+    """0 is up, 1 to 4 follow each other to the right, 5 is down; the edges of u and d lie at 1. Others are turned."""
+    uuids = ("0f37bd0737e349de9d536263a4bdd60d", "1e6b606b44df4a6086c0f97e826d4d15")
+    for number, uuid in enumerate(uuids):
+        for face in CUBE:
+            picture = np.rot90(face_of(face, number), turned and face in "ud")
+            write(tmp_path / "skyboxes" / form.format(scene=uuid, number=SKYBOX[face]), np.ascontiguousarray(picture))
+    folder = tmp_path / "skyboxes"
+    assert is_tour(folder) is form.endswith("sami.png")
+    items = list(list_tour(TourParams.model_validate({"path": folder})))
+    assert [item.name for item in items] == [f"{uuid}.png" for uuid in uuids]
+    context = Context(np.random.default_rng(0), tmp_path, 1)
+    panorama = tour(items[0], TourParams.model_validate({"path": folder}), context)
+    difference = panorama.load().astype(int) - color_of(ray_grid((128, 256)), 0)
+    assert np.abs(difference).max() <= 6
+    assert any("did not fit together" in note for note in context.notes) is turned
