@@ -47,6 +47,16 @@ def leads_outside(path: str) -> bool:
     return path.startswith("/") or ".." in parts or "\\" in path or "\0" in path or drive
 
 
+def plain_title(text: str) -> str:
+    """Return a title as a part of a path that is valid on every system, of at most 96 bytes; "" if nothing is left.
+
+    >>> plain_title("Hall/2nd floor: east?")
+    'Hall 2nd floor east'
+    """
+    kept = "".join(sign if is_printable(sign) and sign not in _INVALID_CHARACTERS + "/\\" else " " for sign in text)
+    return " ".join(kept.split()).encode()[:96].decode(errors="ignore").strip(" .")
+
+
 def path_problem(name: str) -> str:
     """Return why a name with forward slashes cannot be that of a file below a folder, or "" if it can."""
     if not name or not is_printable(name):

@@ -55,7 +55,7 @@ class RecentPictures:
                 self._pictures.popitem(last=False)
 
 
-_OF_RIGS = frozenset({"rig", "first_lens", "second_lens"})
+_OF_SOME = frozenset({"rig", "first_lens", "second_lens", "links"})
 _RECENT = RecentPictures(limit_bytes=48 << 20)
 
 
@@ -80,6 +80,7 @@ class Panorama(Record):
         rig: the lenses from whose pictures the panorama was stitched, or None if they are not known.
         first_lens: the file with the picture of the rig's first lens, or None without a rig.
         second_lens: the file of the second lens; None if `first_lens` shows both side by side.
+        links: names of panoramas that are known to lie nearby, such as those to which a scene of a tour leads.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -98,14 +99,16 @@ class Panorama(Record):
     rig: LensRig | None = None
     first_lens: FilePart | None = None
     second_lens: FilePart | None = None
+    links: tuple[str, ...] = ()
 
     def to_parts(self) -> Parts:
-        """Return the panorama with its rig as JSON; without a rig, nothing is stored about one."""
+        """Return the panorama with its rig as JSON; nothing is stored about a rig or links that it does not have."""
         parts = dict(super().to_parts())
         meta = parts["meta"]
         assert isinstance(meta, dict)
-        plain = {key: value for key, value in meta.items() if key not in _OF_RIGS}
-        return parts | {"meta": plain if self.rig is None else plain | {"rig": self.rig.to_values()}}
+        meta = {key: value for key, value in meta.items() if key not in _OF_SOME}
+        meta |= {} if self.rig is None else {"rig": self.rig.to_values()}
+        return parts | {"meta": meta | ({"links": self.links} if self.links else {})}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:

@@ -16,7 +16,8 @@ from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
-from pano_mvs.io.images.captures import VIDEO_SUFFIXES, is_tour
+from pano_mvs.io.images.captures import VIDEO_SUFFIXES
+from pano_mvs.io.images.tours import is_tour
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 

@@ -73,15 +73,16 @@ def automatic(
 ) -> Pairs:
     """Match all pairs of up to 57 images; in larger captures, match each image with at most 28 others.
 
-    These are chosen by the order of the capture if consecutive images are similar, by the positions of GPS or of an
-    earlier stage that returns poses, and by similarity.
+    These are chosen by the links of a virtual tour, by the order of the capture if consecutive images are similar, by
+    the positions of GPS or of an earlier stage that returns poses, and by similarity.
     """
     settings = arguments_from(automatic_pairs, params)
     if most_pairs(len(descriptors), settings["candidates"]) < len(descriptors) * (len(descriptors) - 1) // 2:
         positions = gps_positions(images) if poses is None else dict(zip(poses.names, poses.centers, strict=True))
     else:
         positions = {}
-    pairs, reason = automatic_pairs(descriptors, positions, **settings)
+    links = {name: image.links for name, image in images.items() if image.links}
+    pairs, reason = automatic_pairs(descriptors, positions, links, **settings)
     ctx.metric("pairs", len(pairs.pairs))
     if reason:
         count = len(descriptors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,13 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.faces.arrangement import arranged_faces
 from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.images.captures import FACES, PictureInfo, describe_picture, list_pictures, list_scenes
+from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.images.copies import Copy, find_copies
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
+from pano_mvs.io.images.tour_configurations import FACES
+from pano_mvs.io.images.tours import TourScene, list_scenes
 from pano_mvs.scene.image_file import (
     MASK_BYTES_PER_PIXEL,
     MAX_PIXELS,
@@ -174,6 +178,9 @@ def _is_mask(path: Path, params: FolderParams) -> bool:
     return path.absolute() == mask or (masks is not None and path.absolute().is_relative_to(masks))
 
 
+_WHOLE = "panorama"  # the role of an equirectangular image among the files of a scene
+
+
 class TourParams(Params):
     """Settings of source.tour."""
 
@@ -189,20 +196,36 @@ def list_tour(params: TourParams) -> Iterator[SourceItem]:
     scenes = list_scenes(params.path, notes)
     if len(scenes) < 2:
         raise InputError(f"{params.path}: contains only one scene ({scenes[0].name}); depth needs two or more")
-    notes.append(f"{len(scenes)} scenes of a virtual tour are read from the faces of their cubes")
+    links = sum(len(scene.links) for scene in scenes)
+    linked = f"; {links} links between them are hints for the selection of pairs" if links else ""
+    notes.append(f"{len(scenes)} scenes of a virtual tour are read{linked}")
+    items = {
+        scene.name: f"{scene.name}{'.png' if scene.panorama is None else scene.panorama.suffix}" for scene in scenes
+    }
     for scene in scenes:
-        files = {f"{face}_{row}_{column}": path for (face, row, column), path in scene.tiles.items()}
-        yield SourceItem(f"{scene.name}.png", files, notes=tuple(notes))
+        links = tuple(items[name] for name in scene.links)
+        yield SourceItem(items[scene.name], _files_of(scene), notes=tuple(notes), links=links)
+
+
+def _files_of(scene: TourScene) -> dict[str, Path]:
+    if scene.panorama is not None:
+        return {_WHOLE: scene.panorama}
+    return {f"{face}_{row}_{column}": path for (face, row, column), path in scene.tiles.items()}
 
 
 @source("source.tour", list_items=list_tour, memory="1GB")
 def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
     """Read the panoramas of a virtual tour from the tiles of their cubes, in the finest resolution.
 
-    Known are the tiles of Marzipano, Pannellum and krpano, and six files for each scene. The panoramas are stored
-    without loss, as `<scene>.png`, with the front face in the middle.
+    The configuration of Marzipano, Pannellum or krpano names the scenes, their tiles or equirectangular images, and
+    their links. Without one, the tiles of these programs, skyboxes of Matterport, and six files for each scene are
+    known by their names. Cubes are stored without loss, as `<scene>.png`, with the front face in the middle.
     """
-    faces = {face: _joined(item, face) for face in FACES}
+    if _WHOLE in item.files:
+        return _equirectangular(item, params, ctx)
+    faces, rearranged = arranged_faces({face: _joined(item, face) for face in FACES})
+    if rearranged:
+        ctx.note("the faces of {count} cubes did not fit together and were put in the order in which their edges do")
     side = faces["f"].shape[0]
     width = min(params.max_width, 4 * side) // 4 * 4
     kept = ctx.scratch / "panorama.png"
@@ -215,7 +238,14 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
         source_size_hw=size_hw,
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
+        links=item.links,
     )
+
+
+def _equirectangular(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
+    plain = FolderParams.model_validate(params.model_dump())
+    image = SourceItem(item.name, {"image": item.files[_WHOLE]}, digests={"image": item.digests.get(_WHOLE, "")})
+    return replace(folder(image, plain, ctx), links=item.links)
 
 
 def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:

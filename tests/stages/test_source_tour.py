@@ -11,7 +11,7 @@ from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import ray_grid
-from pano_mvs.io.images.captures import is_tour, list_scenes
+from pano_mvs.io.images.tours import is_tour, list_scenes
 from pano_mvs.session.session import open_session
 from pano_mvs.stages.source import TourParams, list_tour, tour
 from tests.io.images.tours import LAYOUTS, NAMES, color_of, face_of, write, write_tour
@@ -81,7 +81,7 @@ def test_a_preset_reads_the_scenes_of_a_tour_that_it_is_given(tmp_path: Path, la
     assert stage.spec.name == "source.tour"
     assert isinstance(stage.params, TourParams)
     notes = next(iter(list_tour(stage.params))).notes
-    assert notes == ("2 scenes of a virtual tour are read from the faces of their cubes",)
+    assert notes == ("2 scenes of a virtual tour are read",)
 
 
 def test_a_tour_keeps_the_settings_that_both_sources_have(tmp_path: Path) -> None:
@@ -111,7 +111,9 @@ def test_panoramas_are_not_taken_for_a_tour(tmp_path: Path) -> None:
     assert not is_tour(tmp_path / "dates")
     folder = write_tour(tmp_path / "tour", "Marzipano")
     assert is_tour(folder)
-    write(folder / "panorama.png", face_of("f"))
+    write(folder / "plan.png", face_of("f"))
+    assert is_tour(folder)
+    write(folder / "panorama.png", np.tile(face_of("f"), (1, 2, 1)))
     assert not is_tour(folder)
     write_tour(tmp_path / "one", "Marzipano", ("hall",))
     assert not is_tour(tmp_path / "one")
@@ -125,3 +127,26 @@ def test_a_named_source_and_plain_pictures_are_not_taken_for_a_tour(tmp_path: Pa
         write(tmp_path / f"faces/hall_{face}.png", face_of(face))
     assert not is_tour(tmp_path / "faces")
     assert not is_tour(tmp_path / "nothing")
+
+
+SKYBOX = dict(zip("ufrbld", range(6), strict=True))
+
+
+@pytest.mark.parametrize("form", ["{scene}_skybox{number}_sami.png", "{scene}/skybox{number}.png"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_skyboxes_of_matterport_are_read(tmp_path: Path, form: str, turned: bool) -> None:
+    """0 is up, 1 to 4 follow each other to the right, 5 is down; the edges of u and d lie at 1. Others are turned."""
+    uuids = ("0f37bd0737e349de9d536263a4bdd60d", "1e6b606b44df4a6086c0f97e826d4d15")
+    for number, uuid in enumerate(uuids):
+        for face in CUBE:
+            picture = np.rot90(face_of(face, number), turned and face in "ud")
+            write(tmp_path / "skyboxes" / form.format(scene=uuid, number=SKYBOX[face]), np.ascontiguousarray(picture))
+    folder = tmp_path / "skyboxes"
+    assert is_tour(folder) is form.endswith("sami.png")
+    items = list(list_tour(TourParams.model_validate({"path": folder})))
+    assert [item.name for item in items] == [f"{uuid}.png" for uuid in uuids]
+    context = Context(np.random.default_rng(0), tmp_path, 1)
+    panorama = tour(items[0], TourParams.model_validate({"path": folder}), context)
+    difference = panorama.load().astype(int) - color_of(ray_grid((128, 256)), 0)
+    assert np.abs(difference).max() <= 6
+    assert any("did not fit together" in note for note in context.notes) is turned

@@ -132,6 +132,7 @@ def loop_closing_pairs(
 def automatic_pairs(
     descriptors: Mapping[str, GlobalDescriptor],
     positions: Mapping[str, FloatArray],
+    links: Mapping[str, Collection[str]],
     *,
     candidates: Annotated[
         int, Setting("number of images to match each one with; all pairs are matched while these are no more", ge=1)
@@ -139,14 +140,16 @@ def automatic_pairs(
 ) -> tuple[Pairs, str]:
     """Return every pair while there are few, and else a bounded number for each image from all that the capture offers.
 
-    An image is paired with the ones that follow it, if at least half of the images are
-    among the most similar ones of the image before. To these are added the images that are nearest by position (of
-    images at one place, the most similar ones), and as many of the most similar ones as are left of `candidates`; these
-    close loops. Separate groups are joined by the most similar links.
+    An image is paired with those that it is linked with, then with the ones that follow it, if at least half of the
+    images are among the most similar ones of the image before. To these are added the images that are nearest by
+    position (of images at one place, the most similar ones), and as many of the most similar ones as are left of
+    `candidates`; these close loops. Separate groups are joined by the most similar links.
 
     Args:
         descriptors: image name to its global descriptor, in the capture's order.
         positions: image name to position in one frame and unit; some or all may be missing.
+        links: image name to the images that are known to lie nearby, in either direction; some or all may be missing.
+            If they are more than `candidates`, the most similar ones count.
         candidates: each image adds at most this number of pairs.
 
     Returns:
@@ -160,12 +163,18 @@ def automatic_pairs(
         return exhaustive_pairs(names), ""
     looks = _dissimilarities(names, descriptors, candidates)
     left, chosen, reasons = np.full(count, candidates), np.eye(count, dtype=np.bool_), list[str]()
+    if (linked := _linked(names, links)).any():
+        number = np.minimum(linked.sum(axis=1), left)
+        _choose(chosen, number, looks, apart=np.where(linked, 0.0, np.inf))
+        left -= number
+        reasons.append(f"the {np.count_nonzero(np.triu(linked))} links between them")
     following = _share_that_follow(looks)
     if following >= 0.5:
         window = min(_WINDOW, candidates)
         for step in range(1, window + 1):
-            chosen |= np.eye(count, k=step, dtype=np.bool_) | np.eye(count, k=-step, dtype=np.bool_)
-        left -= window
+            before = np.flatnonzero(left[:-step] >= step)
+            chosen[before, before + step] = chosen[before + step, before] = True
+        left -= np.minimum(window, left)
         reasons.append(f"the next {window} in order, because {100 * following:.0f} % look like the one before")
     located = np.array([name in positions for name in names])
     if located.any():
@@ -180,6 +189,16 @@ def automatic_pairs(
     links = _joined(np.argwhere(np.triu(chosen, 1)), looks)
     reasons.append(f"{'the rest' if reasons else f'the {candidates} most similar'} by their key points")
     return _named(names, {(a, b) for a, b in links.tolist()}), ", ".join(reasons)
+
+
+def _linked(names: Sequence[str], links: Mapping[str, Collection[str]]) -> NDArray[np.bool_]:
+    """Return which images are linked in either direction, (N, N)."""
+    idx_of = {name: idx for idx, name in enumerate(names)}
+    linked = np.zeros((len(names), len(names)), np.bool_)
+    for name in links.keys() & idx_of.keys():
+        others = [idx_of[other] for other in links[name] if other in idx_of and other != name]
+        linked[idx_of[name], others] = linked[others, idx_of[name]] = True
+    return linked
 
 
 def most_pairs(images: int, candidates: int) -> int:

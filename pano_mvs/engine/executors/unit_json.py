@@ -259,9 +259,9 @@ def _input_from_json(value: Any) -> UnitInput:
 
 def _source_to_json(item: SourceItem) -> dict[str, Any]:
     files = {role: str(path.absolute()) for role, path in item.files.items()}
-    return {"name": item.name, "files": files, "digests": dict(item.digests)}
+    return {"name": item.name, "files": files, "links": item.links, "digests": dict(item.digests)}
 
 
 def _source_from_json(value: Mapping[str, Any]) -> SourceItem:
     files = {role: Path(path) for role, path in value["files"].items()}
-    return SourceItem(value["name"], files, digests=value["digests"])
+    return SourceItem(value["name"], files, links=tuple(value["links"]), digests=value["digests"])

@@ -150,7 +150,7 @@ def resolve_source(
         except InputError as error:
             resolution.blocked[item.name] = str(error)
             continue
-        inputs = {"files": digests, "name": item.name}
+        inputs = {"files": digests, "name": item.name, **({"links": list(item.links)} if item.links else {})}
         key = _key(common, inputs)
         unit = Unit(
             entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, replace(item, digests=digests)

@@ -96,6 +96,7 @@ class SourceItem:
         problem: why the item cannot be used, if that is known when it is listed.
         notes: what a user should know in every run, even if the result is cached, such as notes on the location of
             files, which is not part of the key.
+        links: names of items that are known to lie nearby, as the links of a virtual tour say; part of the key.
         digests: role to the digest of the file when it was listed; filled in by the engine.
     """
 
@@ -103,6 +104,7 @@ class SourceItem:
     files: Mapping[str, Path]
     problem: str = ""
     notes: tuple[str, ...] = ()
+    links: tuple[str, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
 
     def file(self, role: str) -> FilePart:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.xml_text import xml_root
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
 from pano_mvs.scene.poses import Poses
@@ -60,12 +61,12 @@ def _parsed(path: Path) -> ElementTree.Element:
         data = path.read_bytes() if size <= _MAX_BYTES else b""
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    if not data or b"<!DOCTYPE" in data[:1000].upper() or b"<!ENTITY" in data.upper():
-        raise InputError(f"{path}: is too large, empty, or declares XML entities, which Metashape does not write")
+    if not data:
+        raise InputError(f"{path}: is empty, or larger than {_MAX_BYTES >> 20} MiB")
     try:
-        return ElementTree.fromstring(data)  # noqa: S314  # without entities
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: not an XML file ({error})") from error
+        return xml_root(data)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}. Export the cameras of Metashape as XML") from error
 
 
 def _similarity(transform: ElementTree.Element | None, where: str) -> Similarity3:

@@ -233,7 +233,7 @@ def shuffled(looks: Mapping[str, GlobalDescriptor]) -> dict[str, GlobalDescripto
 
 
 def test_few_images_are_all_paired(looks: dict[str, GlobalDescriptor]) -> None:
-    pairs, reason = automatic_pairs(looks, {})
+    pairs, reason = automatic_pairs(looks, {}, {})
     assert (set(pairs.pairs), reason) == (set(exhaustive_pairs(list(looks)).pairs), "")
 
 
@@ -241,7 +241,7 @@ def test_few_images_are_all_paired(looks: dict[str, GlobalDescriptor]) -> None:
 def test_many_images_have_bounded_pairs_of_the_same_place(
     walk: PathCapture, looks: dict[str, GlobalDescriptor], candidates: int
 ) -> None:
-    pairs, reason = automatic_pairs(shuffled(looks), {}, candidates=candidates)
+    pairs, reason = automatic_pairs(shuffled(looks), {}, {}, candidates=candidates)
     pairs.check()
     assert groups(looks, pairs.pairs) == 1
     assert len(pairs.pairs) <= most_pairs(len(looks), candidates) + len(looks) - 1
@@ -251,7 +251,7 @@ def test_many_images_have_bounded_pairs_of_the_same_place(
 
 
 def test_order_counts_where_images_look_like_those_before(looks: dict[str, GlobalDescriptor]) -> None:
-    pairs, reason = automatic_pairs(looks, {}, candidates=7)
+    pairs, reason = automatic_pairs(looks, {}, {}, candidates=7)
     assert set(sequential_pairs(list(looks), window=5).pairs) <= set(pairs.pairs)
     assert reason.startswith("the next 5 in order")
 
@@ -260,14 +260,38 @@ def test_positions_count_where_images_have_them(looks: dict[str, GlobalDescripto
     """Half of the images have positions, at random, so that nothing else would pair those that are nearest."""
     rng = np.random.default_rng(4)
     places = {name: rng.normal(size=2) for name in list(looks)[::2]}
-    pairs, reason = automatic_pairs(shuffled(looks), places, candidates=12)
+    pairs, reason = automatic_pairs(shuffled(looks), places, {}, candidates=12)
     nearest = position_pairs(list(places), places, neighbours=10).pairs
     assert {frozenset(pair) for pair in nearest} <= {frozenset(pair) for pair in pairs.pairs}
     assert f"positions of {len(places)}" in reason
 
 
+@pytest.mark.parametrize("candidates", [2, 12])
+def test_linked_images_are_paired_first(looks: dict[str, GlobalDescriptor], candidates: int) -> None:
+    """Links at random, so that nothing else would pair those images; each is stated by one of its ends alone."""
+    mixed, rng = shuffled(looks), np.random.default_rng(8)
+    names = list(mixed)
+    order = rng.permutation(names).tolist()
+    links = {a: (b, "gone", a) for a, b in pairwise(order)}
+    pairs, reason = automatic_pairs(mixed, {}, links, candidates=candidates)
+    pairs.check()
+    wanted = {frozenset(pair) for pair in pairwise(order)}
+    assert wanted <= {frozenset(pair) for pair in pairs.pairs}
+    unlinked = {frozenset(pair) for pair in automatic_pairs(mixed, {}, {}, candidates=candidates)[0].pairs}
+    assert not wanted <= unlinked
+    assert len(pairs.pairs) <= most_pairs(len(names), candidates) + len(names) - 1
+    assert f"the {len(names) - 1} links between them" in reason
+
+
+def test_of_many_links_the_similar_ones_count(looks: dict[str, GlobalDescriptor]) -> None:
+    names = list(looks)
+    everything = dict.fromkeys(names, tuple(names))
+    pairs, _ = automatic_pairs(shuffled(looks), {}, everything, candidates=7)
+    assert pairs.pairs == automatic_pairs(shuffled(looks), {}, {}, candidates=7)[0].pairs
+
+
 def test_of_images_at_one_place_the_similar_ones_are_paired(looks: dict[str, GlobalDescriptor]) -> None:
     at_one_place = dict.fromkeys(looks, np.zeros(2))
     mixed = shuffled(looks)
-    pairs, _ = automatic_pairs(mixed, at_one_place, candidates=10)
-    assert pairs.pairs == automatic_pairs(mixed, {}, candidates=10)[0].pairs
+    pairs, _ = automatic_pairs(mixed, at_one_place, {}, candidates=10)
+    assert pairs.pairs == automatic_pairs(mixed, {}, {}, candidates=10)[0].pairs

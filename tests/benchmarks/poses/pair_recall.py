@@ -74,7 +74,7 @@ def main() -> None:
     for place in WRITERS:
         features, truth = capture(options.folder, place, options.views, width=options.width)
         began = time.process_time()
-        pairs, reason = automatic_pairs({name: vlad_descriptor(one) for name, one in features.items()}, {})
+        pairs, reason = automatic_pairs({name: vlad_descriptor(one) for name, one in features.items()}, {}, {})
         seconds = time.process_time() - began
         every = verified(features)
         chosen = {frozenset(pair) for pair in pairs.pairs}

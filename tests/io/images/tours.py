@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from xml.sax.saxutils import quoteattr
 
 import cv2
 import numpy as np
@@ -52,6 +54,48 @@ def write_tour(folder: Path, layout: str, scenes: tuple[str, ...] = ("1-hall", "
             if layout == "Marzipano":
                 write(folder / f"app-files/tiles/{scene}/1/{name}/0/0.png", face[::2, ::2])
     return folder
+
+
+CONFIGURATIONS: dict[str, str] = {"Marzipano": "app-files/data.js", "Pannellum": "tour.json", "krpano": "tour.xml"}
+"""Where the configuration of a tour is."""
+
+
+def write_configuration(
+    folder: Path, program: str, titles: Mapping[str, str], links: Mapping[str, Sequence[str]]
+) -> None:
+    """Write the configuration of a tour of `write_tour`, with a title and links for each scene."""
+    half = SIDE // 2
+    if program == "Marzipano":
+        sizes = [{"tileSize": 256, "size": 256, "fallbackOnly": True}]
+        sizes += [{"tileSize": half, "size": half}, {"tileSize": half, "size": SIDE}]
+        scenes = [
+            {"id": key, "name": title, "levels": sizes, "linkHotspots": [{"target": to} for to in links.get(key, [])]}
+            for key, title in titles.items()
+        ]
+        text = f"var APP_DATA = {json.dumps({'scenes': scenes}, indent=1)};\n"
+    elif program == "Pannellum":
+        tiles = {"path": "/%l/%s%y_%x", "extension": "png", "tileResolution": half, "maxLevel": 2}
+        stated = {
+            key: {
+                "title": title,
+                "type": "multires",
+                "multiRes": tiles | {"basePath": f"/{key}", "cubeResolution": SIDE},
+                "hotSpots": [{"type": "scene", "sceneId": to} for to in links.get(key, [])],
+            }
+            for key, title in titles.items()
+        }
+        text = json.dumps({"default": {"basePath": "./tour"}, "scenes": stated})
+    else:
+        text = "".join(
+            f"<scene name={quoteattr(key)} title={quoteattr(title)}><image><cube url="
+            f"{quoteattr(f'panos/{key}.tiles/%s/l%l/%0v/l%l_%s_%0v_%0h.png')} multires='{half},{half},{SIDE}'/></image>"
+            + "".join(f"<hotspot linkedscene={quoteattr(to.upper())}/>" for to in links.get(key, []))
+            + "</scene>"
+            for key, title in titles.items()
+        )
+        text = f"<krpano>{text}</krpano>"
+    (folder / CONFIGURATIONS[program]).parent.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIGURATIONS[program]).write_text(text, encoding="utf-8")
 
 
 def write(path: Path, picture: NDArray[np.uint8]) -> None:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 import pano_mvs
+from pano_mvs.io.images.tours import list_scenes
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 
@@ -41,12 +42,19 @@ class Offset(NamedTuple):
 
 def read_links(tour: Path) -> tuple[int, dict[tuple[str, str], float]]:
     """Return the number of scenes, and the azimuth in radians, to the right, of each link by (scene, target)."""
+    named = {}
+    for scene in list_scenes(tour, []):
+        for path in scene.tiles.values():
+            named[path.relative_to(tour).parts[-5]] = scene.name  # tiles/<id>/<level>/<face>/<row>/<column>.jpg
     for file in tour.rglob("data.js"):
         found = re.search(r"APP_DATA\s*=\s*(\{.*\})\s*;", file.read_text(encoding="utf-8"), re.DOTALL)
         if found:
             scenes = json.loads(found.group(1))["scenes"]
             return len(scenes), {
-                (scene["id"], link["target"]): float(link["yaw"]) for scene in scenes for link in scene["linkHotspots"]
+                (named[scene["id"]], named[link["target"]]): float(link["yaw"])
+                for scene in scenes
+                for link in scene["linkHotspots"]
+                if {scene["id"], link["target"]} <= named.keys()
             }
     raise SystemExit(f"{tour}: no data.js of a Marzipano tour in it")
 
