@@ -490,6 +490,12 @@ def calibrate_lenses(
             help="Rough angle of the image circles in degrees, a start value; 0: by camera, otherwise 195.",
         ),
     ] = 0.0,
+    up: Annotated[
+        str,
+        typer.Option(
+            "--up", help="Side of the first lens's picture where the top of the scene is, for upright panoramas."
+        ),
+    ] = "top",
     captures: Annotated[
         int, typer.Option("--captures", min=2, help="Maximum number of captures to use, the first ones.")
     ] = 12,
@@ -504,6 +510,7 @@ def calibrate_lenses(
         layout=layout,
         distance=distance,
         field_of_view_deg=field_of_view,
+        up=up,
         captures=captures,
         console=Console(),
     )

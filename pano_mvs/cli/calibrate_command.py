@@ -13,7 +13,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.io.images.captures import Layout
 from pano_mvs.io.rig_calibration import calibration_text
-from pano_mvs.session.calibrating import calibrate_camera
+from pano_mvs.session.calibrating import QUARTER_TURNS, calibrate_camera
 from pano_mvs.session.scaling import metres_from_text
 
 _LAYOUTS = ("auto", "side_by_side", "folders", "suffixes")
@@ -28,6 +28,7 @@ def calibrate(
     layout: str,
     distance: str,
     field_of_view_deg: float,
+    up: str,
     captures: int,
     console: Console,
 ) -> None:
@@ -40,6 +41,7 @@ def calibrate(
         layout: how the pictures of both lenses are stored.
         distance: distance between the lenses, with its unit; empty if unknown.
         field_of_view_deg: start value; 0 for that of the camera.
+        up: side of the first lens's picture where the top of the scene is.
         captures: maximum number of captures to use.
         console: where to print.
 
@@ -53,6 +55,8 @@ def calibrate(
         raise UsageError(f"--lenses {names[:80]!r}: give two different names, separated by a comma: front,back")
     if layout not in _LAYOUTS:
         raise UsageError(f"--layout {layout[:80]!r}: choose one of {', '.join(_LAYOUTS)}")
+    if up not in QUARTER_TURNS:
+        raise UsageError(f"--up {up[:80]!r}: choose one of {', '.join(QUARTER_TURNS)}")
     distance_m = metres_from_text(distance) if distance else None
     if distance_m is not None and distance_m > _MAX_DISTANCE_M:
         raise UsageError(
@@ -64,6 +68,7 @@ def calibrate(
         layout=cast(Layout, layout),
         distance_m=distance_m,
         field_of_view_deg=field_of_view_deg or None,
+        up=up,
         max_captures=captures,
         progress=lambda step: console.print(step, highlight=False, style="dim"),
     )

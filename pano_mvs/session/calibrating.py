@@ -12,7 +12,7 @@ from pano_mvs.algorithms.lens_calibration.calibrate import Calibration, View, ca
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import LensRig, Rigid3
+from pano_mvs.geometry import LensRig, Rigid3, rotation_from_rotvec
 from pano_mvs.io.images.captures import Layout, RigPictures, list_rig_pictures
 from pano_mvs.io.images.metadata import camera_from_exif, read_container
 from pano_mvs.scene import FilePart
@@ -25,6 +25,9 @@ _FIELDS_OF_VIEW_DEG = {"theta s": 202.0, "gear 360": 195.0}
 """Field of view of the image circles by parts of the camera's name in EXIF: start values."""
 _USUAL_FIELD_OF_VIEW_DEG = 195.0
 
+QUARTER_TURNS = {"top": 0, "right": 1, "bottom": 2, "left": -1}
+"""Turn of the rig about the axis of the first lens by the side of its picture where the top of the scene is."""
+
 
 def calibrate_camera(
     folder: Path,
@@ -33,6 +36,7 @@ def calibrate_camera(
     layout: Layout = "auto",
     distance_m: float | None = None,
     field_of_view_deg: float | None = None,
+    up: str = "top",
     max_captures: int = 12,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[LensRig, list[str]]:
@@ -44,6 +48,8 @@ def calibrate_camera(
         layout: see `list_rig_pictures`.
         distance_m: distance between the centres of the lenses; None if unknown, then the rig is not metric.
         field_of_view_deg: about the full angle of the image circles; None for that of the camera in the EXIF data.
+        up: side of the first lens's picture where the top of the scene is, one of QUARTER_TURNS; the panoramas are
+            then upright.
         max_captures: number of captures that are used, the first ones.
         progress: is called with each step.
 
@@ -71,12 +77,13 @@ def calibrate_camera(
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     length_m = ASSUMED_DISTANCE_M if distance_m is None else distance_m
-    offset = length_m * found.second_from_first.translation
+    second_from_first = Rigid3(found.second_from_first.rotation, length_m * found.second_from_first.translation)
+    first_from_rig = Rigid3(rotation_from_rotvec([0.0, 0.0, QUARTER_TURNS[up] * np.pi / 2]), np.zeros(3))
     determined = bool(np.isfinite(found.offset_std))
     rig = LensRig.centred(
         names,
         found.lenses,
-        (Rigid3.identity(), Rigid3(found.second_from_first.rotation, offset)),
+        (first_from_rig, second_from_first @ first_from_rig),
         metric=distance_m is not None and determined,
     )
     return rig, _described(found, names, len(captures), length_m=length_m, is_given=distance_m is not None)

@@ -22,6 +22,7 @@ CAMERAS = RIG.stop
 _FIRST_DAMPING = 1e-4
 _CONVERGED = 1e-5
 _GAUGE_WEIGHT = 1e8
+_LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +76,12 @@ class Freedom:
         sigmas: (20,) standard deviations of f, cx, cy and k1 to k4 of both lenses, the rotation (radians) and the
             offset of the second lens about their start values; 0 holds a value, inf leaves it free.
         start: (20,) the start values; those of the rotation are 0.
+        moving: whether the centres of the cameras are adjusted. If they are held in one place, points are directions.
     """
 
     sigmas: FloatArray
     start: FloatArray
+    moving: bool = True
 
 
 def residuals_px(bundle: RigBundle) -> FloatArray:
@@ -91,8 +94,8 @@ def adjust_rig(
 ) -> tuple[RigBundle, FloatArray]:
     """Return the adjusted bundle and the covariance of its lenses and rig, (20, 20).
 
-    The length of the longest baseline from the first camera is held. The covariance is that of noise in the key points
-    only, as large as the residuals show; rows of held values are 0.
+    The length of the longest baseline from the first camera is held, if there is one. The covariance is that of noise
+    in the key points only, as large as the residuals show; rows of held values are 0.
 
     Args:
         bundle: start values.
@@ -165,6 +168,8 @@ class _System:
         held = np.zeros(size, np.bool_)
         held[: len(freedom.sigmas)] = freedom.sigmas == 0
         held[CAMERAS : CAMERAS + 6] = True
+        if not freedom.moving:
+            held[CAMERAS:].reshape(-1, 6)[:, 3:] = True
         self._free = ~held
 
     def _add_prior(self, bundle: RigBundle, freedom: Freedom, turned: FloatArray) -> None:
@@ -191,7 +196,9 @@ class _System:
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
         """Return the system without the points, its right-hand side, and the inverse of the points' blocks."""
         diagonal = np.einsum("pii->pi", self._point_blocks)
-        damped = self._point_blocks + (damping * diagonal + 1e-12)[..., None] * np.eye(3)
+        # Seen from one place, a point may lie anywhere along its ray.
+        least = _LEAST_SHARE * diagonal.sum(axis=1, keepdims=True) + 1e-12
+        damped = self._point_blocks + (damping * diagonal + least)[..., None] * np.eye(3)
         inverse = sparse.bsr_array(
             (np.linalg.inv(damped), np.arange(len(damped)), np.arange(len(damped) + 1)),
             shape=(3 * len(damped), 3 * len(damped)),

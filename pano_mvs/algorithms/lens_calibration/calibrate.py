@@ -38,7 +38,7 @@ from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import FisheyeLens, Rigid3, angle_between, rotation_from_rotvec
-from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene import Features, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 
 View = tuple[int, int]
@@ -121,6 +121,11 @@ class _State:
     second_from_first: Rigid3
     cameras: Mapping[int, Rigid3]
 
+    @property
+    def is_moving(self) -> bool:
+        """Whether the cameras are in more than one place."""
+        return any(pose.translation.any() for pose in self.cameras.values())
+
     def rays(self, view: View, pixels: FloatArray) -> FloatArray:
         """Return the rays of pixels (K, 2) in the frame of the view's lens, (K, 3)."""
         return self.lenses[view[1]].ray_from_pixel(pixels)
@@ -143,7 +148,8 @@ def calibrate_lenses(
 
     Args:
         load: returns the picture of a view, (H, W, 3) uint8; all pictures of a lens have the same size.
-        count: number of captures, from at least two places.
+        count: number of captures. If all are from one place, with the camera turned between them, the offset of the
+            second lens is not determined.
         field_of_view_deg: about the full angle of the image circles.
         rng: draws samples.
         progress: is called with each step.
@@ -173,8 +179,10 @@ def calibrate_lenses(
         state = _state(bundle, state, radii)
     assert bundle is not None
     length = float(np.linalg.norm(bundle.offset))
-    offset_std = float(np.sqrt(np.linalg.eigvalsh(covariance[RIG, RIG][3:, 3:])[-1])) / length
-    if not offset_std < _MAX_OFFSET_STD:
+    offset_std = np.nan
+    if length > 0:
+        offset_std = float(np.sqrt(np.linalg.eigvalsh(covariance[RIG, RIG][3:, 3:])[-1])) / length
+    if length > 0 and not offset_std < _MAX_OFFSET_STD:
         bundle, covariance = _adjusted(
             seen, state, _freedom(state, centers, with_offset=False), threshold_deg=2 * _ROUNDS[-1][0]
         )
@@ -207,7 +215,8 @@ def _observed(
     features, pixels, matches = {}, {}, {}
     width = min(_MAX_WIDTH, round(2 * np.pi * max(lens.focal_xy[0] for lens in lenses)) // 4 * 4)
     for capture, lens_idx in product(range(count), (0, 1)):
-        progress(f"finding key points, capture {capture + 1} of {count}")
+        if lens_idx == 0:
+            progress(f"finding key points, capture {capture + 1} of {count}")
         lens = lenses[lens_idx]
         panorama, valid = lens_panorama(load((capture, lens_idx)), lens, size_hw=(width // 2, width))
         found = extract_sift(panorama, valid, max_keypoints=_KEYPOINTS)
@@ -321,27 +330,39 @@ def _placed(
         }
         tried.append((sum(len(view) for view in pairs.values() if view), start, features, pairs))
     _, start, features, pairs = max(tried, key=lambda one: one[0])
-    poses = _largest_group(solve_scaled_translation(features, pairs, rng=rng), pairs)
+    poses = solve_scaled_translation(features, pairs, rng=rng)
+    if not poses.names:
+        return replace(start, cameras=_turned(pairs))
+    group = split_groups(poses)[0]
     cameras = {
         int(name): Rigid3(rotation, translation)
-        for name, rotation, translation in zip(poses.names, poses.rotations, poses.translations, strict=True)
+        for name, rotation, translation in zip(group.names, group.rotations, group.translations, strict=True)
     }
     return replace(start, cameras=cameras)
 
 
-def _largest_group(poses: Poses, pairs: Mapping[tuple[str, str], TwoView]) -> Poses:
-    if len(poses.names):
-        return split_groups(poses)[0]
-    if any(view.geometry == "rotation" for view in pairs.values()):
-        raise InputError(
-            "all pictures were taken from the same place, which does not determine the lenses. Give pictures from two "
-            "or more places, half a metre or more apart"
-        )
-    reasons = "; ".join(sorted({view.reason for view in pairs.values() if view.reason})[:2])
-    raise InputError(
-        f"the pictures could not be connected with each other ({reasons}). Give 6 to 12 pictures of one place with "
-        "texture, taken half a metre to a metre apart, with the camera turned between them"
+def _turned(pairs: Mapping[tuple[str, str], TwoView]) -> dict[int, Rigid3]:
+    """Return the poses of captures that were taken from one place, by the rotations of their best pairs."""
+    cameras: dict[int, Rigid3] = {}
+    best = sorted(
+        (pair for pair, view in pairs.items() if view.geometry == "rotation"), key=lambda pair: -len(pairs[pair])
     )
+    if best:
+        cameras[int(best[0][0])] = Rigid3.identity()
+    for _ in best:
+        for first, second in best:
+            turn = Rigid3(pairs[first, second].rotation, np.zeros(3))
+            if int(first) in cameras and int(second) not in cameras:
+                cameras[int(second)] = turn @ cameras[int(first)]
+            elif int(second) in cameras and int(first) not in cameras:
+                cameras[int(first)] = turn.inverse() @ cameras[int(second)]
+    if not cameras:
+        reasons = "; ".join(sorted({view.reason for view in pairs.values() if view.reason})[:2])
+        raise InputError(
+            f"the pictures could not be connected with each other ({reasons}). Give 6 to 12 pictures of one place with "
+            "texture, taken half a metre to a metre apart, with the camera turned between them"
+        )
+    return cameras
 
 
 def _capture_features(seen: _Seen, state: _State, capture: int) -> Features:
@@ -386,7 +407,7 @@ def _agreeing(seen: _Seen, state: _State, *, threshold_deg: float) -> dict[tuple
             errors, agree = agreement(Rigid3(pose.rotation, pose.translation / length), p, q, threshold_rad=threshold)
         else:
             errors = angle_between(p @ pose.rotation.T, q)
-            agree = errors < np.radians(_RIM_THRESHOLD_DEG)
+            agree = errors < (np.radians(_RIM_THRESHOLD_DEG) if first[0] == second[0] else 1.5 * threshold)
         pairs[_name(first), _name(second)] = TwoView(
             matches[agree], np.eye(3), np.zeros(3), errors[agree].astype(np.float32), "general"
         )
@@ -436,14 +457,24 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         lens_idx[:, None] == 0, state.lenses[0].ray_from_pixel(pixels), state.lenses[1].ray_from_pixel(pixels)
     )
     rotations = np.array([pose.rotation for pose in lens_from_world])
-    found = triangulate_observations(
-        np.array([pose.center for pose in lens_from_world])[tracks.image_idx],
-        np.einsum("nji,nj->ni", rotations[tracks.image_idx], rays),
-        tracks.track_idx,
-        count=tracks.count,
-        max_error_rad=float(np.radians(max_error_deg)),
-        min_angle_rad=float(np.radians(_MIN_ANGLE_DEG)),
-    )
+    in_world = np.einsum("nji,nj->ni", rotations[tracks.image_idx], rays)
+    max_error = float(np.radians(max_error_deg))
+    if state.is_moving:
+        centers = np.array([pose.center for pose in lens_from_world])[tracks.image_idx]
+        found = triangulate_observations(
+            centers,
+            in_world,
+            tracks.track_idx,
+            count=tracks.count,
+            max_error_rad=max_error,
+            min_angle_rad=float(np.radians(_MIN_ANGLE_DEG)),
+        )
+        points, valid, used = found.points_in_world, found.valid, found.used
+    else:
+        points = np.stack([np.bincount(tracks.track_idx, axis, tracks.count) for axis in in_world.T], axis=1)
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+        used = angle_between(points[tracks.track_idx], in_world) < max(max_error, np.radians(_RIM_THRESHOLD_DEG))
+        valid = np.bincount(tracks.track_idx[used], minlength=tracks.count) >= 2
     number = {capture: idx for idx, capture in enumerate(order)}
     bundle = RigBundle(
         lenses=np.array([[lens.focal_xy[0], *lens.principal_xy, *lens.distortion] for lens in state.lenses]),
@@ -451,13 +482,13 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         offset=state.second_from_first.translation,
         rotations=np.array([pose.rotation for pose in poses]),
         translations=np.array([pose.translation for pose in poses]),
-        points=found.points_in_world,
+        points=points,
         pixels=pixels,
         lens_idx=lens_idx.astype(np.intp),
         camera_idx=np.array([number[view[0]] for view in views], np.intp)[tracks.image_idx],
         point_idx=tracks.track_idx.astype(np.intp),
     )
-    return bundle.only(found.used & _some_points(found.valid)[tracks.track_idx])
+    return bundle.only(used & _some_points(valid)[tracks.track_idx])
 
 
 def _some_points(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
