@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec, skew
@@ -134,36 +133,22 @@ class _System:
         redundancy = 1 - min((size + 3 * len(bundle.points)) / max(2 * len(errors), 1), 0.9)
         noise = np.median(np.hypot(*errors.T)) / np.sqrt(2 * np.log(2)) if len(errors) else 0.0
         self._noise = float(noise / np.sqrt(redundancy))
-        rows = np.arange(2 * len(errors)).reshape(-1, 2, 1)
-        camera_part = sparse.csr_array(
-            (
-                (by_camera * root[:, None, None]).ravel(),
-                (
-                    np.broadcast_to(rows, by_camera.shape).ravel(),
-                    np.broadcast_to(columns[:, None], by_camera.shape).ravel(),
-                ),
-            ),
-            shape=(2 * len(errors), size),
-        )
-        point_columns = 3 * bundle.point_idx[:, None, None] + np.arange(3)
-        point_part = sparse.csr_array(
-            (
-                (by_point * root[:, None, None]).ravel(),
-                (
-                    np.broadcast_to(rows, by_point.shape).ravel(),
-                    np.broadcast_to(point_columns, by_point.shape).ravel(),
-                ),
-            ),
-            shape=(2 * len(errors), 3 * len(bundle.points)),
-        )
-        weighted = (errors * root[:, None]).ravel()
-        self._both = (camera_part.T @ point_part).tocsr()
-        self._camera_block = (camera_part.T @ camera_part).toarray()
-        self._camera_side, self._point_side = -(camera_part.T @ weighted), -(point_part.T @ weighted)
-        blocks = np.zeros((len(bundle.points), 3, 3))
-        weighted_blocks = np.einsum("m,mij,mik->mjk", root**2, by_point, by_point)
-        np.add.at(blocks, bundle.point_idx, weighted_blocks)
-        self._point_blocks = blocks
+        by_camera, by_point = by_camera * root[:, None, None], by_point * root[:, None, None]
+        weighted = errors * root[:, None]
+        self._both = np.zeros((size, len(bundle.points), 3))
+        self._camera_block, self._camera_side = np.zeros((size, size)), np.zeros(size)
+        view_idx = 2 * bundle.camera_idx + bundle.lens_idx
+        for view in np.unique(view_idx):  # a view sees a point once
+            seen = np.flatnonzero(view_idx == view)
+            own = columns[seen[0]]
+            rows = by_camera[seen].reshape(-1, by_camera.shape[-1])
+            self._camera_block[np.ix_(own, own)] += rows.T @ rows
+            self._camera_side[own] -= rows.T @ weighted[seen].ravel()
+            mixed = np.einsum("mki,mkj->imj", by_camera[seen], by_point[seen])
+            self._both[np.ix_(own, bundle.point_idx[seen])] += mixed
+        self._point_blocks, self._point_side = np.zeros((len(bundle.points), 3, 3)), np.zeros((len(bundle.points), 3))
+        np.add.at(self._point_blocks, bundle.point_idx, np.einsum("mki,mkj->mij", by_point, by_point))
+        np.add.at(self._point_side, bundle.point_idx, -np.einsum("mki,mk->mi", by_point, weighted))
         self._add_prior(bundle, freedom, turned)
         held = np.zeros(size, np.bool_)
         held[: len(freedom.sigmas)] = freedom.sigmas == 0
@@ -193,20 +178,17 @@ class _System:
                 _GAUGE_WEIGHT / lengths[farthest] ** 2 * np.outer(along, along)
             )
 
-    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
+    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the system without the points, its right-hand side, and the inverse of the points' blocks."""
         diagonal = np.einsum("pii->pi", self._point_blocks)
         # Seen from one place, a point may lie anywhere along its ray.
         least = _LEAST_SHARE * diagonal.sum(axis=1, keepdims=True) + 1e-12
-        damped = self._point_blocks + (damping * diagonal + least)[..., None] * np.eye(3)
-        inverse = sparse.bsr_array(
-            (np.linalg.inv(damped), np.arange(len(damped)), np.arange(len(damped) + 1)),
-            shape=(3 * len(damped), 3 * len(damped)),
-        ).tocsr()
-        eliminated = self._both @ inverse
+        inverse = np.linalg.inv(self._point_blocks + (damping * diagonal + least)[..., None] * np.eye(3))
+        size = len(self._camera_side)
+        eliminated = np.einsum("cpi,pij->cpj", self._both, inverse).reshape(size, -1)
         block = self._camera_block + damping * np.diag(np.diag(self._camera_block))
-        matrix = block - (eliminated @ self._both.T).toarray()
-        side = self._camera_side - eliminated @ self._point_side
+        matrix = block - eliminated @ self._both.reshape(size, -1).T
+        side = self._camera_side - eliminated @ self._point_side.ravel()
         return matrix[np.ix_(self._free, self._free)], side[self._free], inverse
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
@@ -214,8 +196,8 @@ class _System:
         matrix, side, inverse = self._reduced(damping)
         step = np.zeros(len(self._free))
         step[self._free] = _solved(matrix, side)
-        points = inverse @ (self._point_side - self._both.T @ step)
-        return step, np.asarray(points).reshape(-1, 3)
+        left = self._point_side - np.tensordot(step, self._both, axes=1)
+        return step, np.einsum("pij,pj->pi", inverse, left)
 
     def covariance(self) -> FloatArray:
         """Return the covariance of lenses and rig, (20, 20)."""

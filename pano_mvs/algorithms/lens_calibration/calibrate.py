@@ -328,7 +328,7 @@ def _placed(
             )
             for first, second in combinations(range(seen.count), 2)
         }
-        tried.append((sum(len(view) for view in pairs.values() if view), start, features, pairs))
+        tried.append((sum(map(len, pairs.values())), start, features, pairs))
     _, start, features, pairs = max(tried, key=lambda one: one[0])
     poses = solve_scaled_translation(features, pairs, rng=rng)
     if not poses.names:
