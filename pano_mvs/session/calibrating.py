@@ -130,8 +130,8 @@ def _described(found: Calibration, names: tuple[str, str], count: int, *, length
     lines.append(f"axes {axis:.2f}° from opposite; rotation between the lenses ± {found.turn_std_deg:.3f}°")
     if not np.isfinite(found.offset_std):
         lines.append(
-            "not determined: the offset between the lenses, which is 0 in the file. Closer surroundings, and turning "
-            "the camera between pictures, determine it"
+            "not determined: the offset between the lenses, which is 0 in the file. Pictures from several places near "
+            "things, with the camera turned between them, determine it"
         )
     elif is_given:
         lines.append(
