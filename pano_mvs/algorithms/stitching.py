@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import FisheyeLens, LensRig, ray_from_pixel
+from pano_mvs.geometry import FisheyeLens, LensRig, ray_from_pixel, ray_grid
 
 _SIZE_HW = (128, 256)
 _DARK, _BRIGHT = 24, 40
@@ -82,6 +82,17 @@ def stitch_lenses(
 
     for_bands(stitch_rows, height, threads=threads)
     return panorama, valid
+
+
+def lens_panorama(
+    picture: Picture, lens: FisheyeLens, *, size_hw: tuple[int, int]
+) -> tuple[Picture, NDArray[np.bool_]]:
+    """Return the panorama that one lens sees, its axis in the middle, (H, W, 3) uint8, and its valid pixels (H, W)."""
+    rays = ray_grid(size_hw)
+    pixels = lens.pixel_from_ray(rays)
+    valid = np.isfinite(pixels[..., 0]) & lens.contains(pixels)
+    seen = np.clip(np.rint(_sampled(_reduced(picture, lens, size_hw[1]), lens, rays)), 0, 255).astype(np.uint8)
+    return np.where(valid[..., None], seen, np.uint8(0)), valid
 
 
 def lens_weights(margins_rad: FloatArray, *, blend_rad: float) -> FloatArray:

@@ -146,6 +146,7 @@ class LensRig:
         lens_from_rig: pose of each lens, in metres; the mean of their centres is the origin of the rig.
         stitch_distance_m: D, may be inf.
         blend_deg: width of the strip around the seam in which the panorama mixes both pictures.
+        metric: whether the distance between the lenses was measured; if not, only its direction is known.
     """
 
     names: tuple[str, str]
@@ -153,6 +154,7 @@ class LensRig:
     lens_from_rig: tuple[Rigid3, Rigid3]
     stitch_distance_m: float = float("inf")
     blend_deg: float = 2.0
+    metric: bool = True
 
     @staticmethod
     def centred(
@@ -162,6 +164,7 @@ class LensRig:
         *,
         stitch_distance_m: float = float("inf"),
         blend_deg: float = 2.0,
+        metric: bool = True,
     ) -> LensRig:
         """Return the rig whose frame has the axes of a body frame, and its origin between the lenses.
 
@@ -171,7 +174,7 @@ class LensRig:
         middle = np.mean([pose.center for pose in lens_from_body], axis=0)
         body_from_rig = Rigid3(np.eye(3), middle)
         first, second = (pose @ body_from_rig for pose in lens_from_body)
-        rig = LensRig(names, lenses, (first, second), stitch_distance_m, blend_deg)
+        rig = LensRig(names, lenses, (first, second), stitch_distance_m, blend_deg, metric)
         if stitch_distance_m <= 2 * rig.lens_offset_m:
             raise UsageError(
                 f"the stitching distance of {stitch_distance_m:g} m is not outside of the rig, whose lens centres are "
@@ -266,7 +269,8 @@ class LensRig:
             for name, lens, pose in zip(self.names, self.lenses, self.lens_from_rig, strict=True)
         ]
         distance = None if np.isinf(self.stitch_distance_m) else self.stitch_distance_m
-        return {"lenses": lenses, "stitch_distance_m": distance, "blend_deg": self.blend_deg}
+        values = {"lenses": lenses, "stitch_distance_m": distance, "blend_deg": self.blend_deg}
+        return values if self.metric else values | {"metric": False}
 
     @classmethod
     def from_values(cls, values: dict[str, Any]) -> Self:
@@ -289,4 +293,5 @@ class LensRig:
             (poses[0], poses[1]),
             float("inf") if distance is None else distance,
             values["blend_deg"],
+            values.get("metric", True),
         )

@@ -1,4 +1,4 @@
-"""Read the calibration of a rig of two fisheye lenses from a YAML file.
+"""Read and write the calibration of a rig of two fisheye lenses as a YAML file.
 
     model: kannala_brandt
     first_pixel_px: 0.5
@@ -61,7 +61,10 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_d
     """
     place = _Place(file.path)
     root = _parsed(file, place)
-    place.require_keys(root, ("model", "first_pixel_px", "lenses"))
+    place.require_keys(root, ("model", "first_pixel_px", "lenses"), optional=("metric",))
+    metric = root.get("metric", True)
+    if not isinstance(metric, bool):
+        place.fail(root, "metric", "must be true, or false if the length of the translations is only assumed")
     model = root["model"]
     if model not in MODELS:
         place.fail(root, "model", f"unknown model {model!r}. Supported: {', '.join(MODELS)} (the same model)")
@@ -89,9 +92,37 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_d
             (first[1], second[1]),
             stitch_distance_m=stitch_distance_m,
             blend_deg=blend_deg,
+            metric=metric,
         )
     except UsageError as error:
         raise InputError(f"{file.path}: {error}. Give a larger stitch_distance_m, or translations in metres") from error
+
+
+def calibration_text(rig: LensRig, *, comments: Sequence[str] = ()) -> str:
+    """Return the calibration file of a rig, which `read_rig` reads without loss of precision.
+
+    Args:
+        rig: the rig; the poses of its lenses are written in its own frame.
+        comments: lines at the beginning of the file.
+    """
+    lines = [*(f"# {comment}" for comment in comments), f"model: {MODELS[0]}", "first_pixel_px: 0.5"]
+    if not rig.metric:
+        lines.append("metric: false")
+    lines.append("lenses:")
+    for name, lens, pose in zip(rig.names, rig.lenses, rig.lens_from_rig, strict=True):
+        height, width = lens.size_hw
+        lines += [
+            f"  {name}:",
+            f"    image_size_px: [{width}, {height}]",
+            f"    focal_px: {list(lens.focal_xy)}",
+            f"    principal_point_px: {list(lens.principal_xy)}",
+            f"    distortion: {list(lens.distortion)}",
+            f"    field_of_view_deg: {float(np.degrees(2 * lens.max_angle_rad))!r}",
+            "    lens_from_rig:",
+            f"      rotation: {pose.rotation.tolist()}",
+            f"      translation_m: {pose.translation.tolist()}",
+        ]
+    return "\n".join(lines) + "\n"
 
 
 class _Place:
@@ -109,11 +140,11 @@ class _Place:
         """Raise InputError about a place, counted from 0."""
         raise InputError(f"{self._path}:{line + 1}:{column + 1}: {message}. {GUIDE}")
 
-    def require_keys(self, node: CommentedMap, keys: Sequence[str]) -> None:
-        """Raise InputError unless a mapping has exactly these keys."""
+    def require_keys(self, node: CommentedMap, keys: Sequence[str], *, optional: Sequence[str] = ()) -> None:
+        """Raise InputError unless a mapping has exactly these keys, and perhaps some optional ones."""
         for key in node:
-            if key not in keys:
-                self.fail(node, key, f"unknown key; the keys here are {', '.join(keys)}")
+            if key not in keys and key not in optional:
+                self.fail(node, key, f"unknown key; the keys here are {', '.join((*keys, *optional))}")
         missing = [key for key in keys if key not in node]
         if missing:
             self.fail_at(node.lc.line, node.lc.col, f"{missing[0]} is missing, and cannot be guessed")

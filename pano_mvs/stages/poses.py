@@ -161,6 +161,11 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     )
     if refined.metric and not poses.metric:
         ctx.note(f"unit of length: {refined.scale}")
+    elif rigs and not refined.metric and not all(rig.metric for rig in rigs.values()):
+        ctx.note(
+            "the poses are not in metres: the distance between the lenses is only assumed in the calibration. Measure "
+            "it and give it to pano-mvs calibrate with --distance"
+        )
     elif rigs and not refined.metric:
         ctx.note(
             "the distance between the lenses does not determine the unit of length here, so their offsets were "

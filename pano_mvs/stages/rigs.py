@@ -40,9 +40,9 @@ from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.stages.source import working_size
 
 _NO_CALIBRATION = (
-    "calibration is not given, and the parameters of fisheye lenses cannot be guessed from their pictures. Give the "
-    "calibration of this camera as a YAML file (docs/rigs.md states its keys and how to measure them), or export the "
-    "images as panorama with the camera maker's program (stitching) and use source.folder"
+    "calibration is not given. Estimate it from the pictures: pano-mvs calibrate {folder} --out rig.yaml, then --set "
+    "images.calibration=rig.yaml. If the camera was calibrated with another program, give its numbers as a YAML file "
+    "(docs/rigs.md); or export the images as panorama with the camera maker's program (stitching) and use source.folder"
 )
 
 
@@ -51,7 +51,8 @@ class DualFisheyeParams(Params):
 
     path: SourcePath = Field(description="folder of the fisheye pictures, searched recursively")
     calibration: SourcePath | None = Field(
-        default=None, description="YAML file with the parameters of both lenses and their poses; required"
+        default=None,
+        description="YAML file with the parameters of both lenses and their poses, see pano-mvs calibrate; required",
     )
     layout: Annotated[Layout, NOT_IN_KEY] = Field(
         default="auto",
@@ -89,7 +90,7 @@ def list_captures(params: DualFisheyeParams) -> Iterator[SourceItem]:
         InputError: if there is no calibration, it cannot be used, or there are fewer than two captures.
     """
     if params.calibration is None:
-        raise InputError(_NO_CALIBRATION)
+        raise InputError(_NO_CALIBRATION.format(folder=params.path))
     notes: list[str] = []
     rig = params.rig(FilePart(params.calibration))
     captures = list_rig_pictures(params.path, rig.names, params.layout, notes=notes)
@@ -210,6 +211,12 @@ def lens_rig_files(poses: Poses, images: Mapping[str, Panorama], form: ModelForm
     pictures = {name: _pictures(image, stems[name]) for name, image in images.items() if image.rig is not None}
     files: dict[str, Path] = {}
     if not pictures:
+        return files
+    if not all(image.rig.metric for image in images.values() if image.rig is not None):
+        ctx.note(
+            f"{FOLDER} was not written: the distance between the lenses is only assumed in the calibration. Measure it "
+            "and give it to pano-mvs calibrate with --distance (docs/rigs.md)"
+        )
         return files
     for number, group in enumerate(split_groups(poses)):
         if not group.metric:

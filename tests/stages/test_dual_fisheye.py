@@ -14,6 +14,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
+from pano_mvs.io.rig_calibration import calibration_text
 from pano_mvs.scene import Panorama
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.stages.exports.colmap import ModelParams, colmap
@@ -30,7 +31,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.poses.rig_capture import rig_capture
 from tests.cli.conftest import Command, pano_mvs
 from tests.stages.rig_images import tiny_rig, tiny_rig_capture, tiny_rig_panorama
-from tests.synthetic.fisheye_rig import Layout, calibration_text, example_rig, write_rig_capture
+from tests.synthetic.fisheye_rig import Layout, example_rig, write_rig_capture
 
 __all__ = ["pano_mvs"]  # a fixture
 
@@ -102,7 +103,9 @@ def test_the_width_is_that_of_the_lenses_unless_it_is_given_or_limited(tmp_path:
 
 
 def test_without_calibration_the_source_points_to_the_remedies() -> None:
-    with pytest.raises(InputError, match=r"cannot be guessed.*docs/rigs\.md.*camera maker's program.*source\.folder"):
+    with pytest.raises(
+        InputError, match=r"pano-mvs calibrate .*images --out rig\.yaml.*docs/rigs\.md.*camera maker's program"
+    ):
         list(list_captures(params(tiny_rig_capture(), calibration=None)))
 
 

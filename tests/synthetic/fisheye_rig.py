@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec
+from pano_mvs.io.rig_calibration import calibration_text
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import Room, colors_along
 
@@ -90,25 +91,6 @@ def render_rig(
         for lens, pose in zip(rig.lenses, rig.lens_from_rig, strict=True)
     )
     return first, second
-
-
-def calibration_text(rig: LensRig) -> str:
-    """Return the calibration file of a rig."""
-    lines = ["model: kannala_brandt", "first_pixel_px: 0.5", "lenses:"]
-    for name, lens, pose in zip(rig.names, rig.lenses, rig.lens_from_rig, strict=True):
-        height, width = lens.size_hw
-        lines += [
-            f"  {name}:",
-            f"    image_size_px: [{width}, {height}]",
-            f"    focal_px: {list(lens.focal_xy)}",
-            f"    principal_point_px: {list(lens.principal_xy)}",
-            f"    distortion: {list(lens.distortion)}",
-            f"    field_of_view_deg: {float(np.degrees(2 * lens.max_angle_rad))!r}",
-            "    lens_from_rig:",
-            f"      rotation: {pose.rotation.tolist()}",
-            f"      translation_m: {pose.translation.tolist()}",
-        ]
-    return "\n".join(lines) + "\n"
 
 
 def write_rig_capture(

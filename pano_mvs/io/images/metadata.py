@@ -163,7 +163,7 @@ _READERS: Mapping[ImageKind, Callable[[bytes], Container]] = {
 }
 
 
-_ORIENTATION, _GPS_DIRECTORY = 0x0112, 0x8825
+_MAKE, _MODEL, _ORIENTATION, _GPS_DIRECTORY = 0x010F, 0x0110, 0x0112, 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _EXIF_DIRECTORY, _FOCAL_35MM, _FILM_DIAGONAL_MM = 0x8769, 0xA405, 43.2666
 _DAMAGE = (struct.error, IndexError, ZeroDivisionError, OverflowError)
@@ -189,6 +189,17 @@ def orientation_from_exif(exif: bytes) -> int:
     except _DAMAGE:
         return 1
     return value if value is not None and 1 <= value <= 8 else 1
+
+
+def camera_from_exif(exif: bytes) -> str:
+    """Return the make and model of the camera, separated by a space; empty if not stated."""
+    try:
+        tiff = open_tiff(exif)
+        entries = {} if tiff is None else tiff.directory(tiff.first)
+        raw = [tiff.raw(entries[tag]) for tag in (_MAKE, _MODEL) if tiff is not None and tag in entries]
+    except _DAMAGE:
+        return ""
+    return " ".join(part.split(b"\0")[0].decode("ascii", "replace").strip() for part in raw)
 
 
 def focal_from_exif(exif: bytes, size_hw: tuple[int, int]) -> float | None:

@@ -13,7 +13,7 @@ from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estim
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import rotation_from_rotvec, spiral_rays
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec, spiral_rays
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 from tests.algorithms.poses.rig_capture import RigCapture, rig_capture
 
@@ -55,6 +55,28 @@ def test_a_tiny_offset_gives_no_unit_and_changes_nothing() -> None:
     assert not known.metric
     assert known.scale == "arbitrary"
     assert np.array_equal(known.centers, central.centers)
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_an_assumed_distance_helps_but_gives_no_metres(metric: bool) -> None:
+    capture = rig_capture()
+    rigs = {name: replace(rig, metric=False) for name, rig in capture.rigs.items()}
+    known = refine_poses(replace(capture.poses, metric=metric), rigs=rigs)
+    assert known.metric == metric
+    assert known.scale == capture.poses.scale
+    assert np.linalg.norm(known.centers[1]) == pytest.approx(np.linalg.norm(capture.poses.centers[1]), rel=0.05)
+    assert 3 * capture.errors(known)[0] < capture.errors(refine_poses(capture.poses))[0]
+
+
+def test_lenses_in_one_place_are_a_central_camera() -> None:
+    capture = rig_capture()
+    rigs = {
+        name: replace(rig, lens_from_rig=tuple(Rigid3(pose.rotation, np.zeros(3)) for pose in rig.lens_from_rig))
+        for name, rig in capture.rigs.items()
+    }
+    known, central = refine_poses(capture.poses, rigs=rigs), refine_poses(capture.poses)
+    assert np.array_equal(known.centers, central.centers)
+    assert not known.metric
 
 
 @pytest.mark.parametrize(("offset_m", "seed"), [(0.4, 3), (0.6, 1), (0.6, 2)])

@@ -17,6 +17,7 @@ from pano_mvs.geometry import rotation_from_rotvec
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.metadata import (
     GPano,
+    camera_from_exif,
     find_gpano,
     focal_from_exif,
     orientation_from_exif,
@@ -140,6 +141,7 @@ def test_damage_in_exif_is_never_a_crash(noise: bytes, offset: int, cut: int) ->
     damaged = (data[:offset] + noise + data[offset + len(noise) :])[: len(data) - cut]
     position = position_from_exif(damaged)
     assert 1 <= orientation_from_exif(damaged) <= 8
+    assert isinstance(camera_from_exif(damaged), str)
     assert position is None or (abs(position[0]) <= 90 and abs(position[1]) <= 180)
 
 
@@ -167,3 +169,12 @@ def test_the_focal_length_is_that_of_35_mm_film(tmp_path: Path) -> None:
     assert math.degrees(2 * math.atan(250 / focal_px)) == pytest.approx(84.06, abs=0.05)
     assert focal_from_exif(exif(), (300, 400)) is None
     assert focal_from_exif(b"", (300, 400)) is None
+
+
+def test_the_camera_is_its_make_and_model(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[0x010F], tags[0x0110] = "RICOH\0", "RICOH THETA S"
+    Image.new("RGB", (4, 2)).save(tmp_path / "a.jpg", exif=tags)
+    assert camera_from_exif(read_container((tmp_path / "a.jpg").read_bytes()).exif) == "RICOH RICOH THETA S"
+    assert camera_from_exif(exif()) == ""
+    assert camera_from_exif(b"") == ""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.rig_calibration import read_rig
+from pano_mvs.geometry import LensRig
+from pano_mvs.io.rig_calibration import calibration_text, read_rig
 from pano_mvs.scene import FilePart
-from tests.synthetic.fisheye_rig import calibration_text, example_rig
+from tests.synthetic.fisheye_rig import example_rig
 
 TEXT = """\
 model: opencv_fisheye
@@ -53,6 +55,17 @@ def test_a_rig_survives_its_own_calibration_file(tmp_path: Path) -> None:
     for pose, true in zip(again.lens_from_rig, rig.lens_from_rig, strict=True):
         assert pose.rotation == pytest.approx(true.rotation, abs=1e-12)
         assert pose.translation == pytest.approx(true.translation, abs=1e-12)
+
+
+def test_an_assumed_distance_stays_one(tmp_path: Path) -> None:
+    rig = replace(example_rig(), metric=False)
+    again = read_rig(file_of(tmp_path, calibration_text(rig, comments=["from 8 captures"])))
+    assert not again.metric
+    assert not LensRig.from_values(again.to_values()).metric
+    assert (tmp_path / "rig.yaml").read_text(encoding="utf-8").startswith("# from 8 captures\n")
+    assert read_rig(file_of(tmp_path, TEXT)).metric
+    with pytest.raises(InputError, match=r"rig\.yaml:1:1: metric: must be true, or false"):
+        read_rig(file_of(tmp_path, f"metric: 1\n{TEXT}"))
 
 
 def test_opencv_counts_pixels_from_the_centre_of_the_first(tmp_path: Path) -> None:

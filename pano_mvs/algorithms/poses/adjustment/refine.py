@@ -159,7 +159,8 @@ def _refined_with_rigs(
         return _refined_centrally(poses, settings, load=load)
     estimate = partial(_offset_scale, settings=settings, neighbour=neighbour)
     bundle, colors = _with_offsets(*_bundle(poses), own_rigs)
-    if poses.metric:
+    measured = all(rig.metric for rig in own_rigs if rig is not None)
+    if poses.metric and measured:
         bundle = replace(bundle, units_per_m=1.0)
     else:
         found = _with_unit(bundle, colors, settings, estimate=estimate)
@@ -173,11 +174,13 @@ def _refined_with_rigs(
         adjusted, colors = _adjusted(replace(aligned, units_per_m=bundle.units_per_m), colors, settings, rounds=1)
         refined = _poses(refined, adjusted, colors, rigs=own_rigs)
     refined = _with_uncertainty(refined, adjusted, settings, neighbour=neighbour)
-    if poses.metric:
+    if poses.metric and measured:
         return in_gauge_of(refined, poses.centers)
     scale = estimate(adjusted)
     if not scale.relative_std < _MAX_SCALE_STD or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
         return _refined_centrally(poses, settings, load=load)
+    if not measured:
+        return in_gauge_of(refined, poses.centers)
     return _in_metres(refined, adjusted, own_rigs, std=scale.relative_std)
 
 

@@ -1,0 +1,81 @@
+"""`pano-mvs calibrate`: estimate the lenses of a two-lens camera and write the calibration file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from rich.markup import escape
+
+from pano_mvs import __version__
+from pano_mvs.cli.console import Console
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.files import write_text
+from pano_mvs.io.images.captures import Layout
+from pano_mvs.io.rig_calibration import calibration_text
+from pano_mvs.session.calibrating import QUARTER_TURNS, calibrate_camera
+from pano_mvs.session.scaling import metres_from_text
+
+_LAYOUTS = ("auto", "side_by_side", "folders", "suffixes")
+_MAX_DISTANCE_M = 1.0
+
+
+def calibrate(
+    photos: Path,
+    out: Path,
+    *,
+    names: str,
+    layout: str,
+    distance: str,
+    field_of_view_deg: float,
+    up: str,
+    captures: int,
+    console: Console,
+) -> None:
+    """Write the calibration of the camera that took some raw pictures.
+
+    Args:
+        photos: their folder.
+        out: the file to write.
+        names: names of the lenses, separated by a comma.
+        layout: how the pictures of both lenses are stored.
+        distance: distance between the lenses, with its unit; empty if unknown.
+        field_of_view_deg: start value; 0 for that of the camera.
+        up: side of the first lens's picture where the top of the scene is.
+        captures: maximum number of captures to use.
+        console: where to print.
+
+    Raises:
+        UsageError: if an option is wrong.
+        InputError: if the pictures do not determine the lenses.
+        StoreError: if the file cannot be written.
+    """
+    lenses = tuple(part.strip() for part in names.split(","))
+    if len(lenses) != 2 or not all(lenses) or lenses[0] == lenses[1]:
+        raise UsageError(f"--lenses {names[:80]!r}: give two different names, separated by a comma: front,back")
+    if layout not in _LAYOUTS:
+        raise UsageError(f"--layout {layout[:80]!r}: choose one of {', '.join(_LAYOUTS)}")
+    if up not in QUARTER_TURNS:
+        raise UsageError(f"--up {up[:80]!r}: choose one of {', '.join(QUARTER_TURNS)}")
+    distance_m = metres_from_text(distance) if distance else None
+    if distance_m is not None and distance_m > _MAX_DISTANCE_M:
+        raise UsageError(
+            f"--distance {distance}: {distance_m:g} m is too far for the lenses of one camera. Add a unit: 28mm"
+        )
+    rig, lines = calibrate_camera(
+        photos,
+        names=(lenses[0], lenses[1]),
+        layout=cast(Layout, layout),
+        distance_m=distance_m,
+        field_of_view_deg=field_of_view_deg or None,
+        up=up,
+        max_captures=captures,
+        progress=lambda step: console.print(step, highlight=False, style="dim"),
+    )
+    comments = [f"estimated by pano-mvs {__version__} calibrate from {photos.name}", *lines]
+    write_text(out, calibration_text(rig, comments=comments))
+    console.say("\n".join(map(escape, lines)))
+    console.say(
+        f"calibration: {escape(str(out))}\nto use it: pano-mvs run quickstart --images {escape(str(photos))} "
+        f"--set images.use=source.dual_fisheye --set images.calibration={escape(str(out))}"
+    )
