@@ -273,11 +273,12 @@ def test_nerfstudio_reads_the_cameras_for_metashape(tmp_path: Path, monkeypatch:
     write_metashape(tmp_path / "cameras.xml", poses, dict.fromkeys(poses.names, SIZE_HW), file_from_world=turn)
     package = pip_packages(tmp_path / "site", "nerfstudio==1.1.5") / "nerfstudio"
     model = SimpleNamespace(value="EQUIRECTANGULAR")
-    for name, content in {
+    imported: dict[str, dict[str, object]] = {
         "open3d": {},
         "nerfstudio.process_data.process_data_utils": {"CAMERA_MODELS": {"equirectangular": model}},
         "nerfstudio.utils.rich_utils": {"CONSOLE": None},
-    }.items():
+    }
+    for name, content in imported.items():
         module = ModuleType(name)
         vars(module).update(content)
         monkeypatch.setitem(sys.modules, name, module)
