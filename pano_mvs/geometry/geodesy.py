@@ -18,8 +18,8 @@ _ECCENTRICITY_SQ = _FLATTENING * (2 - _FLATTENING)
 
 def local_from_lla(position_lla: ArrayLike, origin_lla: ArrayLike) -> FloatArray:
     """Return (latitude deg, longitude deg, altitude m), (..., 3), as (east, down, north) metres from an origin (3,)."""
-    difference = _earth_from_lla(position_lla) - _earth_from_lla(origin_lla)
-    return difference @ _earth_from_local(origin_lla)
+    difference = earth_from_lla(position_lla) - earth_from_lla(origin_lla)
+    return difference @ earth_from_local(origin_lla)
 
 
 def lla_from_local(position_in_local: ArrayLike, origin_lla: ArrayLike) -> FloatArray:
@@ -30,8 +30,8 @@ def lla_from_local(position_in_local: ArrayLike, origin_lla: ArrayLike) -> Float
     >>> lla_from_local([0.0, 0.0, 1000.0], (48.0, 11.0, 500.0)).round(3).tolist()  # 1 km to the north
     [48.009, 11.0, 500.078]
     """
-    offset = np.asarray(position_in_local, dtype=np.float64) @ _earth_from_local(origin_lla).T
-    x, y, z = np.moveaxis(_earth_from_lla(origin_lla) + offset, -1, 0)
+    offset = np.asarray(position_in_local, dtype=np.float64) @ earth_from_local(origin_lla).T
+    x, y, z = np.moveaxis(earth_from_lla(origin_lla) + offset, -1, 0)
     across = np.hypot(x, y)
     latitude = np.arctan2(z, across * (1 - _ECCENTRICITY_SQ))
     for _ in range(6):
@@ -47,7 +47,7 @@ def _normal_radius_m(latitude_rad: FloatArray) -> FloatArray:
     return radius
 
 
-def _earth_from_lla(position_lla: ArrayLike) -> FloatArray:
+def earth_from_lla(position_lla: ArrayLike) -> FloatArray:
     """Return Earth-centred, Earth-fixed coordinates in metres, (..., 3)."""
     latitude, longitude, altitude = np.moveaxis(np.asarray(position_lla, dtype=np.float64), -1, 0)
     latitude, longitude = np.deg2rad(latitude), np.deg2rad(longitude)
@@ -57,7 +57,7 @@ def _earth_from_lla(position_lla: ArrayLike) -> FloatArray:
     return np.stack([across * np.cos(longitude), across * np.sin(longitude), height], axis=-1)
 
 
-def _earth_from_local(origin_lla: ArrayLike) -> FloatArray:
+def earth_from_local(origin_lla: ArrayLike) -> FloatArray:
     """Return the rotation (3, 3) whose columns are the east, down and north directions at a position."""
     latitude, longitude = np.deg2rad(np.asarray(origin_lla, dtype=np.float64)[:2])
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -69,15 +69,29 @@ def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: Texture
         np.ascontiguousarray(mesh.faces, "<u4").tobytes(),
         picture,
     ]
+    views = [{"target": target} for target in (_ARRAY_BUFFER, _ARRAY_BUFFER, _ELEMENT_BUFFER)] + [{}]
+    write_glb_parts(path, _document(mesh, MIME_TYPES[form]), parts, views=views)
+
+
+def write_glb_parts(
+    path: Path, document: dict[str, Any], parts: Sequence[bytes], *, views: Sequence[dict[str, int]]
+) -> None:
+    """Write a glTF document with its binary parts as one GLB file; part n is buffer view n.
+
+    Args:
+        path: the file to write.
+        document: the document without `buffers` and `bufferViews`.
+        parts: the contents of the buffer views.
+        views: further properties of each buffer view, such as its target.
+    """
     padded = [part + b"\0" * (-len(part) % 4) for part in parts]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(part)} for start, part in zip(starts, parts, strict=False)
+    placed = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(part), **more}
+        for start, part, more in zip(starts, parts, views, strict=False)
     ]
-    for view, target in zip(views, (_ARRAY_BUFFER, _ARRAY_BUFFER, _ELEMENT_BUFFER), strict=False):
-        view["target"] = target
-    document = _document(mesh, MIME_TYPES[form]) | {"bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
-    head = json.dumps(document, separators=(",", ":")).encode()
+    whole = document | {"bufferViews": placed, "buffers": [{"byteLength": starts[-1]}]}
+    head = json.dumps(whole, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
     with path.open("wb") as stream:
         stream.write(struct.pack("<III", _MAGIC, _VERSION, 12 + 8 + len(head) + 8 + starts[-1]))

@@ -38,7 +38,10 @@ for (const {data, scene} of scenes.values())
       next.view().setParameters({yaw: link.targetYaw, pitch: 0});
       next.switchTo();
     };
-    scene.hotspotContainer().createHotspot(button, {yaw: link.yaw, pitch: link.pitch});
+    button.style.cssText = "position: absolute; transform: translate(-50%, -50%); white-space: nowrap";
+    const place = document.createElement("div"); // Marzipano puts its upper left corner at the direction
+    place.append(button);
+    scene.hotspotContainer().createHotspot(place, {yaw: link.yaw, pitch: link.pitch});
   }
 scenes.get(APP_DATA.scenes[0].id).scene.switchTo();
 </script>"""

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.algorithms.points.octree import OctreeNode
 from pano_mvs.scene import PointCloud
 from pano_mvs.share.mesh_file import SharedMesh
 
@@ -92,60 +93,6 @@ def encode_png(image: NDArray[np.uint8]) -> str:
     swapped = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     data = cv2.imencode(".png", cv2.cvtColor(image, swapped))[1]
     return base64.b64encode(data.tobytes()).decode("ascii")
-
-
-NODE_POINTS = 30_000
-"""Largest number of points that a node adds."""
-
-_SMALL_CHILD = 500
-_MAX_DEPTH = 20
-_SEED = 0
-
-
-@dataclass(frozen=True, eq=False)
-class OctreeNode:
-    """A cube of the octree.
-
-    Attributes:
-        name: "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z.
-        lower: (3,) float64, the cube's corner with the smallest coordinates.
-        size: length of its edges.
-        chosen: (K,) int64, the points that this node adds, in no order.
-    """
-
-    name: str
-    lower: NDArray[np.float64]
-    size: float
-    chosen: NDArray[np.int64]
-
-
-def octree(points: NDArray[np.float32], *, node_points: int = NODE_POINTS) -> list[OctreeNode]:
-    """Return the nodes of a cloud's octree, parents before their children; each point is in exactly one node."""
-    if not len(points):
-        return []
-    lower = points.min(axis=0).astype(np.float64)
-    size = float((points.max(axis=0) - lower).max()) * (1 + 1e-6) or 1.0
-    order = np.random.default_rng(_SEED).permutation(len(points)).astype(np.int64)
-    nodes: list[OctreeNode] = []
-    pending = [("r", lower, size, order)]
-    while pending:
-        name, lower, size, inside = pending.pop(0)
-        if len(inside) <= node_points + _SMALL_CHILD or len(name) > _MAX_DEPTH:
-            nodes.append(OctreeNode(name, lower, size, inside))
-            continue
-        half = size / 2
-        rest = inside[node_points:]
-        octants = (points[rest] >= lower + half) @ np.array([1, 2, 4])
-        kept = [inside[:node_points]]
-        for octant in range(8):
-            child = rest[octants == octant]
-            if len(child) < _SMALL_CHILD:  # a file of its own would not pay
-                kept.append(child)
-            else:
-                corner = lower + half * np.array([octant & 1, octant >> 1 & 1, octant >> 2 & 1])
-                pending.append((f"{name}{octant}", corner, half, child))
-        nodes.append(OctreeNode(name, lower, size, np.concatenate(kept)))
-    return nodes
 
 
 PIECE_FACES = 20_000

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.points.octree import octree
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.run_output import RunView
@@ -26,7 +27,6 @@ from pano_mvs.share.encoding import (
     level_count,
     log_steps,
     mesh_pieces,
-    octree,
     panorama_tiles,
 )
 from pano_mvs.share.maps import MapPlace, StoreyMap, cut_height, place_around, top_view

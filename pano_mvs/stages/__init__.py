@@ -6,7 +6,7 @@ They are registered through the entry point `pano_mvs.plugins`, like stages of p
 from pano_mvs.stages.depth import exchange, nearest, patchmatch, plain_surfaces, sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
-from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges
+from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
 from pano_mvs.stages.exports.floor_plan import floor_plan
 from pano_mvs.stages.exports.mesh import mesh, mesh_textured
 from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
@@ -113,6 +113,7 @@ __all__ = [
     "structure",
     "surface",
     "sweep",
+    "tiles_3d",
     "tour",
     "tour_of_panoramas",
     "tracked",

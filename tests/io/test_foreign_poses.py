@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 import json
+import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -21,6 +24,8 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.testing.room import capture_poses
 from pano_mvs.testing.tiny_capture import tiny_capture
+from tests.foreign import pip_packages
+from tests.oracles.openmvg import SAVED_BY_OPENMVG, SIZES_HW, scene
 
 POSES = dict(zip(("1.jpg", "rooms/2.jpg", "10.jpg"), capture_poses(3, seed=5), strict=True))
 SIZE_HW = (512, 1024)
@@ -185,24 +190,41 @@ def test_what_is_wrong_in_a_scene_is_named(
         read_poses(tmp_path)
 
 
-def keys(value: object) -> object:
-    """Return the keys of a JSON value, of lists those of the first entry."""
+def without_order(value: Any) -> Any:
+    """Return a scene of openMVG without what the order of its hash maps decides: lists by key, no pointer numbers."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return sorted((without_order(item) for item in value), key=lambda item: item["key"])
     if isinstance(value, dict):
-        return {key: keys(inner) for key, inner in value.items()}
-    return keys(value[0]) if isinstance(value, list) and value else None
+        left_out = {"id", "polymorphic_id", "polymorphic_name"}
+        return {key: without_order(item) for key, item in value.items() if key not in left_out}
+    return value
 
 
-def test_a_scene_for_openmvg_is_as_openmvg_writes_it(tmp_path: Path) -> None:
-    poses = tiny_capture().whole(Poses)
-    write_openmvg(tmp_path / "sfm_data.json", poses, dict.fromkeys(poses.names, SIZE_HW))
+def test_a_scene_saved_by_openmvg_is_read() -> None:
+    """`python -m tests.oracles.openmvg` lets openMVG itself write the file: it names the camera class once."""
+    found = read_poses(SAVED_BY_OPENMVG)
+    wanted = scene()
+    assert set(found.names) == set(wanted.names)
+    for name in wanted.names:
+        pose = found.cam_from_world(found.names.index(name))
+        same = wanted.cam_from_world(wanted.names.index(name))
+        assert pose.rotation == pytest.approx(same.rotation, abs=1e-12)
+        assert pose.center == pytest.approx(same.center, abs=1e-12)
+
+
+def test_a_scene_for_openmvg_is_as_openmvg_saves_it(tmp_path: Path) -> None:
+    """All keys in their order, and all values to the last digit; openMVG only sorts its lists in another way."""
+    write_openmvg(tmp_path / "sfm_data.json", scene(), SIZES_HW)
     data = json.loads((tmp_path / "sfm_data.json").read_text())
-    found = read_poses(tmp_path)
-    assert found.names == poses.names
-    assert found.rotations == pytest.approx(poses.rotations, abs=1e-12)
-    assert found.centers == pytest.approx(poses.centers, abs=1e-12)
-    assert keys(data | {"structure": []}) == keys(sfm_data())
-    pointers = [entry["value"]["ptr_wrapper"]["id"] for part in ("views", "intrinsics") for entry in data[part]]
-    assert len(set(pointers)) == len(pointers)
+    theirs = json.loads(SAVED_BY_OPENMVG.read_text())
+    assert json.dumps(without_order(data)) == json.dumps(without_order(theirs))
+    for file in (data, theirs):
+        kinds = [entry["value"] for entry in file["intrinsics"]]
+        assert [kind["polymorphic_id"] for kind in kinds] == [1 << 31 | 1, 1]
+        assert [kind.get("polymorphic_name") for kind in kinds] == ["spherical", None]
+        assert {entry["value"]["polymorphic_id"] for entry in file["views"]} == {1 << 30}
+        wrappers = [entry["value"]["ptr_wrapper"] for part in ("views", "intrinsics") for entry in file[part]]
+        assert [wrapper["id"] for wrapper in wrappers] == [1 << 31 | number for number in range(1, 6)]
 
 
 def test_pixels_in_a_scene_for_openmvg_are_those_of_its_camera(tmp_path: Path) -> None:
@@ -239,6 +261,39 @@ def test_cameras_for_metashape_have_z_up(tmp_path: Path) -> None:
     for element in written_tree.iter():
         assert set(element.keys()) <= known.get(element.tag, set()) or element.tag == "reference"
     assert [sensor.get("type") for sensor in written_tree.iter("sensor")] == ["spherical"] * 2
+
+
+@pytest.mark.slow
+def test_nerfstudio_reads_the_cameras_for_metashape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """nerfstudio 1.1.5 (Apache-2.0) converts what Metashape exports; only its reader of this format is installed.
+
+    Its result has cameras by OpenGL's axes, in a world whose axes are turned once more by `applied_transform`.
+    """
+    poses, turn = tiny_capture().whole(Poses), z_up_from_world()
+    write_metashape(tmp_path / "cameras.xml", poses, dict.fromkeys(poses.names, SIZE_HW), file_from_world=turn)
+    package = pip_packages(tmp_path / "site", "nerfstudio==1.1.5") / "nerfstudio"
+    model = SimpleNamespace(value="EQUIRECTANGULAR")
+    imported: dict[str, dict[str, object]] = {
+        "open3d": {},
+        "nerfstudio.process_data.process_data_utils": {"CAMERA_MODELS": {"equirectangular": model}},
+        "nerfstudio.utils.rich_utils": {"CONSOLE": None},
+    }
+    for name, content in imported.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    reader = runpy.run_path(str(package / "process_data" / "metashape_utils.py"))
+    reader["metashape_to_json"]({name: Path(name) for name in poses.names}, tmp_path / "cameras.xml", tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    assert data["camera_model"] == "EQUIRECTANGULAR"
+    assert [frame["file_path"] for frame in data["frames"]] == list(poses.names)
+    their_world = np.array(data["applied_transform"])[:, :3]
+    for idx, frame in enumerate(data["frames"]):
+        assert (frame["h"], frame["w"]) == SIZE_HW
+        world_from_gl = np.array(frame["transform_matrix"])
+        assert world_from_gl[:3, 3] == pytest.approx(their_world @ turn @ poses.centers[idx], abs=1e-12)
+        world_from_cam = their_world @ turn @ poses.rotations[idx].T
+        assert world_from_gl[:3, :3] == pytest.approx(world_from_cam * (1, -1, -1), abs=1e-12)
 
 
 TRANSFORM = ("poses", 0, "pose", "transform")

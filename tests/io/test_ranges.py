@@ -10,6 +10,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import OpenEXR
+import PIL.Image
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -151,6 +152,22 @@ def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
     channels = read_exr(files["normals/{item}.exr"])
     np.testing.assert_array_equal(np.stack([channels[name] for name in "RGB"], axis=-1), normals)
     np.testing.assert_allclose(read_normals(files["normals/{item}.png"]), normals, atol=2e-5)
+
+
+def test_another_library_reads_the_maps(tmp_path: Path) -> None:
+    """Pillow reads TIFF by libtiff and PNG by its own decoder: the same numbers, and the same depth of bits."""
+    values, level = some_ranges(), np.full(SIZE_HW, 200, np.uint8)
+    params = RangesParams(formats=("tiff", "png"))
+    files = ranges(RangeMap(values, level), None, params, Context(np.random.default_rng(0), tmp_path)).files
+    found = {}
+    for name, mode in {"range/{item}.tiff": "F", "range/{item}.png": "I;16", "confidence/{item}.png": "L"}.items():
+        with PIL.Image.open(files[name]) as picture:
+            assert picture.mode == mode
+            found[name] = np.array(picture)
+    np.testing.assert_array_equal(found["range/{item}.tiff"], values)
+    np.testing.assert_array_equal(found["range/{item}.png"] > 0, np.isfinite(values))
+    np.testing.assert_allclose(found["range/{item}.png"] * 0.001, np.nan_to_num(values), atol=0.00051)
+    np.testing.assert_array_equal(found["confidence/{item}.png"], np.where(np.isfinite(values), 200, 0))
 
 
 def test_normals_that_came_with_the_ranges_are_kept(tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ import base64
 
 import numpy as np
 
+from pano_mvs.algorithms.points.octree import octree
 from pano_mvs.scene import PointCloud
-from pano_mvs.share.encoding import encode_points, octree
+from pano_mvs.share.encoding import encode_points
 
 
 def cloud(count: int) -> PointCloud:

@@ -10,6 +10,7 @@ from typing import Any
 import ezdxf
 import numpy as np
 import pytest
+import trimesh
 from ezdxf.filemanagement import readfile
 
 from pano_mvs.api import Context, Files, PointCloud, Poses
@@ -76,6 +77,10 @@ def test_the_drawings_have_the_walls_of_the_room(tmp_path: Path) -> None:
     ends = np.array([[tuple(line.dxf.start.vec2), tuple(line.dxf.end.vec2)] for line in lines])
     np.testing.assert_allclose(ends, walls, atol=1e-5)
     assert drawing.units == ezdxf.units.M
+    with files.files["floor_plan/storey_0.dxf"].open("rb") as stream:
+        plan = trimesh.load_path(stream, file_type="dxf")  # by a reader of its own
+    found = np.array([plan.vertices[line.points] for line in plan.entities if line.layer == "WALLS"])
+    np.testing.assert_allclose(sorted(found.reshape(-1, 4).tolist()), sorted(ends.reshape(-1, 4).tolist()), atol=1e-5)
     assert ctx.metrics == {"storeys": 1, "walls": 6}
     assert not ctx.notes
 

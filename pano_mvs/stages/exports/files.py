@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.points.octree import NODE_POINTS, octree
 from pano_mvs.api import (
     All,
     Context,
@@ -22,6 +23,8 @@ from pano_mvs.api import (
     PointCloud,
     Poses,
     RangeMap,
+    chunks,
+    origin_of_frame,
     params_from,
     settings_from,
     stage,
@@ -41,6 +44,7 @@ from pano_mvs.io.ranges import (
     write_range_tiff,
 )
 from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.io.tiles_3d import TilesetWriter
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import world_up, z_up_from_world
@@ -133,6 +137,49 @@ def ply(cloud: One[PointCloud], poses: One[Poses] | None, params: PlyParams, ctx
         if kept is not None and kept.voxel and not number:
             ctx.metric("voxel", kept.voxel)
     ctx.metric("points", points)
+    return Files(files)
+
+
+@params_from(Selection)
+class Tiles3dParams(Params):
+    """Settings of export.tiles_3d."""
+
+    tile_points: int = Field(default=NODE_POINTS, ge=1000, description="largest number of points that a tile adds")
+
+
+@stage("export.tiles_3d")
+def tiles_3d(cloud: One[PointCloud], poses: One[Poses] | None, params: Tiles3dParams, ctx: Context) -> Files:
+    """Write the fused cloud as tiles_3d/tileset.json for viewers of 3D Tiles 1.1: an octree of glTF files, z up.
+
+    If GPS placed the cameras (`poses.scale` with `align: gps`), the tileset is at its place on the Earth. Further
+    groups of poses are in tiles_3d_1/, tiles_3d_2/ …
+    """
+    selection = settings_from(Selection, params)
+    groups = cloud.groups()
+    own = [] if poses is None else split_groups(poses)
+    files: dict[str, Path] = {}
+    for number, group in enumerate(groups):
+        folder = group_file("tiles_3d", number)
+        (ctx.scratch / folder).mkdir()
+        kept = select_points(group, selection, ctx.scratch)
+        among = None
+        if kept is not None:
+            among = np.concatenate([part.start + np.flatnonzero(kept.within(part)) for part in chunks(len(group))])
+        nodes = octree(group.points_in_world, among, node_points=params.tile_points)
+        if not nodes:
+            ctx.note(f"group {number} has no points that could be written")
+            continue
+        placed = own[number] if number < len(own) else None
+        turn = z_up_from_world() if placed is None else z_up_from_world(world_up(placed))
+        writer = TilesetWriter(ctx.scratch / folder, group, turn, tile_points=params.tile_points)
+        for node in nodes:
+            writer.add(node.name, node.chosen, node.size)
+        metric = placed is not None and placed.metric
+        about = {"unit": "metre" if metric else "scene unit", "file_from_world": turn.tolist()}
+        writer.finish(about, None if placed is None else origin_of_frame(placed.frame))
+        files |= {f"{folder}/{name}": path for name, path in writer.files.items()}
+        if not number:
+            ctx.metric("tiles", len(nodes))
     return Files(files)
 
 

@@ -1,15 +1,19 @@
-"""Clouds as E57 (ASTM E2807)."""
+"""Clouds and panoramas as E57 (ASTM E2807)."""
 
 from __future__ import annotations
 
+import hashlib
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import CHUNK_POINTS, KeptPoints, PointCloud, chunks
+from pano_mvs.api import CHUNK_POINTS, KeptPoints, Panorama, PointCloud, Rigid3, chunks
 from pye57 import libe57
+from scipy.spatial.transform import Rotation
 
 from pano_mvs_las.las_file import bounds
 from pano_mvs_las.placement import Placement
@@ -19,18 +23,47 @@ _COLORS = ("colorRed", "colorGreen", "colorBlue")
 _NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _NAMESPACE = uuid.UUID("6c1f3a52-6d0e-4c43-9d6a-0c5f4a3c8c11")
+# E57's camera has x forward, y left and z up (8.4.14.4 of the standard); ours x right, y down and z forward.
+_CAM_FROM_IMAGE = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
-def write_e57(path: Path, cloud: PointCloud, placement: Placement, *, kept: KeptPoints | None = None) -> None:
+@dataclass(frozen=True)
+class PlacedPanorama:
+    """A panorama of the file.
+
+    Attributes:
+        name: of its image file.
+        panorama: the image, which is loaded when it is written.
+        cam_from_world: its pose.
+    """
+
+    name: str
+    panorama: Panorama
+    cam_from_world: Rigid3
+
+
+def write_e57(
+    path: Path,
+    cloud: PointCloud,
+    placement: Placement,
+    *,
+    kept: KeptPoints | None = None,
+    panoramas: Iterable[PlacedPanorama] = (),
+) -> None:
     """Write a cloud as one scan of an E57 file, in chunks: places in double precision, 8-bit colours, normals.
 
     The same cloud gives the same bytes: no date is written, and its identity follows from its points.
+
+    Panoramas are spherical images (8.4.14 of the standard): the middle of the picture is the positive x axis of the
+    image, azimuths grow to the left, elevations upwards. They are JPEG of quality 95 at working resolution, with a mask
+    where pixels are masked.
 
     Args:
         path: the file to write.
         cloud: the points, one at least.
         placement: where they are.
         kept: the points to write; None: all.
+        panoramas: images to write with their poses.
     """
     low, high = bounds(cloud, placement, kept)
     count = len(cloud) if kept is None else kept.count
@@ -40,6 +73,8 @@ def write_e57(path: Path, cloud: PointCloud, placement: Placement, *, kept: Kept
         _describe_file(file, guid, placement)
         vector = _scan(file, guid, count, low, high)
         _write_points(file, vector, cloud, placement, kept)
+        for panorama in panoramas:
+            _write_panorama(file, panorama, placement)
     finally:
         file.close()
 
@@ -118,6 +153,44 @@ def _write_points(
         if len(points):
             writer.write(len(points))
     writer.close()
+
+
+def _write_panorama(file: libe57.ImageFile, placed: PlacedPanorama, placement: Placement) -> None:
+    height, width = placed.panorama.size_hw
+    bgr = cv2.cvtColor(placed.panorama.load(), cv2.COLOR_RGB2BGR)
+    blobs = {"jpegImage": cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()}
+    valid = placed.panorama.load_mask()
+    if not valid.all():
+        blobs["imageMask"] = cv2.imencode(".png", np.where(valid, 255, 0).astype(np.uint8))[1].tobytes()
+    image = libe57.StructureNode(file)
+    guid = uuid.uuid5(_NAMESPACE, f"{placed.name} {hashlib.sha256(blobs['jpegImage']).hexdigest()}")
+    for name, text in {"guid": f"{{{guid}}}", "name": placed.name, "sensorVendor": "pano_mvs"}.items():
+        image.set(name, libe57.StringNode(file, text))
+    center = placed.cam_from_world.center
+    file_from_image = placement.rotation_at(center) @ placed.cam_from_world.rotation.T @ _CAM_FROM_IMAGE
+    x, y, z, w = Rotation.from_matrix(file_from_image).as_quat().tolist()
+    sign = -1.0 if w < 0 else 1.0  # the standard wants w ≥ 0
+    pose = libe57.StructureNode(file)
+    pose.set("rotation", _structure(file, {"w": sign * w, "x": sign * x, "y": sign * y, "z": sign * z}))
+    (place,) = placement.points(center[None])
+    pose.set("translation", _structure(file, dict(zip("xyz", place.tolist(), strict=True))))
+    image.set("pose", pose)
+    sphere = _structure(
+        file,
+        {
+            "imageWidth": width,
+            "imageHeight": height,
+            "pixelWidth": 2 * np.pi / width,
+            "pixelHeight": np.pi / height,
+        },
+    )
+    nodes = {name: libe57.BlobNode(file, len(data)) for name, data in blobs.items()}
+    for name, node in nodes.items():
+        sphere.set(name, node)
+    image.set("sphericalRepresentation", sphere)
+    file.root()["images2D"].append(image)
+    for name, node in nodes.items():
+        node.write(blobs[name], 0, len(blobs[name]))
 
 
 def _structure(file: libe57.ImageFile, values: Mapping[str, float]) -> libe57.StructureNode:

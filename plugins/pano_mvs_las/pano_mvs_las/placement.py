@@ -30,7 +30,7 @@ class Placement:
     crs: CRS | None = None
     file_from_world: FloatArray = field(default_factory=z_up_from_world)
 
-    def points(self, points_in_world: NDArray[np.float32]) -> FloatArray:
+    def points(self, points_in_world: NDArray[np.floating]) -> FloatArray:
         """Return points (N, 3) as coordinates of the file."""
         world = points_in_world.astype(np.float64)
         if self.crs is None or self.origin_lla is None:
@@ -42,6 +42,16 @@ class Placement:
         """Return unit vectors (N, 3) along east, north and up, which a map's axes differ from by a degree or two."""
         turned: NDArray[np.float32] = directions_in_world @ self.file_from_world.T.astype(np.float32)
         return turned
+
+    def rotation_at(self, point_in_world: FloatArray) -> FloatArray:
+        """Return the rotation (3, 3) that the written coordinates of the surroundings of a point have.
+
+        On a map it includes the angle between its north and the true one; without a map it is `file_from_world`.
+        """
+        steps = np.concatenate([np.eye(3), -np.eye(3)])
+        moved = self.points(point_in_world + steps)
+        left, _, right = np.linalg.svd((moved[:3] - moved[3:]).T)
+        return np.asarray(left @ right)
 
     @cached_property
     def _on_map(self) -> Transformer:

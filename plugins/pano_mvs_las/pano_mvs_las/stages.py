@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from typing import Literal
 
 from pano_mvs.api import (
+    All,
     Context,
     Files,
     InputError,
     KeptPoints,
     One,
+    Panorama,
     Params,
     PointCloud,
     PointSelection,
@@ -25,7 +27,7 @@ from pano_mvs.api import (
 )
 from pydantic import Field
 
-from pano_mvs_las.e57_file import write_e57
+from pano_mvs_las.e57_file import PlacedPanorama, write_e57
 from pano_mvs_las.las_file import write_las
 from pano_mvs_las.placement import Placement, placement_of
 
@@ -60,16 +62,32 @@ def las(cloud: One[PointCloud], poses: One[Poses], params: LasParams, ctx: Conte
     return Files(files)
 
 
-@stage("export.e57")
-def e57(cloud: One[PointCloud], poses: One[Poses], params: CloudParams, ctx: Context) -> Files:
-    """The fused cloud as cloud.e57: one scan with colours and normals, z up.
+class E57Params(CloudParams):
+    """Settings of export.e57."""
 
-    Further groups of poses, each in a frame of its own, are cloud_1.e57 …
+    panoramas: bool = Field(default=True, description="also write the panoramas, as spherical images with their poses")
+
+
+@stage("export.e57")
+def e57(
+    cloud: One[PointCloud], poses: One[Poses], images: All[Panorama] | None, params: E57Params, ctx: Context
+) -> Files:
+    """The fused cloud as cloud.e57: one scan with colours and normals, z up, and the panoramas with their poses.
+
+    Panoramas are JPEG at working resolution, with a mask where they are masked. Further groups of poses, each in a
+    frame of its own, are cloud_1.e57 …
     """
     files = {}
+    groups = split_groups(poses)
     for number, group, kept, placement in _prepared(cloud, poses, params, ctx):
         path = ctx.scratch / group_file("cloud.e57", number)
-        write_e57(path, group, placement, kept=kept)
+        own = groups[number]
+        panoramas = (
+            PlacedPanorama(name, images[name], own.cam_from_world(idx))
+            for idx, name in enumerate(own.names)
+            if images is not None and params.panoramas and name in images
+        )
+        write_e57(path, group, placement, kept=kept, panoramas=panoramas)
         files[path.name] = path
     return Files(files)
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import laspy
 import numpy as np
 import pye57
 import pytest
-from pano_mvs.api import Context, InputError, Params, PointCloud, Poses, Rigid3, UsageError
+from pano_mvs.api import Context, InputError, Panorama, Params, PointCloud, Poses, Rigid3, UsageError, ray_from_pixel
 from pano_mvs.io import thinning
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from pyproj import CRS, Transformer
+from scipy.spatial.transform import Rotation
 
 from pano_mvs_las import e57, las
-from pano_mvs_las.stages import CloudParams, LasParams
+from pano_mvs_las.stages import CloudParams, E57Params, LasParams
 
 HERE = "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
 
@@ -38,7 +41,9 @@ def the_poses(frame: str = "the first registered camera") -> Poses:
 
 def written(stage: Any, folder: Path, cloud: PointCloud, poses: Poses, params: Params) -> Path:
     folder.mkdir(exist_ok=True)
-    (path,) = stage(cloud, poses, params, Context(np.random.default_rng(0), folder)).files.values()
+    ctx = Context(np.random.default_rng(0), folder)
+    inputs = (cloud, poses) if stage is las else (cloud, poses, None)
+    (path,) = stage(*inputs, params, ctx).files.values()
     return Path(path)
 
 
@@ -127,7 +132,7 @@ def test_steps_that_are_too_small_are_refused_with_those_that_are_not(tmp_path: 
 
 def test_an_e57_file_holds_the_cloud(tmp_path: Path) -> None:
     cloud = a_cloud()
-    points = e57_points(written(e57, tmp_path, cloud, the_poses(), CloudParams()))
+    points = e57_points(written(e57, tmp_path, cloud, the_poses(), E57Params()))
     x, y, z = cloud.points_in_world.T
     for name, values in (("cartesianX", x), ("cartesianY", z), ("cartesianZ", -y)):
         np.testing.assert_array_equal(points[name], values)
@@ -137,7 +142,7 @@ def test_an_e57_file_holds_the_cloud(tmp_path: Path) -> None:
 
 def test_an_e57_file_has_normals_and_a_map(tmp_path: Path) -> None:
     cloud = a_cloud()
-    path = written(e57, tmp_path, cloud, the_poses(HERE), CloudParams())
+    path = written(e57, tmp_path, cloud, the_poses(HERE), E57Params())
     with pye57.E57(str(path)) as file:
         header = file.get_header(0)
         assert header.point_count == len(cloud)
@@ -150,7 +155,7 @@ def test_an_e57_file_has_normals_and_a_map(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(("stage", "params"), [(las, LasParams), (e57, CloudParams)])
+@pytest.mark.parametrize(("stage", "params"), [(las, LasParams), (e57, E57Params)])
 def test_points_that_are_not_wanted_are_left_out_in_any_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: Any, params: type[CloudParams]
 ) -> None:
@@ -169,3 +174,86 @@ def test_points_that_are_not_wanted_are_left_out_in_any_cut(
         np.testing.assert_array_equal(e57_points(again)["cartesianX"], e57_points(whole)["cartesianX"])
     with pytest.raises(InputError, match="no points that could be written"):
         written(stage, tmp_path / "c", cloud, the_poses(), params.model_validate({"min_views": 99}))
+
+
+CAPTURE = tiny_capture(Variant((128, 256), masked=True))
+
+
+def in_pictures(idx: int, count: int = 300) -> tuple[np.ndarray, PointCloud]:
+    """Return pixels (N, 2) that one panorama sees, and the points there, in the colours of the pixels."""
+    name, pose = CAPTURE.names[idx], CAPTURE.poses[idx]
+    rows, columns = np.nonzero(CAPTURE.images[name].load_mask())
+    chosen = np.random.default_rng(idx).choice(len(rows), count, replace=False)
+    rows, columns = rows[chosen], columns[chosen]
+    pixels = np.stack([columns, rows], axis=-1) + 0.5
+    rays = ray_from_pixel(pixels, CAPTURE.pictures[idx].shape[:2])
+    points = pose.inverse().apply(rays * CAPTURE.ranges[idx][rows, columns, None])
+    colors = CAPTURE.pictures[idx][rows, columns]
+    cloud = PointCloud(points.astype(np.float32), -rays.astype(np.float32), colors, np.ones(count, np.uint8))
+    return pixels, cloud
+
+
+def blob(node: Any) -> np.ndarray:
+    data = bytearray(node.byteCount())
+    node.read(data, 0, len(data))
+    return np.frombuffer(bytes(data), np.uint8)
+
+
+@pytest.mark.parametrize("frame", ["the room's", HERE], ids=["upright", "on a map"])
+@pytest.mark.parametrize("idx", [0, 2])
+def test_points_of_an_e57_file_lie_on_their_pixels_as_the_standard_defines_them(
+    tmp_path: Path, idx: int, frame: str
+) -> None:
+    """ASTM E2807-11, 8.4.14.5: x = imageWidth / 2 − θ / pixelWidth, y = imageHeight / 2 − φ / pixelHeight.
+
+    θ is the azimuth from the x axis towards y and φ the elevation (5.5), in the frame of the image, which `pose` moves
+    to that of the file: x_file = R x_image + t.
+    """
+    pixels, cloud = in_pictures(idx)
+    poses = Poses.without_points(
+        dict(zip(CAPTURE.names, CAPTURE.poses, strict=True)), frame=frame, scale="", metric=True
+    )
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    (path,) = e57(cloud, poses, CAPTURE.images, E57Params(), ctx).files.values()
+    points = e57_points(path)
+    with pye57.E57(str(path)) as file:
+        assert len(file.root["images2D"]) == len(CAPTURE.names)
+        image = file.root["images2D"][idx]
+        assert image["name"].value() == CAPTURE.names[idx]
+        sphere, pose = image["sphericalRepresentation"], image["pose"]
+        width, height = sphere["imageWidth"].value(), sphere["imageHeight"].value()
+        quaternion = [pose["rotation"][axis].value() for axis in "xyzw"]
+        assert quaternion[3] >= 0
+        place = np.array([pose["translation"][axis].value() for axis in "xyz"])
+        in_file = np.stack([points[f"cartesian{axis}"] for axis in "XYZ"], axis=-1)
+        x, y, z = ((in_file - place) @ Rotation.from_quat(quaternion).as_matrix()).T
+        azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+        x_image = width / 2 - azimuth / sphere["pixelWidth"].value()
+        y_image = height / 2 - elevation / sphere["pixelHeight"].value()
+        picture = cv2.imdecode(blob(sphere["jpegImage"]), cv2.IMREAD_COLOR)[..., ::-1]
+        mask = cv2.imdecode(blob(sphere["imageMask"]), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (height, width, 3) == CAPTURE.pictures[idx].shape
+    np.testing.assert_array_equal(mask > 0, CAPTURE.images[CAPTURE.names[idx]].load_mask())
+    size_hw = (height, width)
+    found = ray_from_pixel(np.stack([x_image, y_image], axis=-1), size_hw)
+    # The scale of a map is .9996, but not that of its heights.
+    np.testing.assert_allclose(found, ray_from_pixel(pixels, size_hw), atol=5e-4 if frame == HERE else 1e-6)
+    colors = np.stack([points[f"color{name}"] for name in ("Red", "Green", "Blue")], axis=-1)
+    seen = picture[y_image.astype(int), x_image.astype(int)]
+    assert np.abs(seen.astype(int) - colors).mean() < 6  # JPEG; 40 between random pixels
+
+
+def test_panoramas_of_an_e57_file_are_optional_and_the_same_each_time(tmp_path: Path) -> None:
+    poses = Poses.without_points(dict(zip(CAPTURE.names, CAPTURE.poses, strict=True)), frame="", scale="", metric=True)
+
+    def bytes_of(name: str, images: dict[str, Panorama] | None, params: E57Params) -> bytes:
+        (tmp_path / name).mkdir()
+        ctx = Context(np.random.default_rng(0), tmp_path / name)
+        (path,) = e57(in_pictures(0)[1], poses, images, params, ctx).files.values()
+        return Path(path).read_bytes()
+
+    whole = bytes_of("a", CAPTURE.images, E57Params())
+    assert whole == bytes_of("b", CAPTURE.images, E57Params())
+    bare = bytes_of("c", CAPTURE.images, E57Params(panoramas=False))
+    assert bare == bytes_of("d", None, E57Params())
+    assert len(whole) > len(bare) + 4 * 3000

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
 import struct
 import subprocess
 import sys
@@ -21,6 +23,7 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import Poses
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.testing.room import capture_poses
+from tests.foreign import pip_packages
 
 NAMES = ("b/1.jpg", "b/2.jpg", "b/10.jpg", "c.png")
 SIZES = {"b/1.jpg": (512, 1024), "b/2.jpg": (512, 1024), "b/10.jpg": (512, 1024), "c.png": (300, 600)}
@@ -309,3 +312,29 @@ def test_a_malformed_text_is_named(tmp_path: Path, file: str, line: str, what: s
         (tmp_path / f"{name}.txt").write_text(text + "\n")
     with pytest.raises(InputError, match=what):
         read_colmap_model(tmp_path)
+
+
+@pytest.mark.slow
+def test_pycolmap_4_1_0_opens_the_model(model_folder: Path, tmp_path: Path) -> None:
+    """The first version with this camera. It projects the points on the pixels that the model states."""
+    script = f"""
+import json, numpy as np, pycolmap
+model = pycolmap.Reconstruction({str(model_folder)!r})
+errors = [
+    float(np.linalg.norm(image.project_point(model.points3D[seen.point3D_id].xyz) - seen.xy))
+    for image in model.images.values() for seen in image.points2D
+]
+cameras = [[camera.model.name, camera.height, camera.width] for _, camera in sorted(model.cameras.items())]
+print(json.dumps([pycolmap.__version__, cameras, len(model.reg_image_ids()), len(model.points3D), errors]))
+"""
+    site = pip_packages(tmp_path / "site", "pycolmap==4.1.0")
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, check=True, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(site)}
+    )
+    version, cameras, images, points, errors = json.loads(done.stdout)
+    assert version == "4.1.0"
+    assert cameras == [["EQUIRECTANGULAR", 512, 1024], ["EQUIRECTANGULAR", 300, 600]]
+    assert (images, points) == (4, 200)
+    assert len(errors) == len(noisy_poses().track_point_idx)
+    assert np.median(errors) < 2 * NOISE_RAD * 1024 / (2 * np.pi)
