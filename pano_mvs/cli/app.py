@@ -17,6 +17,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache.app import cache_app
+from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.error_messages import guarded
@@ -32,6 +33,7 @@ from pano_mvs.cli.options import (
     TargetArgument,
     UntilOption,
     WorkflowArgument,
+    given_path,
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
@@ -180,9 +182,7 @@ def run(
     ] = None,
 ) -> None:
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.blocks_command import run_blocks_shown
-    from pano_mvs.cli.plan_commands import show_dry_run
-    from pano_mvs.cli.run.command import run_workflow
+    from pano_mvs.cli.blocks_command import run_decided
     from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.merging.automatic import decision_of
@@ -197,14 +197,41 @@ def run(
     execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable, otel)
     decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=block_poses)
     with notified([] if dry_run else notify or [], session.out):
-        if decision.division is not None:
-            raise typer.Exit(run_blocks_shown(session, execution, decision, as_json=as_json, dry_run=dry_run))
-        if decision.reason:
-            Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
-        if dry_run:
-            show_dry_run(session, Console(), execution=execution, as_json=as_json)
-            return
-        raise typer.Exit(run_workflow(session, execution, as_json=as_json))
+        raise typer.Exit(run_decided(session, execution, decision, as_json=as_json, dry_run=dry_run))
+
+
+@app.command()
+@guarded
+def tour(
+    images: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PATH", parser=given_path, help="Folder of panoramas or of a virtual tour, or a video of a walk."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Output folder; default: out/<name of PATH>. The page is in <output folder>_page."),
+    ] = None,
+    workflow: Annotated[
+        str,
+        typer.Option(
+            "--workflow",
+            metavar="WORKFLOW",
+            help="A preset or a workflow file; default: mesh, or walk for a video.",
+            autocompletion=complete_workflow,
+            show_default=False,
+        ),
+    ] = "",
+    overrides: SetOption = None,
+    cache: CacheOption = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the page in a browser.")] = False,
+) -> None:
+    """Make a page to walk through from panoramas: run a workflow, write the page, and open it in a browser."""
+    from pano_mvs.cli.tour_command import TourWanted, make_tour
+
+    wanted = TourWanted(images, out, workflow, tuple(overrides or ()), cache)
+    raise typer.Exit(make_tour(wanted, Console(), opens=not no_open))
 
 
 @app.command()

@@ -10,7 +10,7 @@ import typer
 from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
 
 
-def _given_path(text: str) -> Path:
+def given_path(text: str) -> Path:
     """Return the path that an option states, which is empty for a variable of the shell without a value."""
     if not text:
         raise typer.BadParameter("the name is empty")
@@ -35,7 +35,7 @@ ImagesOption = Annotated[
     Path | None,
     typer.Option(
         "--images",
-        parser=_given_path,
+        parser=given_path,
         metavar="PATH",
         help="Folder of panoramas or of a virtual tour, or a video; default: that of the workflow.",
     ),
