@@ -422,10 +422,13 @@ def view_results(
     ] = False,
 ) -> None:
     """View the cloud, the mesh and the cameras, and step inside the panoramas."""
-    from pano_mvs.cli.view_command import ViewOptions, view_scene
+    from pano_mvs.viewer.view import ViewOptions, view_run
 
     options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group, ranges)
-    view_scene(out, options, Console())
+    console = Console()
+    view_run(out, options, say=lambda note: console.say(f"note: {escape(note)}"))
+    if screenshot is not None:
+        console.say(f"picture in {escape(str(screenshot))}")
 
 
 @app.command("scale", context_settings={"ignore_unknown_options": True})
