@@ -84,6 +84,7 @@ def run(
             help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
             "serial (one unit at a time in this process, for debugging). Default: processes.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
     ] = "",
     workers: Annotated[
@@ -91,7 +92,13 @@ def run(
         typer.Option("--workers", min=0, help="Number of worker processes; 0: one per core, if memory permits."),
     ] = 0,
     threads: Annotated[
-        int, typer.Option("--threads-per-worker", min=0, help="Threads per worker; 0: an equal share of the cores.")
+        int,
+        typer.Option(
+            "--threads-per-worker",
+            min=0,
+            help="Threads per worker; 0: an equal share of the cores.",
+            rich_help_panel="Workers",
+        ),
     ] = 0,
     scheduler: Annotated[
         str,
@@ -100,6 +107,7 @@ def run(
             metavar="ADDRESS",
             help="Use this dask scheduler, such as tcp://host:8786; its workers must share the cache.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
     ] = "",
     queue: Annotated[
@@ -109,6 +117,7 @@ def run(
             metavar="FILE.yaml",
             help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
     ] = None,
     notify: Annotated[
@@ -117,11 +126,16 @@ def run(
             "--notify",
             metavar="URL",
             help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
+            rich_help_panel="Disk and messages",
         ),
     ] = None,
     otel: Annotated[
         bool,
-        typer.Option("--otel", help="Send the run, its stages and units as spans to an OpenTelemetry collector."),
+        typer.Option(
+            "--otel",
+            help="Send the run, its stages and units as spans to an OpenTelemetry collector.",
+            rich_help_panel="Disk and messages",
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
@@ -132,7 +146,12 @@ def run(
         bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
     ] = False,
     isolate: Annotated[
-        bool, typer.Option("--isolate", help="Compute each unit of a plugin's stage in a process of its own.")
+        bool,
+        typer.Option(
+            "--isolate",
+            help="Compute each unit of a plugin's stage in a process of its own.",
+            rich_help_panel="Workers",
+        ),
     ] = False,
     min_free: Annotated[
         str,
@@ -141,11 +160,16 @@ def run(
             metavar="SIZE",
             help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
             show_default=False,
+            rich_help_panel="Disk and messages",
         ),
     ] = "",
     durable: Annotated[
         bool,
-        typer.Option("--durable", help="Flush each result to disk, for machines that may lose power."),
+        typer.Option(
+            "--durable",
+            help="Flush each result to disk, for machines that may lose power.",
+            rich_help_panel="Disk and messages",
+        ),
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
@@ -159,6 +183,7 @@ def run(
             help="Run overlapping blocks of at most N images one after the other, and merge them; 0: all images at "
             "once. Default: blocks if pairs or poses would take more memory than there is.",
             show_default=False,
+            rich_help_panel="Blocks of a large capture",
         ),
     ] = None,
     block_overlap: Annotated[
@@ -169,15 +194,23 @@ def run(
             min=0,
             help="Images that consecutive blocks share; default: a quarter of the block size, 3 to 100.",
             show_default=False,
+            rich_help_panel="Blocks of a large capture",
         ),
     ] = 0,
     block_loop: Annotated[
-        bool, typer.Option("--block-loop", help="The path ends where it began: the last block overlaps the first.")
+        bool,
+        typer.Option(
+            "--block-loop",
+            help="The path ends where it began: the last block overlaps the first.",
+            rich_help_panel="Blocks of a large capture",
+        ),
     ] = False,
     block_poses: Annotated[
         Path | None,
         typer.Option(
-            "--block-poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
+            "--block-poses",
+            help="Rough poses, such as an output folder: blocks also overlap where the path returns.",
+            rich_help_panel="Blocks of a large capture",
         ),
     ] = None,
 ) -> None:
@@ -387,7 +420,12 @@ def view_results(
     view: Annotated[
         str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")
     ] = "overview",
-    color: Annotated[str, typer.Option("--color", help="Colours: rgb, confidence, views, normals or height.")] = "rgb",
+    color: Annotated[
+        str,
+        typer.Option(
+            "--color", help="Colours: rgb, confidence, views, normals or height.", rich_help_panel="What is shown"
+        ),
+    ] = "rgb",
     surface: Annotated[
         str,
         typer.Option(
@@ -395,10 +433,14 @@ def view_results(
             metavar="cloud|mesh|both",
             help="What to show; default: the cloud if it exists.",
             show_default=False,
+            rich_help_panel="What is shown",
         ),
     ] = "",
     points: Annotated[
-        int, typer.Option("--points", min=0, help="Maximum number of points to draw; 0: all.")
+        int,
+        typer.Option(
+            "--points", min=0, help="Maximum number of points to draw; 0: all.", rich_help_panel="What is shown"
+        ),
     ] = 2_000_000,
     size: Annotated[
         str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")
@@ -406,19 +448,34 @@ def view_results(
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
     ] = None,
-    labels: Annotated[bool, typer.Option("--labels", help="Show the names of the cameras.")] = False,
-    blended: Annotated[bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.")] = False,
-    backs: Annotated[bool, typer.Option("--backs", help="Also show points that face away from the viewer.")] = False,
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Show the names of the cameras.", rich_help_panel="What is shown")
+    ] = False,
+    blended: Annotated[
+        bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.", rich_help_panel="What is shown")
+    ] = False,
+    backs: Annotated[
+        bool,
+        typer.Option(
+            "--backs", help="Also show points that face away from the viewer.", rich_help_panel="What is shown"
+        ),
+    ] = False,
     group: Annotated[
         int,
         typer.Option(
             "--group",
             min=0,
             help="Group to show if the panoramas form several groups; 0 is the largest.",
+            rich_help_panel="What is shown",
         ),
     ] = 0,
     ranges: Annotated[
-        bool, typer.Option("--ranges", help="Inside a camera, show its ranges; unconfirmed ones are marked.")
+        bool,
+        typer.Option(
+            "--ranges",
+            help="Inside a camera, show its ranges; unconfirmed ones are marked.",
+            rich_help_panel="What is shown",
+        ),
     ] = False,
 ) -> None:
     """View the cloud, the mesh and the cameras, and step inside the panoramas."""

@@ -64,7 +64,12 @@ UntilOption = Annotated[
 ]
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="STAGE:ITEM", help="Run only this unit and the units that it needs."),
+    typer.Option(
+        "--only",
+        metavar="STAGE:ITEM",
+        help="Run only this unit and the units that it needs.",
+        rich_help_panel="Selection of units",
+    ),
 ]
 RefreshOption = Annotated[
     list[str] | None,
@@ -73,8 +78,14 @@ RefreshOption = Annotated[
         metavar="STAGE[:ITEM]",
         help="Recompute this stage or unit even if it is cached.",
         autocompletion=complete_stage,
+        rich_help_panel="Selection of units",
     ),
 ]
 AcceptOption = Annotated[
-    bool, typer.Option("--accept-code", help="Reuse results that were computed before code or libraries changed.")
+    bool,
+    typer.Option(
+        "--accept-code",
+        help="Reuse results that were computed before code or libraries changed.",
+        rich_help_panel="Selection of units",
+    ),
 ]

@@ -121,16 +121,34 @@ def depth(
         typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
     ] = None,
     align: Annotated[
-        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to its truth by one factor.")
+        Literal["none", "median", "lsq"],
+        typer.Option("--align", help="Fit each view to its truth by one factor.", rich_help_panel="Scale and units"),
     ] = "none",
     scale: Annotated[
-        str, typer.Option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
+        str,
+        typer.Option(
+            "--scale",
+            help="Factor to the unit of the ground truth; auto: from the camera centres.",
+            rich_help_panel="Scale and units",
+        ),
     ] = "auto",
-    unit: Annotated[float, typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")] = 1.0,
-    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the true ranges.")] = 1.0,
-    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.")] = 10.0,
+    unit: Annotated[
+        float,
+        typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.", rich_help_panel="Scale and units"),
+    ] = 1.0,
+    truth_unit: Annotated[
+        float, typer.Option("--truth-unit", help="Unit of the true ranges.", rich_help_panel="Scale and units")
+    ] = 1.0,
+    peak: Annotated[
+        float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.", rich_help_panel="Scores")
+    ] = 10.0,
     bad: Annotated[
-        list[str], typer.Option("--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.")
+        list[str],
+        typer.Option(
+            "--bad",
+            help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.",
+            rich_help_panel="Scores",
+        ),
     ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
     min_confidence: Annotated[
         int,
@@ -139,28 +157,43 @@ def depth(
             min=0,
             max=255,
             help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
+            rich_help_panel="Scores",
         ),
     ] = 0,
     masks: Annotated[
-        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")
+        Path | None,
+        typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.", rich_help_panel="Masks"),
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.")
+        Path | None,
+        typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.", rich_help_panel="Masks"),
     ] = None,
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
     ] = None,
     error_limit: Annotated[
-        float, typer.Option("--error-limit", help="Relative error at the end of the colour scale.")
+        float,
+        typer.Option("--error-limit", help="Relative error at the end of the colour scale.", rich_help_panel="Scores"),
     ] = 0.1,
     baseline: Annotated[
-        Literal["best", "median", "mean"], typer.Option("--baseline", help="Constant range to compare with.")
+        Literal["best", "median", "mean"],
+        typer.Option("--baseline", help="Constant range to compare with.", rich_help_panel="Scores"),
     ] = "best",
     poses: Annotated[
-        Path | None, typer.Option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
+        Path | None,
+        typer.Option(
+            "--poses",
+            help="Estimated poses, for the scale; default: of the output folder.",
+            rich_help_panel="Scale and units",
+        ),
     ] = None,
     true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="True poses, for the scale; default: those of the ground truth.")
+        Path | None,
+        typer.Option(
+            "--true-poses",
+            help="True poses, for the scale; default: those of the ground truth.",
+            rich_help_panel="Scale and units",
+        ),
     ] = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None,
     as_json: JsonOption = False,
