@@ -24,6 +24,7 @@ from pano_mvs.session.merging.automatic import decide_blocks
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import default_out, open_session
 from pano_mvs.share import ShareOptions
+from pano_mvs.share.page_folder import require_free
 from pano_mvs.viewer.shown_scene import is_to_see
 
 
@@ -68,6 +69,9 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
         cache=wanted.cache,
         out=wanted.out or default_out(place.stem if is_video else place.name),
     )
+    out = session.out if session.out.name.strip(".") else resolved(session.out)
+    folder = out.with_name(f"{out.name}_page")
+    require_free(folder, "the page would be written to ")
     execution = Execution()
     code = run_decided(session, execution, decide_blocks(session, execution), advise=False)
     if is_early(code):
@@ -77,7 +81,6 @@ def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
     if not is_to_share(summary):
         console.say("no page is written, because the run has neither a cloud nor ranges to show")
         return code
-    folder = session.out.with_name(f"{session.out.name}_page")
     share_output(session.out, folder, ShareOptions(), images=None, cache=session.store_root, console=console)
     page = folder / "index.html"
     if opens and not open_in_browser(page):

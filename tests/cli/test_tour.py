@@ -72,6 +72,16 @@ def test_a_run_with_nothing_to_show_has_no_page(pano_mvs: Command, toy: Toy, ope
     assert not Path("sums_page").exists()
 
 
+def test_a_folder_in_the_place_of_the_page_is_noticed_before_the_run(pano_mvs: Command, toy: Toy) -> None:
+    Path("work_page").mkdir()
+    Path("work_page/notes.txt").touch()
+    Path("numbers").mkdir()
+    result = pano_mvs("tour", "numbers", "--workflow", toy.folder / "wf.yaml", "--out", "work")
+    assert result.code == 2
+    assert "the page would be written to work_page: the folder is not empty" in result.flat
+    assert not Path("work").exists()
+
+
 @pytest.mark.parametrize(("name", "what"), [("nowhere", "no such folder or video"), ("", "the name is empty")])
 def test_what_is_no_folder(pano_mvs: Command, name: str, what: str) -> None:
     result = pano_mvs("tour", name)
