@@ -58,7 +58,7 @@ class ViewOptions:
 
 
 def view_run(
-    run: RunOutput | str | Path, options: ViewOptions | None = None, *, say: Callable[[str], object] | None = None
+    run: RunOutput | str | Path, options: ViewOptions | None = None, *, say: Callable[[str], object] = print
 ) -> NDArray[np.uint8] | None:
     """View a run or a PLY file in a window until it is closed, or write an image of it.
 
@@ -69,7 +69,7 @@ def view_run(
     Args:
         run: the output of a run, its folder, or a .ply file.
         options: what is shown, and how.
-        say: is called with each note about what is missing.
+        say: is called with each note about what is missing; prints it by default.
 
     Returns:
         The image, (H, W, 3) uint8 RGB; None if a window was opened.
@@ -95,7 +95,7 @@ def view_run(
     if options.screenshot is not None:
         quiet_vtk()
     window = SceneWindow(tour, size_wh=size_wh, off_screen=options.screenshot is not None, budget=options.points)
-    for note in scene.notes if say is not None else ():
+    for note in scene.notes:
         say(note)
     if options.screenshot is None:
         require_window(window.plotter.render_window.GetClassName())

@@ -10,6 +10,7 @@ import pytest
 
 from pano_mvs.cli.tour_command import open_in_browser
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.session import Session
 from tests.cli.conftest import SMALL, Command
 from tests.engine.conftest import Toy, toy
 
@@ -20,7 +21,12 @@ __all__ = ["toy"]
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The addresses that were opened, on a machine with a screen."""
     addresses: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", lambda address: addresses.append(address) or True)
+
+    def open_address(address: str) -> bool:
+        addresses.append(address)
+        return True
+
+    monkeypatch.setattr(webbrowser, "open", open_address)
     monkeypatch.setenv("DISPLAY", ":0")
     return addresses
 
@@ -49,10 +55,13 @@ def test_the_preset_is_chosen_by_what_is_given(
 ) -> None:
     Path("rooms").mkdir()
     Path("walk.mp4").touch()
-    sessions = []
-    monkeypatch.setattr(
-        "pano_mvs.cli.tour_command.run_decided", lambda session, *_, **__: sessions.append(session) or 4
-    )
+    sessions: list[Session] = []
+
+    def stop(session: Session, *_: object, **__: object) -> int:
+        sessions.append(session)
+        return 4
+
+    monkeypatch.setattr("pano_mvs.cli.tour_command.run_decided", stop)
     result = pano_mvs("tour", name, "--cache", "kept")
     (session,) = sessions
     assert (result.code, session.workflow.name, session.store_root) == (4, workflow, Path("kept"))
