@@ -9,6 +9,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +35,7 @@ from pano_mvs.cli.options import (
     UntilOption,
     WorkflowArgument,
     given_path,
+    takes_record,
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
@@ -69,14 +71,15 @@ def options(
     """Dense 3D from 360° photographs."""
 
 
-@app.command()
-@guarded
-def run(
-    workflow: WorkflowArgument,
-    images: ImagesOption = None,
-    out: OutOption = None,
-    overrides: SetOption = None,
-    cache: CacheOption = None,
+@dataclass(frozen=True)
+class RunArguments:
+    """The arguments and options of `pano-mvs run`."""
+
+    workflow: WorkflowArgument
+    images: ImagesOption = None
+    out: OutOption = None
+    overrides: SetOption = None
+    cache: CacheOption = None
     executor: Annotated[
         str,
         typer.Option(
@@ -86,11 +89,11 @@ def run(
             show_default=False,
             rich_help_panel="Workers",
         ),
-    ] = "",
+    ] = ""
     workers: Annotated[
         int,
         typer.Option("--workers", min=0, help="Number of worker processes; 0: one per core, if memory permits."),
-    ] = 0,
+    ] = 0
     threads: Annotated[
         int,
         typer.Option(
@@ -99,7 +102,7 @@ def run(
             help="Threads per worker; 0: an equal share of the cores.",
             rich_help_panel="Workers",
         ),
-    ] = 0,
+    ] = 0
     scheduler: Annotated[
         str,
         typer.Option(
@@ -109,7 +112,7 @@ def run(
             show_default=False,
             rich_help_panel="Workers",
         ),
-    ] = "",
+    ] = ""
     queue: Annotated[
         Path | None,
         typer.Option(
@@ -119,7 +122,7 @@ def run(
             show_default=False,
             rich_help_panel="Workers",
         ),
-    ] = None,
+    ] = None
     notify: Annotated[
         list[str] | None,
         typer.Option(
@@ -128,7 +131,7 @@ def run(
             help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
             rich_help_panel="Disk and messages",
         ),
-    ] = None,
+    ] = None
     otel: Annotated[
         bool,
         typer.Option(
@@ -136,15 +139,15 @@ def run(
             help="Send the run, its stages and units as spans to an OpenTelemetry collector.",
             rich_help_panel="Disk and messages",
         ),
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
-    until: UntilOption = None,
-    only: OnlyOption = None,
-    refresh: RefreshOption = None,
-    accept_code: AcceptOption = False,
+    ] = False
+    as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False
+    until: UntilOption = None
+    only: OnlyOption = None
+    refresh: RefreshOption = None
+    accept_code: AcceptOption = False
     keep_going: Annotated[
         bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
-    ] = False,
+    ] = False
     isolate: Annotated[
         bool,
         typer.Option(
@@ -152,7 +155,7 @@ def run(
             help="Compute each unit of a plugin's stage in a process of its own.",
             rich_help_panel="Workers",
         ),
-    ] = False,
+    ] = False
     min_free: Annotated[
         str,
         typer.Option(
@@ -162,7 +165,7 @@ def run(
             show_default=False,
             rich_help_panel="Disk and messages",
         ),
-    ] = "",
+    ] = ""
     durable: Annotated[
         bool,
         typer.Option(
@@ -170,10 +173,10 @@ def run(
             help="Flush each result to disk, for machines that may lose power.",
             rich_help_panel="Disk and messages",
         ),
-    ] = False,
+    ] = False
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
-    ] = False,
+    ] = False
     block_size: Annotated[
         int | None,
         typer.Option(
@@ -185,7 +188,7 @@ def run(
             show_default=False,
             rich_help_panel="Blocks of a large capture",
         ),
-    ] = None,
+    ] = None
     block_overlap: Annotated[
         int,
         typer.Option(
@@ -196,7 +199,7 @@ def run(
             show_default=False,
             rich_help_panel="Blocks of a large capture",
         ),
-    ] = 0,
+    ] = 0
     block_loop: Annotated[
         bool,
         typer.Option(
@@ -204,7 +207,7 @@ def run(
             help="The path ends where it began: the last block overlaps the first.",
             rich_help_panel="Blocks of a large capture",
         ),
-    ] = False,
+    ] = False
     block_poses: Annotated[
         Path | None,
         typer.Option(
@@ -212,8 +215,13 @@ def run(
             help="Rough poses, such as an output folder: blocks also overlap where the path returns.",
             rich_help_panel="Blocks of a large capture",
         ),
-    ] = None,
-) -> None:
+    ] = None
+
+
+@app.command()
+@guarded
+@takes_record
+def run(given: RunArguments) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.blocks_command import run_decided
     from pano_mvs.cli.run.ending import notified
@@ -222,15 +230,36 @@ def run(
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
-    limits = tuple(until or ()), tuple(only or ()), tuple(refresh or ())
-    run_options = RunOptions(*limits, accept_code, keep_going, isolate)
+    limits = tuple(given.until or ()), tuple(given.only or ()), tuple(given.refresh or ())
+    run_options = RunOptions(*limits, given.accept_code, given.keep_going, given.isolate)
     session = open_session(
-        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+        given.workflow,
+        overrides=given.overrides or [],
+        images=given.images,
+        cache=given.cache,
+        out=given.out,
+        run_options=run_options,
     )
-    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable, otel)
-    decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=block_poses)
-    with notified([] if dry_run else notify or [], session.out):
-        raise typer.Exit(run_decided(session, execution, decision, as_json=as_json, dry_run=dry_run))
+    execution = Execution(
+        given.executor,
+        given.workers,
+        given.threads,
+        given.scheduler,
+        given.queue,
+        given.min_free,
+        given.durable,
+        given.otel,
+    )
+    decision = decision_of(
+        session,
+        execution,
+        given.block_size,
+        overlap=given.block_overlap,
+        loop=given.block_loop,
+        poses=given.block_poses,
+    )
+    with notified([] if given.dry_run else given.notify or [], session.out):
+        raise typer.Exit(run_decided(session, execution, decision, as_json=given.as_json, dry_run=given.dry_run))
 
 
 @app.command()
@@ -407,25 +436,26 @@ app.command()(plugins)
 app.command()(doctor)
 
 
-@app.command("view")
-@guarded
-def view_results(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
+@dataclass(frozen=True)
+class ViewArguments:
+    """The arguments and options of `pano-mvs view`."""
+
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")]
     screenshot: Annotated[
         Path | None,
         typer.Option(
             "--screenshot", metavar="FILE", help="Write an image instead of opening a window; works without a display."
         ),
-    ] = None,
-    view: Annotated[
-        str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")
-    ] = "overview",
+    ] = None
+    view: Annotated[str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")] = (
+        "overview"
+    )
     color: Annotated[
         str,
         typer.Option(
             "--color", help="Colours: rgb, confidence, views, normals or height.", rich_help_panel="What is shown"
         ),
-    ] = "rgb",
+    ] = "rgb"
     surface: Annotated[
         str,
         typer.Option(
@@ -435,31 +465,29 @@ def view_results(
             show_default=False,
             rich_help_panel="What is shown",
         ),
-    ] = "",
+    ] = ""
     points: Annotated[
         int,
         typer.Option(
             "--points", min=0, help="Maximum number of points to draw; 0: all.", rich_help_panel="What is shown"
         ),
-    ] = 2_000_000,
-    size: Annotated[
-        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")
-    ] = "1280x860",
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
-    ] = None,
+    ] = 2_000_000
+    size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")] = (
+        "1280x860"
+    )
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")] = None
     labels: Annotated[
         bool, typer.Option("--labels", help="Show the names of the cameras.", rich_help_panel="What is shown")
-    ] = False,
+    ] = False
     blended: Annotated[
         bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.", rich_help_panel="What is shown")
-    ] = False,
+    ] = False
     backs: Annotated[
         bool,
         typer.Option(
             "--backs", help="Also show points that face away from the viewer.", rich_help_panel="What is shown"
         ),
-    ] = False,
+    ] = False
     group: Annotated[
         int,
         typer.Option(
@@ -468,7 +496,7 @@ def view_results(
             help="Group to show if the panoramas form several groups; 0 is the largest.",
             rich_help_panel="What is shown",
         ),
-    ] = 0,
+    ] = 0
     ranges: Annotated[
         bool,
         typer.Option(
@@ -476,16 +504,34 @@ def view_results(
             help="Inside a camera, show its ranges; unconfirmed ones are marked.",
             rich_help_panel="What is shown",
         ),
-    ] = False,
-) -> None:
+    ] = False
+
+
+@app.command("view")
+@guarded
+@takes_record
+def view_results(given: ViewArguments) -> None:
     """View the cloud, the mesh and the cameras, and step inside the panoramas."""
     from pano_mvs.viewer.view import ViewOptions, view_run
 
-    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group, ranges)
+    options = ViewOptions(
+        given.images,
+        given.screenshot,
+        given.view,
+        given.color,
+        given.surface,
+        given.points,
+        given.size,
+        given.labels,
+        given.blended,
+        given.backs,
+        given.group,
+        given.ranges,
+    )
     console = Console()
-    view_run(out, options, say=lambda note: console.say(f"note: {escape(note)}"))
-    if screenshot is not None:
-        console.say(f"picture in {escape(str(screenshot))}")
+    view_run(given.out, options, say=lambda note: console.say(f"note: {escape(note)}"))
+    if given.screenshot is not None:
+        console.say(f"picture in {escape(str(given.screenshot))}")
 
 
 @app.command("scale", context_settings={"ignore_unknown_options": True})

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar, get_type_hints
 
 import typer
 
 from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
+
+Arguments = TypeVar("Arguments")
+
+
+def takes_record(command: Callable[[Arguments], None]) -> Callable[..., None]:
+    """Let a command with many options take them as one record, whose fields typer reads as those of a function."""
+    (record,) = (hint for name, hint in get_type_hints(command).items() if name != "return")
+
+    def take(**values: object) -> None:
+        command(record(**values))
+
+    take.__name__, take.__doc__ = command.__name__, command.__doc__
+    take.__annotations__ = hints = get_type_hints(record, include_extras=True)
+    fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(record).parameters.items()]
+    take.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
+    return take
 
 
 def given_path(text: str) -> Path:
