@@ -4,6 +4,8 @@
     run = pano_mvs.load("out")                                      # what an earlier run made
     plan = pano_mvs.plan("quickstart", images="photos")             # what a run would compute
     scores = pano_mvs.evaluate_run("out", "truth")                  # how far it is from ground truth
+    run.share("page")                                               # a page to send, shown in a notebook
+    run.view()                                                      # a window with the cloud and the cameras
 
 The command line is `pano-mvs`. Authors of plugins import `pano_mvs.api`. The conventions (frames, pixels, ranges) are
 stated once, in `pano_mvs.geometry`.
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.captures import run
     from pano_mvs.session.planning import RunPlan, plan
+    from pano_mvs.share import Shared, ShareOptions, share_run
+    from pano_mvs.viewer.view import ViewOptions, view_run
 
 __version__ = "0.1.0"
 
@@ -30,8 +34,11 @@ __all__ = [
     "RunStoppedError",
     "RunSummary",
     "RunView",
+    "ShareOptions",
+    "Shared",
     "StoreError",
     "UsageError",
+    "ViewOptions",
     "WorkflowError",
     "__version__",
     "evaluate_cloud",
@@ -41,6 +48,8 @@ __all__ = [
     "load",
     "plan",
     "run",
+    "share_run",
+    "view_run",
 ]
 
 # Where each name is; imported when it is first used, since the libraries behind it take a second to load.
@@ -52,8 +61,11 @@ _HOMES = {
     "RunStoppedError": "core.errors",
     "RunSummary": "results.summary",
     "RunView": "results.run_output",
+    "ShareOptions": "share",
+    "Shared": "share",
     "StoreError": "core.errors",
     "UsageError": "core.errors",
+    "ViewOptions": "viewer.view",
     "WorkflowError": "core.errors",
     "evaluate_cloud": "evaluation",
     "evaluate_depth": "evaluation",
@@ -62,6 +74,8 @@ _HOMES = {
     "load": "results.run_output",
     "plan": "session.planning",
     "run": "session.captures",
+    "share_run": "share",
+    "view_run": "viewer.view",
 }
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / "pano_mvs"
 MAX_POSITIONAL = 3
 MAX_PARAMETERS = 12
-# Each option of a command is a parameter of its function; `pano_mvs.run` has those of the command `run`.
-MANY_PARAMETERS = {"cli/app.py:run", "cli/app.py:view_results", "cli/evaluate/app.py:depth", "session/captures.py:run"}
+# `pano_mvs.run` has the options of the command `run`; the commands themselves take them as a record.
+MANY_PARAMETERS = {"session/captures.py:run"}
 
 
 def wrong_functions(module: str, source: str) -> tuple[list[str], set[str]]:

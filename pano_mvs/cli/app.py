@@ -9,6 +9,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache.app import cache_app
+from pano_mvs.cli.completion import complete_workflow
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.error_messages import guarded
@@ -32,6 +34,8 @@ from pano_mvs.cli.options import (
     TargetArgument,
     UntilOption,
     WorkflowArgument,
+    given_path,
+    takes_record,
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
@@ -67,14 +71,15 @@ def options(
     """Dense 3D from 360° photographs."""
 
 
-@app.command()
-@guarded
-def run(
-    workflow: WorkflowArgument,
-    images: ImagesOption = None,
-    out: OutOption = None,
-    overrides: SetOption = None,
-    cache: CacheOption = None,
+@dataclass(frozen=True)
+class RunArguments:
+    """The arguments and options of `pano-mvs run`."""
+
+    workflow: WorkflowArgument
+    images: ImagesOption = None
+    out: OutOption = None
+    overrides: SetOption = None
+    cache: CacheOption = None
     executor: Annotated[
         str,
         typer.Option(
@@ -82,15 +87,22 @@ def run(
             help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
             "serial (one unit at a time in this process, for debugging). Default: processes.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
-    ] = "",
+    ] = ""
     workers: Annotated[
         int,
         typer.Option("--workers", min=0, help="Number of worker processes; 0: one per core, if memory permits."),
-    ] = 0,
+    ] = 0
     threads: Annotated[
-        int, typer.Option("--threads-per-worker", min=0, help="Threads per worker; 0: an equal share of the cores.")
-    ] = 0,
+        int,
+        typer.Option(
+            "--threads-per-worker",
+            min=0,
+            help="Threads per worker; 0: an equal share of the cores.",
+            rich_help_panel="Workers",
+        ),
+    ] = 0
     scheduler: Annotated[
         str,
         typer.Option(
@@ -98,8 +110,9 @@ def run(
             metavar="ADDRESS",
             help="Use this dask scheduler, such as tcp://host:8786; its workers must share the cache.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
-    ] = "",
+    ] = ""
     queue: Annotated[
         Path | None,
         typer.Option(
@@ -107,31 +120,42 @@ def run(
             metavar="FILE.yaml",
             help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
             show_default=False,
+            rich_help_panel="Workers",
         ),
-    ] = None,
+    ] = None
     notify: Annotated[
         list[str] | None,
         typer.Option(
             "--notify",
             metavar="URL",
             help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
+            rich_help_panel="Disk and messages",
         ),
-    ] = None,
+    ] = None
     otel: Annotated[
         bool,
-        typer.Option("--otel", help="Send the run, its stages and units as spans to an OpenTelemetry collector."),
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
-    until: UntilOption = None,
-    only: OnlyOption = None,
-    refresh: RefreshOption = None,
-    accept_code: AcceptOption = False,
+        typer.Option(
+            "--otel",
+            help="Send the run, its stages and units as spans to an OpenTelemetry collector.",
+            rich_help_panel="Disk and messages",
+        ),
+    ] = False
+    as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False
+    until: UntilOption = None
+    only: OnlyOption = None
+    refresh: RefreshOption = None
+    accept_code: AcceptOption = False
     keep_going: Annotated[
         bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
-    ] = False,
+    ] = False
     isolate: Annotated[
-        bool, typer.Option("--isolate", help="Compute each unit of a plugin's stage in a process of its own.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--isolate",
+            help="Compute each unit of a plugin's stage in a process of its own.",
+            rich_help_panel="Workers",
+        ),
+    ] = False
     min_free: Annotated[
         str,
         typer.Option(
@@ -139,15 +163,20 @@ def run(
             metavar="SIZE",
             help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
             show_default=False,
+            rich_help_panel="Disk and messages",
         ),
-    ] = "",
+    ] = ""
     durable: Annotated[
         bool,
-        typer.Option("--durable", help="Flush each result to disk, for machines that may lose power."),
-    ] = False,
+        typer.Option(
+            "--durable",
+            help="Flush each result to disk, for machines that may lose power.",
+            rich_help_panel="Disk and messages",
+        ),
+    ] = False
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
-    ] = False,
+    ] = False
     block_size: Annotated[
         int | None,
         typer.Option(
@@ -157,8 +186,9 @@ def run(
             help="Run overlapping blocks of at most N images one after the other, and merge them; 0: all images at "
             "once. Default: blocks if pairs or poses would take more memory than there is.",
             show_default=False,
+            rich_help_panel="Blocks of a large capture",
         ),
-    ] = None,
+    ] = None
     block_overlap: Annotated[
         int,
         typer.Option(
@@ -167,44 +197,103 @@ def run(
             min=0,
             help="Images that consecutive blocks share; default: a quarter of the block size, 3 to 100.",
             show_default=False,
+            rich_help_panel="Blocks of a large capture",
         ),
-    ] = 0,
+    ] = 0
     block_loop: Annotated[
-        bool, typer.Option("--block-loop", help="The path ends where it began: the last block overlaps the first.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--block-loop",
+            help="The path ends where it began: the last block overlaps the first.",
+            rich_help_panel="Blocks of a large capture",
+        ),
+    ] = False
     block_poses: Annotated[
         Path | None,
         typer.Option(
-            "--block-poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
+            "--block-poses",
+            help="Rough poses, such as an output folder: blocks also overlap where the path returns.",
+            rich_help_panel="Blocks of a large capture",
         ),
-    ] = None,
-) -> None:
+    ] = None
+
+
+@app.command()
+@guarded
+@takes_record
+def run(given: RunArguments) -> None:
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.blocks_command import run_blocks_shown
-    from pano_mvs.cli.plan_commands import show_dry_run
-    from pano_mvs.cli.run.command import run_workflow
+    from pano_mvs.cli.blocks_command import run_decided
     from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
     from pano_mvs.session.merging.automatic import decision_of
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
-    limits = tuple(until or ()), tuple(only or ()), tuple(refresh or ())
-    run_options = RunOptions(*limits, accept_code, keep_going, isolate)
+    limits = tuple(given.until or ()), tuple(given.only or ()), tuple(given.refresh or ())
+    run_options = RunOptions(*limits, given.accept_code, given.keep_going, given.isolate)
     session = open_session(
-        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+        given.workflow,
+        overrides=given.overrides or [],
+        images=given.images,
+        cache=given.cache,
+        out=given.out,
+        run_options=run_options,
     )
-    execution = Execution(executor, workers, threads, scheduler, queue, min_free, durable, otel)
-    decision = decision_of(session, execution, block_size, overlap=block_overlap, loop=block_loop, poses=block_poses)
-    with notified([] if dry_run else notify or [], session.out):
-        if decision.division is not None:
-            raise typer.Exit(run_blocks_shown(session, execution, decision, as_json=as_json, dry_run=dry_run))
-        if decision.reason:
-            Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
-        if dry_run:
-            show_dry_run(session, Console(), execution=execution, as_json=as_json)
-            return
-        raise typer.Exit(run_workflow(session, execution, as_json=as_json))
+    execution = Execution(
+        given.executor,
+        given.workers,
+        given.threads,
+        given.scheduler,
+        given.queue,
+        given.min_free,
+        given.durable,
+        given.otel,
+    )
+    decision = decision_of(
+        session,
+        execution,
+        given.block_size,
+        overlap=given.block_overlap,
+        loop=given.block_loop,
+        poses=given.block_poses,
+    )
+    with notified([] if given.dry_run else given.notify or [], session.out):
+        raise typer.Exit(run_decided(session, execution, decision, as_json=given.as_json, dry_run=given.dry_run))
+
+
+@app.command()
+@guarded
+def tour(
+    images: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PATH", parser=given_path, help="Folder of panoramas or of a virtual tour, or a video of a walk."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Output folder; default: out/<name of PATH>. The page is in <output folder>_page."),
+    ] = None,
+    workflow: Annotated[
+        str,
+        typer.Option(
+            "--workflow",
+            metavar="WORKFLOW",
+            help="A preset or a workflow file; default: mesh, or walk for a video.",
+            autocompletion=complete_workflow,
+            show_default=False,
+        ),
+    ] = "",
+    overrides: SetOption = None,
+    cache: CacheOption = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the page in a browser.")] = False,
+) -> None:
+    """Make a page to walk through from panoramas: run a workflow, write the page, and open it in a browser."""
+    from pano_mvs.cli.tour_command import TourWanted, make_tour
+
+    wanted = TourWanted(images, out, workflow, tuple(overrides or ()), cache)
+    raise typer.Exit(make_tour(wanted, Console(), opens=not no_open))
 
 
 @app.command()
@@ -347,20 +436,26 @@ app.command()(plugins)
 app.command()(doctor)
 
 
-@app.command("view")
-@guarded
-def view_results(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
+@dataclass(frozen=True)
+class ViewArguments:
+    """The arguments and options of `pano-mvs view`."""
+
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")]
     screenshot: Annotated[
         Path | None,
         typer.Option(
             "--screenshot", metavar="FILE", help="Write an image instead of opening a window; works without a display."
         ),
-    ] = None,
-    view: Annotated[
-        str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")
-    ] = "overview",
-    color: Annotated[str, typer.Option("--color", help="Colours: rgb, confidence, views, normals or height.")] = "rgb",
+    ] = None
+    view: Annotated[str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")] = (
+        "overview"
+    )
+    color: Annotated[
+        str,
+        typer.Option(
+            "--color", help="Colours: rgb, confidence, views, normals or height.", rich_help_panel="What is shown"
+        ),
+    ] = "rgb"
     surface: Annotated[
         str,
         typer.Option(
@@ -368,37 +463,75 @@ def view_results(
             metavar="cloud|mesh|both",
             help="What to show; default: the cloud if it exists.",
             show_default=False,
+            rich_help_panel="What is shown",
         ),
-    ] = "",
+    ] = ""
     points: Annotated[
-        int, typer.Option("--points", min=0, help="Maximum number of points to draw; 0: all.")
-    ] = 2_000_000,
-    size: Annotated[
-        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")
-    ] = "1280x860",
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
-    ] = None,
-    labels: Annotated[bool, typer.Option("--labels", help="Show the names of the cameras.")] = False,
-    blended: Annotated[bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.")] = False,
-    backs: Annotated[bool, typer.Option("--backs", help="Also show points that face away from the viewer.")] = False,
+        int,
+        typer.Option(
+            "--points", min=0, help="Maximum number of points to draw; 0: all.", rich_help_panel="What is shown"
+        ),
+    ] = 2_000_000
+    size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")] = (
+        "1280x860"
+    )
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")] = None
+    labels: Annotated[
+        bool, typer.Option("--labels", help="Show the names of the cameras.", rich_help_panel="What is shown")
+    ] = False
+    blended: Annotated[
+        bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.", rich_help_panel="What is shown")
+    ] = False
+    backs: Annotated[
+        bool,
+        typer.Option(
+            "--backs", help="Also show points that face away from the viewer.", rich_help_panel="What is shown"
+        ),
+    ] = False
     group: Annotated[
         int,
         typer.Option(
             "--group",
             min=0,
             help="Group to show if the panoramas form several groups; 0 is the largest.",
+            rich_help_panel="What is shown",
         ),
-    ] = 0,
+    ] = 0
     ranges: Annotated[
-        bool, typer.Option("--ranges", help="Inside a camera, show its ranges; unconfirmed ones are marked.")
-    ] = False,
-) -> None:
-    """View the cloud, the mesh and the cameras, and step inside the panoramas."""
-    from pano_mvs.cli.view_command import ViewOptions, view_scene
+        bool,
+        typer.Option(
+            "--ranges",
+            help="Inside a camera, show its ranges; unconfirmed ones are marked.",
+            rich_help_panel="What is shown",
+        ),
+    ] = False
 
-    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group, ranges)
-    view_scene(out, options, Console())
+
+@app.command("view")
+@guarded
+@takes_record
+def view_results(given: ViewArguments) -> None:
+    """View the cloud, the mesh and the cameras, and step inside the panoramas."""
+    from pano_mvs.viewer.view import ViewOptions, view_run
+
+    options = ViewOptions(
+        given.images,
+        given.screenshot,
+        given.view,
+        given.color,
+        given.surface,
+        given.points,
+        given.size,
+        given.labels,
+        given.blended,
+        given.backs,
+        given.group,
+        given.ranges,
+    )
+    console = Console()
+    view_run(given.out, options, say=lambda note: console.say(f"note: {escape(note)}"))
+    if given.screenshot is not None:
+        console.say(f"picture in {escape(str(given.screenshot))}")
 
 
 @app.command("scale", context_settings={"ignore_unknown_options": True})

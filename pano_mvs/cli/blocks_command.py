@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.plan_commands import show_dry_run
-from pano_mvs.cli.run.command import interrupted_by_termination, run_shown, run_with_events
+from pano_mvs.cli.run.command import interrupted_by_termination, run_shown, run_with_events, run_workflow
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.text import plural
 from pano_mvs.results.summary import BLOCKS
@@ -29,25 +29,47 @@ from pano_mvs.session.session import Session
 _SAME_COMMAND = "give the same command again; finished results are reused"
 
 
-def run_blocks_shown(
-    session: Session, execution: Execution, decision: BlockDecision, *, as_json: bool = False, dry_run: bool = False
+def run_decided(
+    session: Session,
+    execution: Execution,
+    decision: BlockDecision,
+    *,
+    as_json: bool = False,
+    dry_run: bool = False,
+    advise: bool = True,
 ) -> int:
-    """Run a workflow for each block of its images, merge the blocks, and return the exit code.
-
-    A block that ends early ends the command, or, with `--keep-going`, is left for a later command. The blocks are
-    merged when none did.
+    """Run a workflow, in blocks if that was decided, print progress and a summary, and return the exit code.
 
     Args:
-        session: over the whole capture.
+        session: the session.
         execution: how units are computed.
-        decision: with a division.
+        decision: whether the capture is divided.
         as_json: print events instead.
-        dry_run: only print the plan of each block.
+        dry_run: only print the plan.
+        advise: whether to print the commands that can follow.
 
     Raises:
         UsageError: if the session cannot be run in blocks, or an option does not go with blocks.
         InputError: if there are no images.
         StoreError: if the output folder cannot be written.
+    """
+    if decision.division is not None:
+        return _run_blocks_shown(session, execution, decision, as_json=as_json, dry_run=dry_run)
+    if decision.reason:
+        Console(stderr=True).say(f"[yellow]warning:[/] {escape(decision.reason)}")
+    if dry_run:
+        show_dry_run(session, Console(), execution=execution, as_json=as_json)
+        return 0
+    return run_workflow(session, execution, as_json=as_json, advise=advise)
+
+
+def _run_blocks_shown(
+    session: Session, execution: Execution, decision: BlockDecision, *, as_json: bool, dry_run: bool
+) -> int:
+    """Run a workflow for each block of its images, merge the blocks, and return the exit code.
+
+    A block that ends early ends the command, or, with `--keep-going`, is left for a later command. The blocks are
+    merged when none did.
     """
     if dry_run:
         if as_json:

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar, get_type_hints
 
 import typer
 
 from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
 
+Arguments = TypeVar("Arguments")
 
-def _given_path(text: str) -> Path:
+
+def takes_record(command: Callable[[Arguments], None]) -> Callable[..., None]:
+    """Let a command with many options take them as one record, whose fields typer reads as those of a function."""
+    (record,) = (hint for name, hint in get_type_hints(command).items() if name != "return")
+
+    def take(**values: object) -> None:
+        command(record(**values))
+
+    take.__name__, take.__doc__ = command.__name__, command.__doc__
+    take.__annotations__ = hints = get_type_hints(record, include_extras=True)
+    fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(record).parameters.items()]
+    take.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
+    return take
+
+
+def given_path(text: str) -> Path:
     """Return the path that an option states, which is empty for a variable of the shell without a value."""
     if not text:
         raise typer.BadParameter("the name is empty")
@@ -35,7 +53,7 @@ ImagesOption = Annotated[
     Path | None,
     typer.Option(
         "--images",
-        parser=_given_path,
+        parser=given_path,
         metavar="PATH",
         help="Folder of panoramas or of a virtual tour, or a video; default: that of the workflow.",
     ),
@@ -64,7 +82,12 @@ UntilOption = Annotated[
 ]
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="STAGE:ITEM", help="Run only this unit and the units that it needs."),
+    typer.Option(
+        "--only",
+        metavar="STAGE:ITEM",
+        help="Run only this unit and the units that it needs.",
+        rich_help_panel="Selection of units",
+    ),
 ]
 RefreshOption = Annotated[
     list[str] | None,
@@ -73,8 +96,14 @@ RefreshOption = Annotated[
         metavar="STAGE[:ITEM]",
         help="Recompute this stage or unit even if it is cached.",
         autocompletion=complete_stage,
+        rich_help_panel="Selection of units",
     ),
 ]
 AcceptOption = Annotated[
-    bool, typer.Option("--accept-code", help="Reuse results that were computed before code or libraries changed.")
+    bool,
+    typer.Option(
+        "--accept-code",
+        help="Reuse results that were computed before code or libraries changed.",
+        rich_help_panel="Selection of units",
+    ),
 ]

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+import pano_mvs
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import file_inside, item_problem
 from pano_mvs.core.paths import is_file, is_folder
@@ -91,6 +92,14 @@ class RunOutput:
     def views(self) -> Views:
         """The views with a range map, by the names of their images."""
         return Views(self)
+
+    def share(self, folder: str | Path, options: pano_mvs.ShareOptions | None = None) -> pano_mvs.Shared:
+        """Write a page with the cloud, the mesh, the cameras and the panoramas; see `pano_mvs.share_run`."""
+        return pano_mvs.share_run(self, folder, options)
+
+    def view(self, options: pano_mvs.ViewOptions | None = None) -> NDArray[np.uint8] | None:
+        """View the run in a window until it is closed, or write an image of it; see `pano_mvs.view_run`."""
+        return pano_mvs.view_run(self, options)
 
     def has_file(self, name: str) -> bool:
         """Return whether a file is in the output folder and not left over from an earlier run.

@@ -38,6 +38,14 @@ SINGLE_FILE = "page.html"
 _MARK = "pano-mvs-page.txt"
 
 
+def require_free(folder: Path, option: str = "") -> None:
+    """Raise UsageError if a folder holds anything but an earlier page; the message begins with the option."""
+    if exists(folder) and not is_folder(folder):
+        raise UsageError(f"{option}{folder}: this is a file. Give a folder")
+    if is_folder(folder) and any(children(folder)) and not is_file(folder / _MARK):
+        raise UsageError(f"{option}{folder}: the folder is not empty and holds no earlier page. Give a new folder")
+
+
 class PageFolder:
     """A folder with a page, to which data are added.
 
@@ -56,10 +64,7 @@ class PageFolder:
             UsageError: if the folder holds something else.
             StoreError: if it cannot be written.
         """
-        if exists(folder) and not is_folder(folder):
-            raise UsageError(f"--to {folder}: this is a file. Give a folder")
-        if is_folder(folder) and any(children(folder)) and not is_file(folder / _MARK):
-            raise UsageError(f"--to {folder}: the folder is not empty and holds no earlier page. Give a new folder")
+        require_free(folder, "--to ")
         for name in ("data", "index.html", SINGLE_FILE):
             remove_whole(folder / name)
         write_text(folder / _MARK, "This folder was written by pano-mvs share, which may replace its files.\n")

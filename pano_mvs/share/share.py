@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
-from pano_mvs.results.run_output import RunOutput
+from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_file import decode_image
@@ -72,10 +73,18 @@ class Shared:
     total_bytes: int
     notes: tuple[str, ...] = ()
 
+    def _repr_html_(self) -> str:
+        """Return the page for a notebook, which keeps it; only where it is if it is too large for one file."""
+        if self.single_file is None:
+            return f"<p>Open {escape(str(self.page))} in a browser: the page is too large for a notebook.</p>"
+        page = self.single_file.read_text(encoding="utf-8")
+        # The page cannot reach the notebook from its sandbox.
+        return f'<iframe srcdoc="{escape(page)}" sandbox="allow-scripts" width="100%" height="600"></iframe>'
+
 
 def share_run(
-    run: RunOutput,
-    folder: Path,
+    run: RunOutput | str | Path,
+    folder: str | Path,
     options: ShareOptions | None = None,
     *,
     images: Path | None = None,
@@ -85,13 +94,12 @@ def share_run(
 
     Of several groups of cameras, the largest is shown.
 
-    >>> import pano_mvs
-    >>> shared = share_run(pano_mvs.load("out"), Path("page"))
+    >>> shared = share_run("out", "page")
     >>> shared.page.name, shared.panoramas
     ('index.html', 4)
 
     Args:
-        run: the output of a run.
+        run: the output of a run, or its folder.
         folder: a new folder, or one that holds an earlier page.
         options: what the page contains.
         images: folder of the panoramas, if they were moved.
@@ -102,7 +110,7 @@ def share_run(
         UsageError: if the folder holds something else.
         StoreError: if a file cannot be written.
     """
-    options = options or ShareOptions()
+    run, folder, options = run if isinstance(run, RunOutput) else load(run), Path(folder), options or ShareOptions()
     poses = split_groups(run.poses)[0] if run.poses is not None else None
     cloud = run.cloud.groups()[0] if run.cloud is not None else None
     if poses is None and (cloud is None or not len(cloud)):

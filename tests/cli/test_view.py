@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.geometry import ray_from_pixel
 from pano_mvs.scene.image_file import decode_image
@@ -35,6 +36,16 @@ def test_a_picture_is_written_without_a_display(out: Path, tmp_path: Path, name:
     assert picture.shape == (200, 320, 3)
     ahead = turned_poses(3)["lobby/001.png"].rotation.T @ ray_from_pixel([64, 32], (64, 128))
     assert np.abs(picture[100, 160].astype(int) - world_color(ahead)).max() <= 10
+
+
+def test_a_run_is_viewed_from_python(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    options = pano_mvs.ViewOptions(screenshot=tmp_path / "a.png", size="320x200")
+    picture = pano_mvs.view_run(str(out), options)
+    assert picture is not None
+    assert (picture == decode_image(tmp_path / "a.png")).all()
+    with pytest.raises(pano_mvs.UsageError, match="no display"):
+        pano_mvs.view_run(out)
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:

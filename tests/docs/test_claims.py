@@ -1,8 +1,11 @@
-"""Versions, extras and capabilities that the documentation states are those of the package."""
+"""Versions, options, settings, defaults and capabilities that the documentation states are those of the package."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import re
+import textwrap
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,9 +14,14 @@ import pytest
 from typer.core import TyperOption
 from typer.main import get_command
 
+import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.extends import MAX_BYTES, MAX_FILES, MAX_STAGES
 from pano_mvs.engine.workflows.policy import Policy
+from pano_mvs.engine.workflows.yaml_text import MAX_DEPTH, MAX_VALUES
+from pano_mvs.results.records import PosesSummary
+from pano_mvs.scene import Poses
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -70,22 +78,151 @@ def test_what_a_stage_does_is_not_denied(denied: str, stage: str) -> None:
         assert not [hit for hit in re.findall(rf"(?<!Single )(?:{denied})", text) if hit], page
 
 
-COMMANDS = {"share": "share", "viewer": "view", "running": "run", "large_captures": "run"}
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
+FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+FILES = ("bin", "csv", "e57", "jpg", "json", "jsonl", "laz", "npz", "pgw", "ply", "png", "sh", "yaml")
+NUMBER = r"([\d][\d,]*)"
+# Options of other programs that a page names on their own.
+OTHERS = {
+    "docs/exports.md": {"--gut", "--depth-unit-scale-factor", "--depth_loss", "--data"},
+    "docs/installation.md": {"--user"},
+}
+
+
+def prose(page: Path) -> str:
+    """Return the text of a page without its blocks of code, in one line."""
+    return FENCED.sub("", page.read_text(encoding="utf-8")).replace("\n", " ")
+
+
+def commands(command: Any, words: str = "") -> dict[str, dict[str, TyperOption]]:
+    """Return the options of each command below one, by name."""
+    known = {name: option for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    inner = getattr(command, "commands", {})
+    below = [commands(child, f"{words} {name}".strip()) for name, child in inner.items()]
+    return {words: known, **{name: options for one in below for name, options in one.items()}}
+
+
+COMMANDS = commands(get_command(app))
+TABLES = {"share": "share", "viewer": "view", "running": "run", "large_captures": "run"}
 """Page to the command whose options its tables list."""
 
-NUMBER = r"([\d][\d,]*)"
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_options_exist(page: Path) -> None:
+    """On the command that the text names, or else on any."""
+    every = {name for options in COMMANDS.values() for name in options} | {"--help"}
+    place = page.relative_to(ROOT).as_posix()
+    for span in re.findall(r"`([^`]+)`", prose(page)):
+        named = OPTION.findall(span)
+        words = span.removeprefix("pano-mvs ").split()
+        called = next((two for two in (" ".join(words[:2]), words[0]) if two in COMMANDS), None) if words else None
+        if not named or (called is None and not span.startswith(("-", "pano-mvs"))) or place == "docs/benchmarks.md":
+            continue  # another program, such as pip
+        known = every | OTHERS.get(place, set()) if called is None else COMMANDS[called].keys() | {"--help"}
+        assert set(named) <= known, span
+
+
+def stages_by_name() -> dict[str, set[str]]:
+    """Return what the name of a stage in the shipped workflows stands for."""
+    found: dict[str, set[str]] = {}
+    for path in (ROOT / "workflows").glob("*.yaml"):
+        for name, use in re.findall(r"^  (\w+):\s+(?:\{use: |\n    use: )([\w.]+)", path.read_text(), re.MULTILINE):
+            found.setdefault(name, set()).add(use)
+    return found
+
+
+STAGES = Registry.installed().stages
+NAMES = stages_by_name()
+
+
+def defaults(stage: str, setting: str) -> list[Any]:
+    """Return the defaults of a setting in the stages that a name stands for, or in all stages if it is empty."""
+    specs = [STAGES[use] for use in NAMES.get(stage, ())] if stage else STAGES.values()
+    return [
+        spec.params_type.model_fields[setting].default for spec in specs if setting in spec.params_type.model_fields
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_stages_and_settings_exist(page: Path) -> None:
+    """A remedy named `pairs.neighbours`, which the stage `pairs` of no preset has."""
+    kinds = {name.partition(".")[0] for name in STAGES}
+    ours = set(re.findall(r'@stage\(\s*"([\w.]+)"', "".join(path.read_text() for path in ROOT.glob("plugins/**/*.py"))))
+    for name, key in re.findall(r"`([a-z]\w*)\.([a-z]\w*)`", prose(page)):
+        if (name not in NAMES and name not in kinds) or key in FILES or page.name == "benchmarks.md":
+            continue
+        in_run_json = hasattr(PosesSummary, key) or key in PosesSummary.__annotations__ or hasattr(Poses, key)
+        known = f"{name}.{key}" in {*STAGES, *ours} or defaults(name, key) or (name == "poses" and in_run_json)
+        assert known, f"{name}.{key}"
+
+
+STATED = re.compile(
+    r"`(?:([a-z]\w*)\.)?([a-z]\w*)`(?: \((?:default:? )?|, (?=[\d.,]+ by default))(-?\d[\d.,]*\d|-?\d)(?![–\d])"
+)
+"""A setting with a number that is its default: `min_s` (0.2), `max_megapixels`, 512 by default."""
+
+
+def test_defaults_of_settings_are_right() -> None:
+    found = 0
+    for page in PAGES:
+        for stage, setting, number in STATED.findall(prose(page)):
+            known = defaults(stage, setting)
+            if known and all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in known):
+                assert float(number.replace(",", "")) in known, f"{page.name}: {stage}.{setting} {number}"
+                found += 1
+    assert found >= 8
+
+
+def test_limits_of_workflows_are_those_of_the_code() -> None:
+    text = (ROOT / "docs" / "workflows.md").read_text(encoding="utf-8").replace("\n", " ")
+    stated = re.search(
+        rf"{NUMBER} values, {NUMBER} levels of nesting, {NUMBER} stages, {NUMBER} kB and {NUMBER} files", text
+    )
+    assert stated
+    numbers = [int(number.replace(",", "")) for number in stated.groups()]
+    assert numbers == [MAX_VALUES, MAX_DEPTH, MAX_STAGES, MAX_BYTES // 1000, MAX_FILES]
+
+
+def test_versions_of_what_the_package_holds_are_right() -> None:
+    wheels = {version for page in PAGES for version in re.findall(r"pano_mvs-([\d.]+)-py3", page.read_text())}
+    assert wheels == {pano_mvs.__version__}
+    (three,) = set(re.findall(r"three(?:@|\.js\]\(\S+\) )(0\.\d+)", (ROOT / "docs" / "share.md").read_text()))
+    library = (ROOT / "pano_mvs" / "share" / "web" / "three.min.js").read_text(encoding="utf-8")
+    assert f'"{three.removeprefix("0.")}"' in library
+
+
+def test_every_stage_and_preset_is_on_a_page() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    readme = dict(re.findall(r"^\| \[?(\w+)[^|]*\| (.*) \|$", PAGES[0].read_text(encoding="utf-8"), re.MULTILINE))
+    short = {f"{kind}.{name}" for kind, row in readme.items() for name in re.findall(r"`(\w+)`", row)}
+    short |= {name.replace("exports.", "export.") for name in short}
+    assert [name for name in STAGES if name not in text and name not in short] == []
+    presets = re.findall(r"`(\w+)`", "".join(re.findall(r"^\| ((?:`\w+`,? ?)+)\|", PAGES[0].read_text(), re.MULTILINE)))
+    assert {path.stem for path in (ROOT / "workflows").glob("*.yaml")} <= set(presets)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_python_imports_exists(page: Path) -> None:
+    for _, language, code in FENCED.findall(page.read_text(encoding="utf-8")):
+        if language != "python":
+            continue
+        for node in ast.walk(ast.parse(textwrap.dedent(code))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pano_mvs") and not node.level:
+                module = importlib.import_module(node.module or "")
+                assert [one.name for one in node.names if not hasattr(module, one.name)] == []
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "pano_mvs":
+                assert hasattr(pano_mvs, node.attr), node.attr
 
 
 def options_of(page: str) -> dict[str, tuple[str, TyperOption]]:
     """Return the rows of a page that begin with an option, and the option of the command."""
-    program: Any = get_command(app)
-    command = program.commands[COMMANDS[page]]
-    known = {name: option for option in command.params for name in option.opts}
-    rows = re.findall(r"^\| `(--[\w-]+)[^|]*\|(.*)\|$", (ROOT / "docs" / f"{page}.md").read_text(), re.MULTILINE)
+    known = COMMANDS[TABLES[page]]
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(--[\w-]+)[^|]*\|(.*)\|$", text, re.MULTILINE)
     return {name: (text, known[name]) for name, text in rows if name in known}
 
 
-@pytest.mark.parametrize("page", COMMANDS)
+@pytest.mark.parametrize("page", TABLES)
 def test_defaults_of_options_are_right(page: str) -> None:
     found = options_of(page)
     assert len(found) >= 3
@@ -96,7 +233,7 @@ def test_defaults_of_options_are_right(page: str) -> None:
             assert int(number.replace(",", "")) == option.default, name
 
 
-@pytest.mark.parametrize("page", COMMANDS)
+@pytest.mark.parametrize("page", TABLES)
 def test_zero_means_the_same_in_help_and_on_the_page(page: str) -> None:
     """`share --points 0` leaves out the cloud; its help said that all points are kept."""
     for name, (text, option) in options_of(page).items():

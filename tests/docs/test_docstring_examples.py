@@ -17,6 +17,7 @@ COMPUTING = (
     "pano_mvs.session.planning",
     "pano_mvs.results.run_output",
     "pano_mvs.share.share",
+    "pano_mvs.viewer.view",
 )
 
 

@@ -68,6 +68,9 @@ def test_the_notebook_runs(
     assert "% within 5 %" in printed
     (page,) = [value._repr_html_() for value in shown if isinstance(value, pano_mvs.RunOutput)]
     assert page.count("data:image/jpeg") == 8
+    (shared,) = [value for value in shown if isinstance(value, pano_mvs.Shared)]
+    assert (shared.points, shared.panoramas) == (100_000, 4)
+    assert len(shared._repr_html_()) < 10_000_000
     figures = [mpl.pyplot.figure(number) for number in mpl.pyplot.get_fignums()]
     assert len(figures) == 2
     assert len(figures[0].axes[0].images) == 1
@@ -76,6 +79,9 @@ def test_the_notebook_runs(
     exec(block("points"), names)
     points = names["points_in_world"](names["view"])
     assert np.linalg.norm(points, axis=1).max() < 100
+    exec(block("share"), names)
+    exec(block("view"), names)
+    assert names["picture"].shape == (640, 960, 3)
     exec(block("summary"), names)
     assert names["summary"] == names["run"].summary
 

@@ -42,12 +42,14 @@ def smaller(arguments: list[str]) -> list[str]:
     """Return a command that computes smaller images and opens no window."""
     if arguments[0] == "view":
         return [*arguments, "--screenshot", "view.png"]
-    if arguments[0] != "run":
+    if arguments[0] not in ("run", "tour"):
         return arguments
     given = [f"{name}={value}" for name, value in SMALLER.items()]
     if arguments[1] == "known_poses":
         given = [setting for setting in given if not setting.startswith("features")]
-    return [*arguments, *(word for setting in given for word in ("--set", setting))]
+    given += ["textured.texture_px=1024"] if arguments[0] == "tour" else []
+    quiet = ["--no-open"] if arguments[0] == "tour" else []
+    return [*arguments, *quiet, *(word for setting in given for word in ("--set", setting))]
 
 
 @pytest.mark.slow
@@ -63,9 +65,18 @@ def test_the_commands_run_one_after_the_other(tmp_path: Path, monkeypatch: pytes
     for _, script in sequences():
         for arguments in commands(script):
             result = CliRunner().invoke(app, smaller(arguments))
-            finished = (0, 3) if arguments[0] == "run" else (0,)  # 3: a camera may be doubtful at this resolution
+            finished = (
+                (0, 3) if arguments[0] in ("run", "tour") else (0,)
+            )  # 3: a camera may be doubtful at this resolution
             assert result.exit_code in finished, f"{shlex.join(arguments)}:\n{result.output}"
-    for made in ("classroom_page/index.html", "lobby_page/index.html", "curve.png", "view.png", "errors"):
+    for made in (
+        "classroom_page/index.html",
+        "out/lobby_page/index.html",
+        "lobby_page/index.html",
+        "curve.png",
+        "view.png",
+        "errors",
+    ):
         assert (tmp_path / made).exists(), made
     check_python()
 

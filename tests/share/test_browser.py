@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -105,6 +106,18 @@ def test_the_single_file_shows_the_same(browser: Browser, page: Path) -> None:
     folder_picture = browser.screenshot()
     show(browser, page.with_name("page.html").as_uri())
     assert differing(browser.screenshot(), folder_picture) < 0.01
+    assert browser.console() == []
+
+
+def test_a_notebook_shows_the_page_in_a_frame_that_cannot_reach_it(browser: Browser, tmp_path: Path) -> None:
+    shown = share_run(box_run(tmp_path, points=20_000), tmp_path / "page")._repr_html_()
+    (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><title>before</title><body>{shown}", encoding="utf-8")
+    browser.open((tmp_path / "notebook.html").as_uri())
+    end = time.monotonic() + 60
+    while browser.screenshot()[200:400, 400:800].std() < 10:  # the script of this page cannot ask the frame
+        assert time.monotonic() < end, browser.console()
+        time.sleep(0.2)
+    assert browser.evaluate("document.querySelector('iframe').contentDocument") is None
     assert browser.console() == []
 
 

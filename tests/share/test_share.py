@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import html
 import json
 import re
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
@@ -123,6 +125,17 @@ def test_a_large_run_has_no_single_file(tmp_path: Path) -> None:
     assert shared.single_file is None
     assert not (tmp_path / "page" / "page.html").exists()
     assert shared.points == 2_000
+
+
+def test_a_run_is_shared_from_python_and_shown_in_a_notebook(tmp_path: Path) -> None:
+    run = box_run(tmp_path)
+    shared = run.share(str(tmp_path / "page"), pano_mvs.ShareOptions(title='The "lobby" & more', max_points=1000))
+    assert shared.points == 1000
+    (text,) = re.findall(r'^<iframe srcdoc="([^"]*)" sandbox="allow-scripts" width="100%" height="600"></iframe>$',
+                         shared._repr_html_(), re.DOTALL)  # fmt: skip
+    assert html.unescape(text) == (tmp_path / "page" / "page.html").read_text(encoding="utf-8")
+    too_large = pano_mvs.share_run(run.out, tmp_path / "page", ShareOptions(max_single_file_bytes=1000))
+    assert f"Open {tmp_path / 'page' / 'index.html'} in a browser" in too_large._repr_html_()
 
 
 def test_a_folder_with_something_else_is_refused_and_kept(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -11,6 +12,7 @@ from typer.core import TyperGroup
 
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.error_messages import guarded
+from pano_mvs.cli.options import takes_record
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 
@@ -111,27 +113,46 @@ def cloud(
         Console().say(escape(f"accuracy.ply, completeness.ply and images of the errors are in {out}"))
 
 
-@evaluate_app.command("depth")
-@guarded
-def depth(
-    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
+@dataclass(frozen=True)
+class DepthArguments:
+    """The arguments and options of `pano-mvs evaluate depth`."""
+
+    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")]
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")]
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
-    ] = None,
+    ] = None
     align: Annotated[
-        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to its truth by one factor.")
-    ] = "none",
+        Literal["none", "median", "lsq"],
+        typer.Option("--align", help="Fit each view to its truth by one factor.", rich_help_panel="Scale and units"),
+    ] = "none"
     scale: Annotated[
-        str, typer.Option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
-    ] = "auto",
-    unit: Annotated[float, typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")] = 1.0,
-    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the true ranges.")] = 1.0,
-    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.")] = 10.0,
+        str,
+        typer.Option(
+            "--scale",
+            help="Factor to the unit of the ground truth; auto: from the camera centres.",
+            rich_help_panel="Scale and units",
+        ),
+    ] = "auto"
+    unit: Annotated[
+        float,
+        typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.", rich_help_panel="Scale and units"),
+    ] = 1.0
+    truth_unit: Annotated[
+        float, typer.Option("--truth-unit", help="Unit of the true ranges.", rich_help_panel="Scale and units")
+    ] = 1.0
+    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.", rich_help_panel="Scores")] = (
+        10.0
+    )
     bad: Annotated[
-        list[str], typer.Option("--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.")
-    ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
+        list[str] | None,
+        typer.Option(
+            "--bad",
+            help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated. Default: 5%.",
+            rich_help_panel="Scores",
+        ),
+    ] = None
     min_confidence: Annotated[
         int,
         typer.Option(
@@ -139,32 +160,52 @@ def depth(
             min=0,
             max=255,
             help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
+            rich_help_panel="Scores",
         ),
-    ] = 0,
+    ] = 0
     masks: Annotated[
-        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")
-    ] = None,
+        Path | None,
+        typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.", rich_help_panel="Masks"),
+    ] = None
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.")
-    ] = None,
+        Path | None,
+        typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.", rich_help_panel="Masks"),
+    ] = None
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
-    ] = None,
+    ] = None
     error_limit: Annotated[
-        float, typer.Option("--error-limit", help="Relative error at the end of the colour scale.")
-    ] = 0.1,
+        float,
+        typer.Option("--error-limit", help="Relative error at the end of the colour scale.", rich_help_panel="Scores"),
+    ] = 0.1
     baseline: Annotated[
-        Literal["best", "median", "mean"], typer.Option("--baseline", help="Constant range to compare with.")
-    ] = "best",
+        Literal["best", "median", "mean"],
+        typer.Option("--baseline", help="Constant range to compare with.", rich_help_panel="Scores"),
+    ] = "best"
     poses: Annotated[
-        Path | None, typer.Option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
-    ] = None,
+        Path | None,
+        typer.Option(
+            "--poses",
+            help="Estimated poses, for the scale; default: of the output folder.",
+            rich_help_panel="Scale and units",
+        ),
+    ] = None
     true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="True poses, for the scale; default: those of the ground truth.")
-    ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+        Path | None,
+        typer.Option(
+            "--true-poses",
+            help="True poses, for the scale; default: those of the ground truth.",
+            rich_help_panel="Scale and units",
+        ),
+    ] = None
+    csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None
+    as_json: JsonOption = False
+
+
+@evaluate_app.command("depth")
+@guarded
+@takes_record
+def depth(given: DepthArguments) -> None:
     """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
     from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import (
@@ -177,32 +218,34 @@ def depth(
         write_depth_scores,
     )
 
-    settings = ScoreSettings(peak, tuple(BadLimit.from_text(text) for text in bad), align, min_confidence)
-    evaluation = evaluate_depth(
-        source,
-        truth,
-        settings=settings,
-        unit=unit,
-        truth_unit=truth_unit,
-        scale=_scale(scale),
-        poses=poses,
-        true_poses=true_poses,
-        masks=masks,
-        mask=mask,
+    settings = ScoreSettings(
+        given.peak, tuple(BadLimit.from_text(text) for text in given.bad or ["5%"]), given.align, given.min_confidence
     )
-    if out is not None:
-        write_depth_pictures(out, evaluation, images=images, limit=error_limit)
-        write_depth_scores(out, evaluation)
-    if csv is not None:
-        write_depth_csv(csv, evaluation)
-    if as_json:
+    evaluation = evaluate_depth(
+        given.source,
+        given.truth,
+        settings=settings,
+        unit=given.unit,
+        truth_unit=given.truth_unit,
+        scale=_scale(given.scale),
+        poses=given.poses,
+        true_poses=given.true_poses,
+        masks=given.masks,
+        mask=given.mask,
+    )
+    if given.out is not None:
+        write_depth_pictures(given.out, evaluation, images=given.images, limit=given.error_limit)
+        write_depth_scores(given.out, evaluation)
+    if given.csv is not None:
+        write_depth_csv(given.csv, evaluation)
+    if given.as_json:
         print_json(evaluation.to_json())
         return
-    print_summary(depth_summary(evaluation, baseline=baseline), Console())
-    if out is not None:
+    print_summary(depth_summary(evaluation, baseline=given.baseline), Console())
+    if given.out is not None:
         count = len(evaluation.views)
         images_text = f"{count} {plural(count, 'image')} of the errors"
-        Console().say(escape(f"{images_text}, scores.json and scores.csv are in {out}"))
+        Console().say(escape(f"{images_text}, scores.json and scores.csv are in {given.out}"))
 
 
 def _scale(text: str) -> float | Literal["auto"]:

@@ -24,14 +24,21 @@ from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
 
 
-def run_workflow(session: Session, execution: Execution, *, as_json: bool = False) -> int:
-    """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code."""
+def run_workflow(session: Session, execution: Execution, *, as_json: bool = False, advise: bool = True) -> int:
+    """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code.
+
+    Args:
+        session: the session.
+        execution: how units are computed.
+        as_json: print events instead.
+        advise: whether to print the commands that can follow.
+    """
     if as_json:
         return run_with_events(partial(run_session, session, execution)).summary.exit_code
     stream = apart(sys.stdout)
     try:
         with interrupted_by_termination():
-            return run_shown(session, execution, Console(file=stream), advise=True).exit_code
+            return run_shown(session, execution, Console(file=stream), advise=advise).exit_code
     finally:
         if stream is not sys.stdout:
             stream.close()

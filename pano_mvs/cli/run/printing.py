@@ -53,9 +53,14 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     files = f"{count} {plural(count, 'file')}, {len(output.written)} written now"
     report = f"; open {escape(str(output.out / 'report.html'))} in a browser"
     console.say(f"results in {escape(str(output.out))} ({files}){report}")
-    if following:
+    print_next(following, console)
+
+
+def print_next(commands: Sequence[str], console: Console) -> None:
+    """Print the commands to type next, if there are any."""
+    if commands:
         console.print("next:", highlight=False)
-    for command in following:
+    for command in commands:
         console.say(f"  {escape(command)}")
 
 
@@ -71,12 +76,17 @@ def next_commands(output: RunOutput, session: Session) -> list[str]:
         commands.append(run_command(session))
     if is_to_see(summary.files):
         commands.append(shlex.join(["pano-mvs", "view", out]))
-    if summary.cloud.points or summary.views:
+    if is_to_share(summary):
         words = ["pano-mvs", "share", out, "--to", f"{out}_page"]
         if resolved(cache_of(summary)) != resolved(Path(summary.cache)):
             words += ["--cache", summary.cache]
         commands.append(shlex.join(words))
     return commands
+
+
+def is_to_share(summary: RunSummary) -> bool:
+    """Return whether a run has results that a page can show."""
+    return bool(summary.cloud.points or summary.views)
 
 
 def _print_failures(summary: RunSummary, console: Console) -> None:

@@ -366,7 +366,7 @@ class Page {
   writeLink() {
     if (this.mode === undefined || (this.mode === "inside" && !this.here)) return;
     this.link = linkOf(this);
-    history.replaceState(null, "", this.link);
+    if (location.protocol !== "about:") history.replaceState(null, "", this.link); // in a notebook it has no address
   }
 
   // --- Drawing ---

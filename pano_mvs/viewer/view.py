@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.markup import escape
 
-from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import InputError, StoreError, UsageError
+from pano_mvs.results.run_output import RunOutput
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.display import quiet_vtk, require_display, require_drawing, require_window
@@ -26,7 +26,7 @@ _QUALITY = 90
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Options of `pano-mvs view`.
+    """What a window or an image shows, and how; the options of `pano-mvs view`.
 
     Attributes:
         images: folder of the panoramas; None: where the run read them.
@@ -57,17 +57,33 @@ class ViewOptions:
     ranges: bool = False
 
 
-def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
-    """View an output folder or a PLY file in a window, or write an image of it.
+def view_run(
+    run: RunOutput | str | Path, options: ViewOptions | None = None, *, say: Callable[[str], object] = print
+) -> NDArray[np.uint8] | None:
+    """View a run or a PLY file in a window until it is closed, or write an image of it.
+
+    >>> picture = view_run("out", ViewOptions(screenshot=Path("top.png"), view="top"))
+    >>> picture.shape
+    (860, 1280, 3)
+
+    Args:
+        run: the output of a run, its folder, or a .ply file.
+        options: what is shown, and how.
+        say: is called with each note about what is missing; prints it by default.
+
+    Returns:
+        The image, (H, W, 3) uint8 RGB; None if a window was opened.
 
     Raises:
         InputError: if there is nothing to show, or a file is damaged.
         UsageError: if an option is invalid, or there is no display.
         StoreError: if the image cannot be written.
     """
+    options = options or ViewOptions()
     size_wh = _size_wh(options.size)
     if options.screenshot is not None:
         _check_screenshot(options.screenshot)
+    path = run.out if isinstance(run, RunOutput) else Path(run)
     scene = open_scene(path, images=options.images, group=options.group)
     if options.screenshot is None:
         require_display()
@@ -80,15 +96,15 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
         quiet_vtk()
     window = SceneWindow(tour, size_wh=size_wh, off_screen=options.screenshot is not None, budget=options.points)
     for note in scene.notes:
-        console.say(f"note: {escape(note)}")
+        say(note)
     if options.screenshot is None:
         require_window(window.plotter.render_window.GetClassName())
         window.run()
-        return
+        return None
     picture = window.picture()
     window.close()
     _write(options.screenshot, picture)
-    console.say(f"picture in {escape(str(options.screenshot))}")
+    return picture
 
 
 def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> Tour:
