@@ -17,6 +17,7 @@ MARK = "PANO_MVS_WORKER"
 """Environment variable of a worker and of what it starts, whose value no other worker has."""
 
 _PR_SET_CHILD_SUBREAPER = 36
+_LOOKS = 3  # a process that forks and ends while others are looked at is missed by a look, and so is its child
 
 
 def adopt_orphans() -> None:
@@ -38,12 +39,14 @@ def end_started(worker: int, mark: str) -> None:
     with suppress(ProcessLookupError, PermissionError):
         if worker != os.getpid():
             os.kill(worker, signal.SIGSTOP)  # so that it starts no others meanwhile
-    ended = {worker, os.getpid()}
-    while found := _started(worker, mark) - ended:
+    ended, unsuccessful = {worker, os.getpid()}, 0
+    while unsuccessful < _LOOKS:
+        found = _started(worker, mark) - ended
         for process in found:
             with suppress(ProcessLookupError, PermissionError):
                 os.kill(process, signal.SIGKILL)
         ended |= found
+        unsuccessful = 0 if found else unsuccessful + 1
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(worker, signal.SIGKILL)
 
