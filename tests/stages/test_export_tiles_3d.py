@@ -34,8 +34,8 @@ def a_cloud(count: int = COUNT) -> PointCloud:
     points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-1, 1], count)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     colors = rng.integers(0, 256, (count, 3)).astype(np.uint8)
-    points = (points * (4, 1.5, 6)).astype(np.float32)
-    return PointCloud(points, normals.astype(np.float32), colors, np.full(count, 3, np.uint8))
+    points = points * (4, 1.5, 6)
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32), colors, np.full(count, 3, np.uint8))
 
 
 def the_poses(frame: str = "the first registered camera") -> Poses:
@@ -144,7 +144,7 @@ def test_gps_puts_the_tiles_on_the_earth(tmp_path: Path, lla: str, expected: tup
 
 def test_points_are_selected_and_groups_apart(tmp_path: Path) -> None:
     cloud = replace(a_cloud(3000), group_sizes=(2000, 1000))
-    params = Tiles3dParams(tile_points=TILE_POINTS, max_points=500)
+    params = Tiles3dParams.model_validate({"tile_points": TILE_POINTS, "max_points": 500})
     files = tiles_3d(cloud, None, params, Context(np.random.default_rng(0), tmp_path)).files
     assert set(files) == {
         f"{folder}/{name}" for folder in ("tiles_3d", "tiles_3d_1") for name in ("r.glb", "tileset.json")
