@@ -1,12 +1,15 @@
-"""Clouds as 3D Tiles: read as the specification says and by Khronos's validator."""
+"""Clouds as 3D Tiles: read as the specification says, by Khronos's validator, and by a viewer in a browser."""
 
 from __future__ import annotations
 
+import functools
 import json
 import struct
 import subprocess
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import Tiles3dParams, tiles_3d
 from tests.foreign import npm_packages
+from tests.share.chromium import chromium
 
 COUNT, TILE_POINTS, SMALL_TILE = 20_000, 1000, 500
 
@@ -30,8 +34,8 @@ def a_cloud(count: int = COUNT) -> PointCloud:
     points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-1, 1], count)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     colors = rng.integers(0, 256, (count, 3)).astype(np.uint8)
-    points = (points * (4, 1.5, 6)).astype(np.float32)
-    return PointCloud(points, normals.astype(np.float32), colors, np.full(count, 3, np.uint8))
+    points = points * (4, 1.5, 6)
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32), colors, np.full(count, 3, np.uint8))
 
 
 def the_poses(frame: str = "the first registered camera") -> Poses:
@@ -140,7 +144,7 @@ def test_gps_puts_the_tiles_on_the_earth(tmp_path: Path, lla: str, expected: tup
 
 def test_points_are_selected_and_groups_apart(tmp_path: Path) -> None:
     cloud = replace(a_cloud(3000), group_sizes=(2000, 1000))
-    params = Tiles3dParams(tile_points=TILE_POINTS, max_points=500)
+    params = Tiles3dParams.model_validate({"tile_points": TILE_POINTS, "max_points": 500})
     files = tiles_3d(cloud, None, params, Context(np.random.default_rng(0), tmp_path)).files
     assert set(files) == {
         f"{folder}/{name}" for folder in ("tiles_3d", "tiles_3d_1") for name in ("r.glb", "tileset.json")
@@ -168,3 +172,76 @@ def test_the_validator_of_khronos_accepts_the_tiles(tmp_path: Path) -> None:
     for report in reports:
         assert report["issues"]["messages"] == []
         assert report["info"]["totalVertexCount"] > 0
+
+
+VIEWER = """<!doctype html><script type="importmap">{"imports": {
+"three": "./node_modules/three/build/three.module.js", "three/addons/": "./node_modules/three/examples/jsm/",
+"3d-tiles-renderer": "./node_modules/3d-tiles-renderer/build/index.three.js"}}</script>
+<body style="margin:0"><script type="module">
+import * as THREE from "three";
+import {TilesRenderer} from "3d-tiles-renderer";
+const renderer = new THREE.WebGLRenderer({preserveDrawingBuffer: true});
+renderer.setSize(400, 300);
+document.body.append(renderer.domElement);
+const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(60, 4 / 3, 0.01, 1000);
+camera.up.set(0, 0, 1);
+camera.position.set(14, -12, 9);
+camera.lookAt(0, 0, 0);
+const tiles = new TilesRenderer("tiles_3d/tileset.json");
+window.failures = [];
+tiles.addEventListener("load-error", (event) => failures.push(String(event.error)));
+tiles.addEventListener("load-model", ({scene}) => scene.traverse((part) => {
+  if (part.isPoints) { part.material.size = 3; part.material.sizeAttenuation = false; }
+}));
+tiles.errorTarget = ERROR_TARGET;
+tiles.setCamera(camera);
+scene.add(tiles.group);
+window.points = () => {
+  const found = [];
+  tiles.group.updateMatrixWorld(true);
+  tiles.group.traverse((part) => {
+    if (!part.isPoints) return;
+    const place = new THREE.Vector3(), places = part.geometry.attributes.position;
+    for (let idx = 0; idx < places.count; idx++)
+      found.push(place.fromBufferAttribute(places, idx).applyMatrix4(part.matrixWorld).toArray());
+  });
+  return found;
+};
+renderer.setAnimationLoop(() => {
+  tiles.setResolutionFromRenderer(camera, renderer);
+  camera.updateMatrixWorld();
+  tiles.update();
+  renderer.render(scene, camera);
+});
+</script>"""
+
+
+@pytest.mark.browser
+def test_a_viewer_loads_the_tiles_that_it_needs(tmp_path: Path) -> None:
+    """The 3D Tiles renderer of NASA's Jet Propulsion Laboratory, for three.js."""
+    cloud = a_cloud()
+    cloud = replace(cloud, colors_rgb=np.full_like(cloud.colors_rgb, (200, 90, 30)))
+    written(tmp_path, cloud, the_poses())
+    npm_packages(tmp_path, "3d-tiles-renderer@0.5.3", "three@0.187.0")
+    for name, target in (("all", "0.01"), ("far", "100000")):
+        (tmp_path / f"{name}.html").write_text(VIEWER.replace("ERROR_TARGET", target))
+    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}"
+    with chromium(width=400, height=300) as browser:
+        browser.open(f"{address}/far.html")
+        browser.wait("window.points && points().length")
+        assert len(browser.evaluate("points()")) < 0.3 * COUNT
+        browser.open(f"{address}/all.html")
+        browser.wait(f"window.points && points().length == {COUNT}")
+        found = np.array(browser.evaluate("points()"), np.float32)
+        shown = browser.screenshot().astype(int)
+        assert browser.evaluate("failures") == []
+    server.shutdown()
+    server.server_close()
+    x, y, z = cloud.points_in_world.T
+    np.testing.assert_allclose(rows(found), rows(np.stack([x, z, -y], axis=-1)), atol=1e-5)
+    lit = shown[shown.max(axis=2) > 150]
+    assert len(lit) > 3000
+    assert np.abs(np.median(lit, axis=0) - (200, 90, 30)).max() <= 2

@@ -63,7 +63,7 @@ def marked(camera: Rigid3, to_other: ArrayLike) -> NDArray[np.uint8]:
         away = np.linalg.norm(ray_grid(SIZE_HW) - unit, axis=-1)
         share = np.clip((0.03 - away) * SIZE_HW[1] / (2 * np.pi) + 0.5, 0, 1)[..., None]
         picture = picture * (1 - share) + share * color
-    return np.rint(picture).astype(np.uint8)
+    return np.asarray(np.rint(picture), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def mark_after_look(window: Browser, player: str, yaw_deg: float, pitch_deg: flo
         color = np.clip(shown[..., channel] - np.delete(shown, channel, axis=2).max(axis=2) - 40, 0, None)
         if color.sum() > 1000 and np.array_equal(shown, before):
             rows, columns = np.indices(color.shape) + 0.5
-            return np.array([(columns * color).sum(), (rows * color).sum()]) / color.sum()
+            return np.array([(columns * color).sum() / color.sum(), (rows * color).sum() / color.sum()])
         before = shown
     raise AssertionError(f"{player} never shows the mark; console: {window.console()}")
 
