@@ -18,7 +18,9 @@ from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Pa
 from pano_mvs.core.paths import is_folder
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.images.copies import Copy, find_copies
+from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
+from pano_mvs.io.images.stereo import stereo_layout
 from pano_mvs.io.images.tour_configurations import FACES
 from pano_mvs.io.images.tours import TourScene, list_scenes
 from pano_mvs.scene.image_file import (
@@ -28,6 +30,13 @@ from pano_mvs.scene.image_file import (
     decoding_bytes_per_pixel,
     readable_pixels,
     write_png,
+)
+from pano_mvs.scene.image_header import stated_size
+from pano_mvs.scene.stereo import StereoLayout, StereoSetting, one_eye
+
+STEREO: Any = Field(
+    default="auto",
+    description="how a stereo panorama shows both eyes, of which one is used; auto: by its metadata and its shape",
 )
 
 
@@ -42,6 +51,7 @@ class FolderParams(Params):
     )
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
+    stereo: StereoSetting = STEREO
     max_megapixels: Annotated[float, NOT_IN_KEY] = Field(
         default=MAX_PIXELS / 1e6, gt=0, description="larger files are rejected before they are decoded"
     )
@@ -106,10 +116,13 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
 
     An image is a panorama if its GPano metadata say so (full or cropped), or if it is twice as wide as high. Masks are
     searched as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover the
-    same part of the sphere as the image, or the full sphere, at any resolution.
+    same part of the sphere as the image, or the full sphere, at any resolution. Of stereo panoramas, the left eye is
+    used.
     """
     image = item.file("image")
     path, data = image.path, image.read_bytes()
+    if (layout := _layout(path, data, params)) != "none":
+        return _left_eye(item, layout, data, params=params, ctx=ctx)
     info = describe_picture(path, data, max_pixels=params.max_pixels)
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
@@ -134,6 +147,46 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     if not valid:
         ctx.note(f"{item.name}: everything in it is masked")
     return panorama
+
+
+def _layout(path: Path, data: bytes, params: FolderParams) -> StereoLayout:
+    def picture() -> NDArray[np.uint8]:
+        return decode_image(path, data, max_pixels=params.max_pixels)
+
+    if params.stereo != "auto":
+        return params.stereo
+    return stereo_layout(path, stated_size(data) or (0, 0), data, picture=picture)
+
+
+def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: FolderParams, ctx: Context) -> Panorama:
+    """Store the picture of one eye without loss, and return it."""
+    path = item.files["image"]
+    eye = one_eye(decode_image(path, data, max_pixels=params.max_pixels), layout)
+    ctx.note(stereo_note("{count} images", layout))
+    kept = ctx.scratch / "eye.png"
+    write_png(kept, eye)
+    container = read_container(data)
+    gpano, _ = find_gpano(container.xmp, data)
+    size_hw = eye.shape[0], eye.shape[1]
+    panorama = Panorama(
+        image=FilePart(kept),
+        size_hw=working_size(size_hw, params.max_width),
+        source_size_hw=size_hw,
+        mask_file=item.file("mask") if "mask" in item.files else None,
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+        up_in_cam=gpano.up_in_cam if gpano else None,
+        heading_deg=gpano.heading_deg if gpano else None,
+        position_lla=position_from_exif(container.exif),
+    )
+    ctx.metric("valid", float(panorama.load_mask().mean()))
+    return panorama
+
+
+def stereo_note(what: str, layout: StereoLayout) -> str:
+    """Return a note on stereo pictures of which one eye is used."""
+    place = "the upper half" if layout == "top_bottom" else "the left half"
+    return f"{what} show both eyes (stereo); {place} is used, which is that of the left eye"
 
 
 def _check_pixels(path: Path, data: bytes, info: PictureInfo, *, max_pixels: int) -> None:

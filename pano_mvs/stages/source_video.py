@@ -25,7 +25,8 @@ from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
-from pano_mvs.stages.source import working_size
+from pano_mvs.scene.stereo import StereoSetting
+from pano_mvs.stages.source import STEREO, stereo_note, working_size
 
 # Motion is measured in at most this number of frames per second.
 _MEASURED_PER_S = 15.0
@@ -77,6 +78,7 @@ class VideoParams(Params):
     nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight down (operator)")
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider frames are scaled down to this width")
+    stereo: StereoSetting = STEREO
 
     @model_validator(mode="after")
     def _one_step(self) -> VideoParams:
@@ -134,7 +136,9 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
     Frames are stored without loss, as `<video>_<milliseconds of the time>ms.png`. Match them with `pairs.sequential`.
     """
     path = item.files["video"]
-    info = describe_video(path)
+    info = describe_video(path, params.stereo)
+    if info.stereo != "none":
+        ctx.note(stereo_note(path.name, info.stereo))
     if info.is_turned:
         ctx.note(f"{path.name} has a rotation in its metadata, which was ignored: frames are used as stored")
     time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info=info, threads=ctx.threads)
@@ -175,10 +179,10 @@ def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path,
 
 
 def _items_of(path: Path, name: str, params: VideoParams) -> Iterator[SourceItem]:
-    info = describe_video(path)
+    info = describe_video(path, params.stereo)
     begin_s = params.start_s
     if begin_s <= _last_s(info, params):
-        first = next(frames_between(path, begin_s, begin_s + params.step_s(info)), None)
+        first = next(frames_between(path, begin_s, begin_s + params.step_s(info), stereo=info.stereo), None)
         if first is not None and is_dual_fisheye(first[1]):
             raise InputError(_dual_fisheye(path))
     times = _steps(info, params) if params.keyframes == "time" else _keyframes(path, info, params)
@@ -202,12 +206,18 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
     usable = _usable(path, info, params)
     code = digest_from_file(Path(str(keyframes.__file__)))
     known = keyframe_file(
-        path, [*vars(settings).values(), params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, code]
+        path,
+        [*vars(settings).values(), info.stereo, params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, code],
     )
     times = read_times(known)
     if times is None:
         frames = frames_between(
-            path, params.start_s, _last_s(info, params) + 1.0, min_step_s=1 / _MEASURED_PER_S, threads=2
+            path,
+            params.start_s,
+            _last_s(info, params) + 1.0,
+            min_step_s=1 / _MEASURED_PER_S,
+            threads=2,
+            stereo=info.stereo,
         )
         small = (SmallFrame(time_s, reduced_grey(frame), sharpness(_band(frame))) for time_s, frame in frames)
         times = [frame.time_s for frame in select_keyframes(small, settings, usable)]
@@ -255,7 +265,8 @@ def _best_frame(
     reach_s = params.reach_s(info)
     best: tuple[float, float, NDArray[np.uint8]] | None = None
     least = np.inf
-    for found_s, frame in frames_between(path, time_s - reach_s, time_s + reach_s, threads=threads):
+    frames = frames_between(path, time_s - reach_s, time_s + reach_s, threads=threads, stereo=info.stereo)
+    for found_s, frame in frames:
         quality = sharpness(frame)
         badness = -quality if params.pick == "sharpest" else abs(found_s - time_s)
         if best is None or badness < least:

@@ -154,6 +154,15 @@ def test_pixels_of_openmvg_are_ours() -> None:
     assert pixel_from_ray(bearings, SIZE_HW) == pytest.approx(pixels, abs=1e-9)
 
 
+@pytest.mark.parametrize("rig", [-1, "-1", "4294967295"])
+def test_undefined_rigs_of_alicevision_are_none(tmp_path: Path, rig: object) -> None:
+    data = alicevision()
+    for view in data["views"]:
+        view["rigId"] = rig
+    (tmp_path / "cameras.sfm").write_text(json.dumps(data))
+    assert len(read_poses(tmp_path / "cameras.sfm").names) == len(data["poses"])
+
+
 def changed(path: tuple[Any, ...], value: object) -> Callable[[dict[str, Any]], object]:
     def change(data: dict[str, Any]) -> None:
         at: Any = data

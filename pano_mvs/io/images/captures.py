@@ -134,7 +134,8 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     elif width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
-            "metadata place it on one. Remove it, export it again as a full equirectangular panorama, or, if it is "
+            "metadata place it on one. Remove it, export it again as a full equirectangular panorama, set `stereo` "
+            "(top_bottom, left_right) if it shows both eyes, or, if it is "
             "cropped, write the GPano FullPano and CroppedArea fields into it"
         )
     exif = container.exif

@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, is_folder, problem_of
 from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
+from pano_mvs.io.images.stereo import stereo_layout
+from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace FFmpeg's messages
 
 _UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
+_MAX_HEADER_BYTES = 64 << 20
 _SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
 
@@ -35,12 +38,14 @@ class VideoInfo:
         frames: number of frames.
         frames_per_s: average frame rate.
         is_turned: whether the header asks players to rotate the frames.
+        stereo: how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
     """
 
     size_hw: tuple[int, int]
     frames: int
     frames_per_s: float
     is_turned: bool
+    stereo: StereoLayout = "none"
 
 
 def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
@@ -71,8 +76,13 @@ def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
     return sorted(videos, key=lambda file: natural_key(file.relative_to(path).as_posix()))
 
 
-def describe_video(path: Path) -> VideoInfo:
+def describe_video(path: Path, stereo: StereoSetting = "auto") -> VideoInfo:
     """Return the header of a video after checking that its frames may be panoramas.
+
+    Args:
+        path: the video.
+        stereo: how its frames show both eyes; "auto": as its metadata say, else if square frames, or frames four times
+            as wide as high, have two halves that are nearly equal.
 
     Raises:
         InputError: if it cannot be opened, or its frames are not twice as wide as high.
@@ -86,17 +96,47 @@ def describe_video(path: Path) -> VideoInfo:
             f"{path}: does not say how long it lasts ({count:.0f} frames at {rate:g} a second): the "
             "recording was not finished. Copy it into an .mp4 with a video program"
         )
+    layout = _stereo_layout(path, (height, width)) if stereo == "auto" else stereo
+    if layout != "none":
+        height, width = eye_size_hw((height, width), layout)
     if width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px frames are not equirectangular, which are twice as wide as high. If it is "
-            f"unstitched (two fisheye images, or cube faces), {_UNSTITCHED}; of a stereo video, export "
-            "one eye"
+            f"unstitched (two fisheye images, or cube faces), {_UNSTITCHED}; of a stereo video, set "
+            "`stereo` to top_bottom or left_right"
         )
-    return VideoInfo((height, width), int(count), float(rate), is_turned)
+    return VideoInfo((height, width), int(count), float(rate), is_turned, layout)
+
+
+def _stereo_layout(path: Path, size_hw: tuple[int, int]) -> StereoLayout:
+    def first_frame() -> NDArray[np.uint8] | None:
+        return next((frame for _, frame in frames_between(path, 0.0, np.inf)), None)
+
+    return stereo_layout(path, size_hw, _movie_header(path), picture=first_frame)
+
+
+def _movie_header(path: Path) -> bytes:
+    """Return the box `moov` of an MP4 file, in which its metadata are; nothing for other files."""
+    with path.open("rb") as file:
+        while len(head := file.read(16)) == 16:
+            size, kind = int.from_bytes(head[:4], "big"), head[4:8]
+            size = int.from_bytes(head[8:], "big") if size == 1 else size
+            if kind == b"moov":
+                return head + file.read(min(size, _MAX_HEADER_BYTES))
+            if size < 8:
+                break
+            file.seek(size - 16, os.SEEK_CUR)
+    return b""
 
 
 def frames_between(
-    path: Path, begin_s: float, end_s: float, *, min_step_s: float = 0.0, threads: int = 1
+    path: Path,
+    begin_s: float,
+    end_s: float,
+    *,
+    min_step_s: float = 0.0,
+    threads: int = 1,
+    stereo: StereoLayout = "none",
 ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
     """Yield the time in seconds and the frame, (H, W, 3) uint8 BGR, of frames between two times, inclusive.
 
@@ -108,6 +148,7 @@ def frames_between(
         end_s: the last time.
         min_step_s: minimum time between two frames; frames in between are left out. 0 yields all.
         threads: number of threads of the decoder, each of which may hold a frame in memory.
+        stereo: how a frame shows both eyes, of which one is returned.
 
     Raises:
         InputError: if the video cannot be opened, or its time stamps do not increase.
@@ -129,7 +170,7 @@ def frames_between(
                 if not is_decoded:
                     return
                 yielded = time_s
-                yield time_s, frame
+                yield time_s, one_eye(frame, stereo)
             previous = time_s
             has_frame = capture.grab()
 
