@@ -65,7 +65,7 @@ def write_table(table: Each[Table], ctx: Context) -> Files:
     return Files({"tables/{item}.txt": path, "tables/{item}.npy": ctx.scratch / "rows.npy"})
 '''
 _STAGE = re.compile(r'(@(?:stage|source)\("(toy\.\w+)"[^\n]*\)\ndef [^\n]*\n    """[^\n]*"""\n)')
-TOY_STAGES = tuple(name for _, name in _STAGE.findall(PLUGIN + _TABLE))
+TOY_STAGES: tuple[str, ...] = tuple(name for _, name in _STAGE.findall(PLUGIN + _TABLE))
 
 
 def write_toy(folder: Path, *, numbers: int = 16) -> Path:

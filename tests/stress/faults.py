@@ -116,6 +116,9 @@ class Case:
     owner: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def __post_init__(self) -> None:
+        self.cache: Path
+        self.out: Path
+        self.hold: Path
         self.cache, self.out, self.hold = (self.folder / name for name in ("cache", "out", "hold"))
         self.hold.mkdir()
 
@@ -130,7 +133,7 @@ class Case:
         out: str = "",
         clean: Clean | None = None,
         program: Iterable[str] = ("-m", "pano_mvs"),
-        environment: Mapping[str, str] | None = None,
+        environment: dict[str, str] | None = None,
         prepare: Callable[[], None] | None = None,
     ) -> tuple[subprocess.Popen[str], Path]:
         """Start the run, or another one on the same cache into a folder of its own, which is not held."""
@@ -318,10 +321,14 @@ def _memory_runs_out(case: Case) -> list[Ended]:
     """A unit takes memory until the system kills its process."""
     group = case.stack.enter_context(memory_limit(1_500_000_000))
     (case.hold / case.stage).write_text("eat")
-    run = case.start(prepare=lambda: group.write_text(str(os.getpid())) and None)
+    run = case.start(prepare=partial(_join, group))
     ended = case.end(run)
     assert (case.hold / "met").exists(), ended.said
     return [ended]
+
+
+def _join(group: Path) -> None:
+    group.write_text(str(os.getpid()))
 
 
 def _main_ends(case: Case, number: int) -> list[Ended]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.stress import damage, faults, hostile, kills, load
+from tests.stress.captures import TOY_STAGES
 from tests.stress.world import ImpossibleHereError
 
 
@@ -53,7 +54,7 @@ def test_a_hundred_tries_meet_each_fault_and_each_stage() -> None:
     assert len(tries) + faults.LONG.tries == 100
     assert {fault.kind for fault, _ in tries} == {fault.kind for fault in faults.FAULTS}
     full = next(fault for fault in faults.FAULTS if "in each stage" in fault.kind)
-    assert [number for fault, number in tries if fault is full] == list(range(len(faults.TOY_STAGES)))
+    assert [number for fault, number in tries if fault is full] == list(range(len(TOY_STAGES)))
 
 
 @pytest.fixture(scope="module")
