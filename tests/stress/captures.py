@@ -11,6 +11,32 @@ from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 
 EXEMPT = ("run.json", "report.html", "logs", ".pano-mvs-output")
 SLEEP_VARIABLE = "TOY_SLEEP_S"
+HOLD_VARIABLE = "TOY_HOLD"
+"""Names a folder. A unit of a stage waits while a file there has the stage's name, and writes its process into `met`.
+
+If the content of that file is "eat", it takes memory without end instead.
+"""
+
+_HOLD = """
+
+def _hold(name):
+    time.sleep(float(os.environ.get("TOY_SLEEP_S", "0")))
+    folder = os.environ.get("TOY_HOLD", "")
+    path = os.path.join(folder, name)
+    if not folder or not os.path.exists(path):
+        return
+    with open(path) as stream:
+        eaten = ["x"] if stream.read() == "eat" else []
+    if eaten:
+        os.remove(path)
+    with open(os.path.join(folder, f"met-{os.getpid()}"), "w") as stream:
+        stream.write(str(os.getpid()))
+    os.replace(stream.name, os.path.join(folder, "met"))
+    while eaten:
+        eaten.append("x" * (10_000_000 + len(eaten)))
+    while os.path.exists(path):
+        time.sleep(0.01)
+"""
 
 _TABLE = '''
 import numpy as np
@@ -38,14 +64,14 @@ def write_table(table: Each[Table], ctx: Context) -> Files:
     np.save(ctx.scratch / "rows.npy", table.rows)
     return Files({"tables/{item}.txt": path, "tables/{item}.npy": ctx.scratch / "rows.npy"})
 '''
-_STAGE = re.compile(r'(@(?:stage|source)\([^\n]*\)\ndef [^\n]*\n    """[^\n]*"""\n)')
+_STAGE = re.compile(r'(@(?:stage|source)\("(toy\.\w+)"[^\n]*\)\ndef [^\n]*\n    """[^\n]*"""\n)')
+TOY_STAGES: tuple[str, ...] = tuple(name for _, name in _STAGE.findall(PLUGIN + _TABLE))
 
 
 def write_toy(folder: Path, *, numbers: int = 16) -> Path:
     """Write the capture and its workflow into a folder; return the workflow."""
-    slow = r'\1    time.sleep(float(os.environ.get("TOY_SLEEP_S", "0")))' + "\n"
     (folder / "capture").mkdir(parents=True)
-    (folder / "plug.py").write_text(_STAGE.sub(slow, PLUGIN + _TABLE))
+    (folder / "plug.py").write_text(_STAGE.sub(r'\1    _hold("\2")' + "\n", PLUGIN + _TABLE + _HOLD))
     (folder / "helper.py").write_text(HELPER)
     more = "  table:      {use: toy.table, in: {x: scaled}}\n  tables:     {use: toy.write_table}\n"
     (folder / "wf.yaml").write_text(WORKFLOW + more)

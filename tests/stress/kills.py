@@ -8,12 +8,16 @@ Whenever both have come to their end, the files that they delivered must be, byt
 store of its own, `cache verify` must find nothing damaged, and nothing half written may lie about. Then both start anew
 in an empty store, until enough have been killed.
 
+With `--packed`, results are moved into packs after every few files, so that runs also read what others are packing.
+With `--full`, the disk of the store is full once in every round; a run that says so is started again with more room.
+
 Without `--workflow`, a toy workflow whose stages take some hundredths of a second each. With it, any workflow; its
 deliverables must be the same from run to run, as they are to be anyway.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import shutil
@@ -23,19 +27,28 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pano_mvs.engine.cache.packs import RECORD, Packs
 from tests.stress.captures import SLEEP_VARIABLE, deliverables, write_toy
+from tests.stress.world import Disk, small_disk
 
 _LOOK_S = 0.02
 _LONGEST_S = 600.0
 _FAILED_ITEMS = 3
 _MOST_UNITS = 12
 _SHARE_OF_TIMES = 0.25
+_FULL = 4
+PACKING = (
+    "from pano_mvs.engine.cache import maintenance; maintenance._MIN_PACKED_FILES = 20; "
+    "from pano_mvs.cli.app import main; main()"
+)
+"""The command `pano-mvs`, but packs are made of fewer files."""
 
 
 class Moments:
@@ -67,6 +80,12 @@ class Setting:
     command: list[str]
     environment: dict[str, str]
     folder: Path
+    disk: Disk | None = None
+
+    @property
+    def store(self) -> Path:
+        """The store that the killed runs share."""
+        return (self.disk.folder if self.disk else self.folder) / "store"
 
 
 @dataclass
@@ -75,6 +94,7 @@ class Killed:
 
     mains: int = 0
     workers: int = 0
+    full: int = 0
     rounds: int = 0
     wrong: list[str] = field(default_factory=list)
     at: Counter[int] = field(default_factory=Counter)
@@ -88,9 +108,9 @@ class Killed:
 class Runner:
     """One of the runs: the same command again and again, until it ends of itself."""
 
-    def __init__(self, setting: Setting, name: str, store: str) -> None:
+    def __init__(self, setting: Setting, name: str, store: Path) -> None:
         self._setting = setting
-        self._store = setting.folder / store
+        self._store = store
         self.out = setting.folder / name
         self.done = False
         self.process = self._start()
@@ -116,6 +136,10 @@ class Runner:
             self.process = self._start()
             return ""
         if code == _FAILED_ITEMS and "killed by SIGKILL" in said:
+            self.process = self._start()
+            return ""
+        if self._setting.disk and code == _FULL and ("is full" in said or "No space left" in said):
+            self._setting.disk.grow()
             self.process = self._start()
             return ""
         self.done = True
@@ -159,7 +183,7 @@ def kill_runs(setting: Setting, count: int, rng: random.Random) -> Killed:
     """Kill until so many have been killed, and both runs have come to their end after that."""
     killed = Killed()
     started = time.monotonic()
-    clean = Runner(setting, "clean", "clean-store")
+    clean = Runner(setting, "clean", setting.folder / "clean-store")
     while not clean.done:
         time.sleep(_LOOK_S)
         wrong = clean.look()
@@ -190,9 +214,10 @@ def _one_round(
     expected: dict[str, bytes],
 ) -> None:
     """Start two runs in an empty store and kill them, ever more seldom, until both have come to their end."""
-    for name in ("a", "b", "store"):
-        shutil.rmtree(setting.folder / name, ignore_errors=True)
-    runners = [Runner(setting, name, "store") for name in ("a", "b")]
+    for path in (setting.folder / "a", setting.folder / "b", setting.store):
+        shutil.rmtree(path, ignore_errors=True)
+    runners = [Runner(setting, name, setting.store) for name in ("a", "b")]
+    full_at = rng.uniform(1, killed.units) if setting.disk else math.inf
     moments, deadline = Moments(rng, typical_s), time.monotonic() + _LONGEST_S
     try:
         while not all(runner.done for runner in runners):
@@ -201,7 +226,10 @@ def _one_round(
             if killed.wrong or time.monotonic() > deadline:
                 killed.wrong.append("it does not come to an end") if not killed.wrong else None
                 return
-            living, records = [runner for runner in runners if not runner.done], records_in(setting.folder / "store")
+            living, records = [runner for runner in runners if not runner.done], records_in(setting.store)
+            if setting.disk and living and records >= full_at:
+                setting.disk.fill()
+                killed.full, full_at = killed.full + 1, math.inf
             if living and killed.total < count and moments.has_come(records):
                 rng.choice(living).kill(rng, killed, records)
                 moments.draw(records)
@@ -213,7 +241,13 @@ def _one_round(
 
 def records_in(store: Path) -> int:
     """Return how many units are done."""
-    return sum(1 for _ in (store / "records").glob("*/*.json"))
+    return len(record_keys(store))
+
+
+def record_keys(store: Path) -> set[str]:
+    """Return the keys of all records, in files of their own and in packs."""
+    keys = {path.stem for path in (store / "records").glob("*/*.json")}
+    return keys | {packed.digest for packed in Packs(store).each() if packed.kind == RECORD}
 
 
 def _faults(setting: Setting, runners: list[Runner], expected: dict[str, bytes]) -> list[str]:
@@ -223,7 +257,7 @@ def _faults(setting: Setting, runners: list[Runner], expected: dict[str, bytes])
         names = [name for name in {*found, *expected} if found.get(name) != expected.get(name)]
         if names:
             faults.append(f"{runner.out.name} differs from a clean run in {', '.join(sorted(names))}")
-    store = setting.folder / "store"
+    store = setting.store
     verified = subprocess.run(
         [sys.executable, "-m", "pano_mvs", "cache", "verify", "--cache", str(store)],
         capture_output=True,
@@ -271,6 +305,8 @@ def main(
     workers: int = 2,
     seed: int = 0,
     more: list[str] | None = None,
+    packed: bool = False,
+    full: bool = False,
 ) -> int:
     """Kill, print what came of it, and return the exit code.
 
@@ -281,16 +317,23 @@ def main(
         workers: of processes and dask.
         seed: of the moments.
         more: further arguments of `pano-mvs run`.
+        packed: whether results are packed early.
+        full: whether the disk of the store is full once a round; needs the right to mount.
     """
-    with tempfile.TemporaryDirectory(prefix="pano-mvs-kills-") as name:
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-kills-") as name, ExitStack() as stack:
         folder = Path(name)
+        disk = stack.enter_context(small_disk(folder / "disk")) if full else None
+        if disk and not disk.is_mounted:
+            raise SystemExit("--full needs the right to mount a disk")
         used = workflow or str(write_toy(folder))
         used = str(Path(used).absolute()) if Path(used).is_file() else used  # else a preset
         number = [] if executor == "serial" else ["--workers", str(workers)]
-        command = [sys.executable, "-m", "pano_mvs", "run", used, "--executor", executor, *number, *(more or ())]
+        program = ("-c", PACKING) if packed else ("-m", "pano_mvs")
+        options = ["--executor", executor, *number, *(["--min-free", "0"] if full else []), *(more or ())]
+        command = [sys.executable, *program, "run", used, *options]
         environment = os.environ | {SLEEP_VARIABLE: os.environ.get(SLEEP_VARIABLE, "0.05"), "COLUMNS": "400"}
         started = time.monotonic()
-        killed = kill_runs(Setting(command, environment, folder), count, random.Random(seed))
+        killed = kill_runs(Setting(command, environment, folder, disk), count, random.Random(seed))
     quarters = [
         sum(n for done, n in killed.at.items() if quarter == min(3, 4 * done // max(1, killed.units)))
         for quarter in range(4)
@@ -298,6 +341,7 @@ def main(
     print(
         f"{killed.total} killed ({killed.mains} main processes, {killed.workers} workers; {quarters} in the quarters "
         f"of {killed.units} units) in {killed.rounds} rounds of two runs on one store, "
+        f"the disk full {killed.full} times, "
         f"{time.monotonic() - started:.0f} s"
     )
     print("FAILED: " + "\n".join(killed.wrong) if killed.wrong else "deliverables as of a clean run, 0 bad records")

@@ -17,7 +17,6 @@ import json
 import os
 import random
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -32,9 +31,10 @@ from typing import Annotated, Any
 
 import typer
 
-from tests.stress.bad_items import FULL_VARIABLE, Capture, write_capture
+from tests.stress.bad_items import Capture, write_capture
 from tests.stress.captures import deliverables
 from tests.stress.kills import children
+from tests.stress.world import Disk, small_disk
 
 _FULL_EXIT, _FAILED_EXIT = 4, 3
 _MOST_RUNS = 8
@@ -118,7 +118,7 @@ def load(
         return Verdict([f"the clean run ended with {done.returncode}: {done.stdout}{done.stderr}"])
     verdict, killer = Verdict(), Killer(kills, every_s, seed)
     started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    with _small_disk(folder / "disk") as disk:
+    with small_disk(folder / "disk") as disk:
         options = ["--executor", executor, "--workers", str(workers), "--min-free", "0"]
         none: AbstractContextManager[tuple[str, list[int]]] = nullcontext(("", []))
         with _dask_cluster(folder / "cluster", workers, disk) if executor == "dask" else none as (address, others):
@@ -179,53 +179,6 @@ def _differences(folder: Path, capture: Capture, cache: Path) -> list[str]:
         wrong.append(f"cache verify: {verified.stdout}{verified.stderr}")
     left = [path.name for path in (cache / "tmp").glob("*") if path.name.startswith(".tmp-")]
     return wrong + [f"left in the cache: {name}" for name in left]
-
-
-class Disk:
-    """A disk that can be full: a small one that grows, or one that the plugin plays."""
-
-    def __init__(self, folder: Path, *, mounted: bool) -> None:
-        self.folder = folder
-        self._mounted = mounted
-        self._flag = folder.with_suffix(".full")
-        self.environment = os.environ | {"COLUMNS": "400"} | ({} if mounted else {FULL_VARIABLE: str(self._flag)})
-
-    def fill_after(self, records: int, process: subprocess.Popen[bytes]) -> None:
-        """Fill the disk when so many records are stored, or when the process has ended."""
-        while process.poll() is None and _count(self.folder / "cache" / "records") < records:
-            time.sleep(_LOOK_S)
-        if not self._mounted:
-            self._flag.touch()
-        # It cannot become smaller than what is in it, and that grows until it has become so.
-        while self._mounted and not _mount(self.folder, f"remount,size={shutil.disk_usage(self.folder).used + 4096}"):
-            time.sleep(0.01)
-
-    def grow(self) -> None:
-        """Make room."""
-        if self._mounted:
-            _mount(self.folder, "remount,size=8g")
-        else:
-            self._flag.unlink()
-
-
-@contextmanager
-def _small_disk(folder: Path) -> Iterator[Disk]:
-    folder.mkdir()
-    mounted = os.name == "posix" and os.geteuid() == 0 and _mount(folder, "size=8g")
-    try:
-        yield Disk(folder, mounted=mounted)
-    finally:
-        if mounted:
-            subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
-def _mount(folder: Path, options: str) -> bool:
-    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
-    return subprocess.run(command, capture_output=True, check=False).returncode == 0
-
-
-def _count(folder: Path) -> int:
-    return sum(len(files) for _, _, files in os.walk(folder))
 
 
 @contextmanager

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.io.ranges import has_exr
-from tests.stress import damage, hostile, kills, load
+from tests.stress import damage, faults, hostile, kills, load
+from tests.stress.captures import TOY_STAGES
+from tests.stress.world import ImpossibleHereError
 
 
 @pytest.mark.slow
@@ -61,6 +63,32 @@ def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize("executor", ["processes", "serial"])
 def test_killed_runs_lose_nothing(executor: str) -> None:
     assert kills.main(3, executor=executor) == 0
+
+
+def test_a_hundred_tries_meet_each_fault_and_each_stage() -> None:
+    tries = faults.schedule(100)
+    assert len(tries) + faults.LONG.tries == 100
+    assert {fault.kind for fault, _ in tries} == {fault.kind for fault in faults.FAULTS}
+    full = next(fault for fault in faults.FAULTS if "in each stage" in fault.kind)
+    assert [number for fault, number in tries if fault is full] == list(range(len(TOY_STAGES)))
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> faults.Clean:
+    return faults.Clean.make(tmp_path_factory.mktemp("clean"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind",
+    ["a second run starts", "SIGSTOP of all", "stalls", "becomes read-only", "ulimit", "output folder is removed"],
+)
+def test_nothing_is_lost_whatever_happens_around_a_run(clean: faults.Clean, tmp_path: Path, kind: str) -> None:
+    fault = next(fault for fault in faults.FAULTS if kind in fault.kind)
+    try:
+        assert faults.attempt(fault, clean, 0, folder=tmp_path / "try", pause_s=4) == []
+    except ImpossibleHereError as error:
+        pytest.skip(str(error))
 
 
 @pytest.mark.slow
