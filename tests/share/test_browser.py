@@ -221,27 +221,26 @@ def test_a_link_keeps_the_panorama_the_direction_and_the_measured_distance(brows
     assert differing(before, browser.screenshot()) < 0.01
 
 
-def test_a_link_leads_to_a_single_marked_point(browser: Browser) -> None:
-    for inside in (False, True):
-        if inside:
-            step_inside(browser, 0)
-        browser.press("m")
-        floor = place_of(browser, np.array([-0.9, HALF[1], -1.8]))
-        browser.click(*((700, 420) if inside else floor))
-        said = "document.getElementById('measured').textContent"
-        marked, told = browser.evaluate("PanoMvs.page.ruler.picks[0].point.toArray()"), browser.evaluate(said)
-        assert told.startswith("One point is marked")
-        assert ("from this panorama" in told) == inside
-        settle(browser)
-        before, link = browser.screenshot(), browser.evaluate("location.href")
-        show(browser, link)
-        assert browser.evaluate("PanoMvs.page.ruler.picks.map(({point}) => point.toArray())") == [
-            pytest.approx(marked, rel=1e-4)
-        ]
-        assert browser.evaluate(said) == told
-        assert browser.evaluate("document.querySelector('#labels div').textContent") == "Marked point"
-        assert differing(before, browser.screenshot()) < 0.01
-        assert browser.console() == []
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_link_leads_to_a_single_marked_point(browser: Browser, inside: bool) -> None:
+    if inside:
+        step_inside(browser, 0)
+    browser.press("m")
+    browser.click(*((700, 420) if inside else place_of(browser, np.array([-0.9, HALF[1], -1.8]))))
+    said = "document.getElementById('measured').textContent"
+    marked, told = browser.evaluate("PanoMvs.page.ruler.picks[0].point.toArray()"), browser.evaluate(said)
+    assert told.startswith("One point is marked")
+    assert ("from this panorama" in told) == inside
+    settle(browser)
+    before, link = browser.screenshot(), browser.evaluate("location.href")
+    show(browser, link)
+    assert browser.evaluate("PanoMvs.page.ruler.picks.map(({point}) => point.toArray())") == [
+        pytest.approx(marked, rel=1e-4)
+    ]
+    assert browser.evaluate(said) == told
+    assert browser.evaluate("document.querySelector('#labels div').textContent") == "Marked point"
+    assert differing(before, browser.screenshot()) < 0.01
+    assert browser.console() == []
 
 
 def test_a_keyboard_walks_turns_moves_and_measures(browser: Browser) -> None:
@@ -355,7 +354,8 @@ def test_three_megabytes_show_the_whole_room(window: Browser, large_room: Path, 
         early = [name.removeprefix(server.address) for name, at in window.evaluate(entries) if at < limit]
         server.release()
         settle(window)
-    assert all(re.search(needed, name) for name in early if name.startswith("data/"))
+    data = [name for name in early if name.startswith("data/")]
+    assert all(re.search(needed, name) for name in data)
     assert sum((large_room / name).stat().st_size for name in ["index.html", *early]) < 3_000_000, early
     final = window.screenshot()
     assert differing(first, final) < 0.3
@@ -363,7 +363,7 @@ def test_three_megabytes_show_the_whole_room(window: Browser, large_room: Path, 
         drawn = [np.abs(picture.astype(int) - final[5, 700]).sum(axis=-1) > 40 for picture in (first, final)]
         assert drawn[1].mean() > 0.2
         assert (drawn[0] != drawn[1]).mean() < 0.15 * drawn[1].mean()
-    assert len(window.evaluate("PanoMvs.loaded")) > len(early)
+    assert len(window.evaluate("PanoMvs.loaded")) > len(data)
     assert window.console() == []
 
 

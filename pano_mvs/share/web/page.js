@@ -377,7 +377,7 @@ class Page {
   describe() {
     clearTimeout(this.describing);
     this.describing = setTimeout(() => {
-      if (this.mode !== "inside" || this.move) return;
+      if (this.mode !== "inside" || !this.here || this.move) return;
       const parts = [`Facing ${Math.round((THREE.MathUtils.radToDeg(this.look.yaw) % 360 + 360) % 360) % 360}°`];
       const ahead = this.ahead(), seen = this.here.pick(this.eye.getWorldDirection(new THREE.Vector3()));
       if (seen) parts.push(`surface at ${lengthText(seen.point.distanceTo(this.here.center), this.scene.unit)}`);
@@ -472,7 +472,7 @@ class Page {
       }
       this.changed();
     }
-    if (!this.dirty) return;
+    if (!this.dirty || (this.mode === "inside" && !this.here)) return; // or a link leads to a panorama on its way
     this.dirty = false;
     this.coarse = pace !== PACES[0];
     const t = this.move ? Math.min(1, Math.max(0, (now - this.move.began) / this.move.length)) : 1;
