@@ -570,16 +570,24 @@ def scale_results(
 def share(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
     to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to write the page to.")],
-    title: Annotated[str, typer.Option("--title", help="Heading; default: the name of OUT.", show_default=False)] = "",
+    title: Annotated[
+        str, typer.Option("--title", help="Heading; default: the capture's folder.", show_default=False)
+    ] = "",
     points: Annotated[
         int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: none.")
-    ] = 5_000_000,
+    ] = 1_500_000,
     triangles: Annotated[
         int,
         typer.Option("--triangles", min=0, help="Maximum number of triangles of a mesh without texture; 0: none."),
     ] = 300_000,
-    width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 4096,
+    width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 8192,
     quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,
+    rooms: Annotated[
+        Path | None,
+        typer.Option(
+            "--rooms", help="YAML file with the panoramas of each room; default: from folders, names, or what they see."
+        ),
+    ] = None,
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
     ] = None,
@@ -588,8 +596,10 @@ def share(
     """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
     from pano_mvs.cli.page_commands import share_output
     from pano_mvs.share import ShareOptions
+    from pano_mvs.share.rooms import read_rooms
 
-    options = ShareOptions(title, points, triangles, width, quality)
+    given = read_rooms(rooms) if rooms is not None else None
+    options = ShareOptions(title, points, triangles, width, quality, given)
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -88,10 +89,10 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> str:
     return base64.b64encode(data.tobytes()).decode("ascii")
 
 
-def encode_png(image: NDArray[np.uint8]) -> str:
-    """Return an RGB or RGBA image as the base64 of a PNG file."""
+def encode_webp(image: NDArray[np.uint8]) -> str:
+    """Return an RGB or RGBA image as the base64 of a WebP file."""
     swapped = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-    data = cv2.imencode(".png", cv2.cvtColor(image, swapped))[1]
+    data = cv2.imencode(".webp", cv2.cvtColor(image, swapped), [cv2.IMWRITE_WEBP_QUALITY, 85])[1]
     return base64.b64encode(data.tobytes()).decode("ascii")
 
 
@@ -173,22 +174,28 @@ def z_order(points: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 TILE = 1024
-"""Width of a tile in pixels: level 0 is one tile of 1024 x 512, level L is 2^L columns by 2^(L-1) rows."""
+"""Largest width of a tile in pixels: level 0 is one tile, level L is 2^L columns by 2^(L-1) rows of the same width."""
 
 
-def level_count(width: int, max_width: int) -> int:
-    """Return how many levels a panorama has: the last one is not wider than the panorama, unless it is the only one."""
-    return max(0, int(np.log2(min(width, max_width) / TILE))) + 1
+def tile_layout(width: int, max_width: int) -> tuple[int, int]:
+    """Return how many levels a panorama has, and the width of its tiles: those of the last level make up its width."""
+    full = max(TILE, min(width, max_width))
+    levels = math.ceil(math.log2(full / TILE)) + 1
+    return levels, 2 * round(full / (1 << levels))
 
 
-def panorama_tiles(image: NDArray[np.uint8], levels: int) -> Iterator[tuple[int, int, int, NDArray[np.uint8]]]:
+def panorama_tiles(
+    image: NDArray[np.uint8], levels: int, tile_width: int
+) -> Iterator[tuple[int, int, int, NDArray[np.uint8]]]:
     """Yield (level, column, row, pixels) of all tiles."""
     for level in range(levels):
-        width = TILE << level
+        width, height = tile_width << level, tile_width << level >> 1
         shrinks = width < image.shape[1]
-        scaled = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-        height = min(TILE, width // 2)
-        for row in range(width // 2 // height):
+        scaled = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+        rows = max(1, 1 << level >> 1)
+        for row in range(rows):
             for column in range(1 << level):
-                tile = scaled[row * height : (row + 1) * height, column * TILE : (column + 1) * TILE]
+                tile = scaled[
+                    row * height // rows : (row + 1) * height // rows, column * tile_width : (column + 1) * tile_width
+                ]
                 yield level, column, row, np.asarray(tile, np.uint8)

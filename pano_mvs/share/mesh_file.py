@@ -20,6 +20,8 @@ from pano_mvs.scene import FilePart
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 
+_TEXELS = 4  # along a side, of which a vertex of a coarser mesh shows the mean
+
 TEXTURED = "mesh_textured.glb"
 COLORED = "mesh.ply"
 
@@ -86,6 +88,26 @@ def thinned(mesh: SharedMesh, max_faces: int) -> tuple[SharedMesh, str]:
     nearest = cKDTree(mesh.vertices).query(vertices)[1]
     colors = mesh.colors_rgb[nearest] if mesh.colors_rgb is not None else None
     return SharedMesh(vertices.astype(np.float32), faces.astype(np.int32), colors), ""
+
+
+def coarser(mesh: SharedMesh, max_faces: int) -> SharedMesh | None:
+    """Return a mesh with coloured vertices and about `max_faces` triangles; None if the mesh itself is as small."""
+    if mesh.texture is None and len(mesh.faces) <= max_faces:
+        return None
+    colors = mesh.colors_rgb
+    if mesh.texture is not None and mesh.uv is not None:
+        height, width = (max(1, side // _TEXELS) for side in mesh.texture.shape[:2])
+        means = cv2.resize(mesh.texture, (width, height), interpolation=cv2.INTER_AREA)
+        places = (mesh.uv * [width, -height] + [0, height]).astype(int)
+        colors = np.asarray(means[places[:, 1].clip(0, height - 1), places[:, 0].clip(0, width - 1)], np.uint8)
+    # A texture divides a vertex where the parts of its atlas meet; joined again, the surface stays closed.
+    _, first, joined = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    whole = SharedMesh(
+        mesh.vertices[first],
+        joined.reshape(-1)[mesh.faces].astype(np.int32),
+        colors[first] if colors is not None else None,
+    )
+    return thinned(whole, max_faces)[0]
 
 
 def _colored(run: RunOutput) -> SharedMesh:

@@ -28,6 +28,7 @@ SCRIPTS = (
     "measure.js",
     "map.js",
     "link.js",
+    "rooms.js",
     "input.js",
     "page.js",
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.points.octree import octree
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, spiral_rays
 from pano_mvs.results.run_output import RunView
 from pano_mvs.scene import PointCloud
 from pano_mvs.share.encoding import (
@@ -21,20 +21,25 @@ from pano_mvs.share.encoding import (
     VertexFacts,
     encode_arrays,
     encode_jpeg,
-    encode_png,
     encode_points,
     encode_ranges,
-    level_count,
+    encode_webp,
     log_steps,
     mesh_pieces,
     panorama_tiles,
+    tile_layout,
 )
 from pano_mvs.share.maps import MapPlace, StoreyMap, cut_height, place_around, top_view
-from pano_mvs.share.mesh_file import SharedMesh
+from pano_mvs.share.mesh_file import SharedMesh, coarser
 from pano_mvs.share.page_folder import PageFolder
 
 RANGES_HW = (256, 512)
 """Size of the range map that the page walks and measures on."""
+
+COARSE_FACES = 40_000
+"""About the number of triangles of the mesh that the page shows first: 0.6 MB, half a second at 10 Mbit/s."""
+
+_OUTLINE_SAMPLE = 50_000
 
 MAX_TEXTURE = 4096
 """Largest width and height of the texture of a mesh, which all graphics processors in use can hold."""
@@ -45,19 +50,21 @@ class ShareOptions:
     """What a shared page contains.
 
     Attributes:
-        title: heading of the page; empty for the name of the output folder.
+        title: heading of the page; empty for the name of the capture's folder.
         max_points: largest number of points of the cloud; 0 for none. Those kept are drawn at random.
         max_triangles: about the largest number of triangles of a mesh without texture; 0 for no mesh.
         max_width: largest width of a panorama in pixels, at least 1024.
         jpeg_quality: of the panoramas, 1 to 100.
+        rooms: names or patterns of panoramas by room; None to take them from folders, names, or what is seen.
         max_single_file_bytes: size up to which everything is also written as one HTML file.
     """
 
     title: str = ""
-    max_points: int = 5_000_000
+    max_points: int = 1_500_000
     max_triangles: int = 300_000
-    max_width: int = 4096
+    max_width: int = 8192
     jpeg_quality: int = 85
+    rooms: Mapping[str, Sequence[str]] | None = None
     max_single_file_bytes: int = 40_000_000
 
     def __post_init__(self) -> None:
@@ -122,19 +129,35 @@ def put_cloud(page: PageFolder, shown: ShownCloud) -> dict[str, Any]:
     }
 
 
+def outline(points: NDArray[np.float32]) -> list[list[float]]:
+    """Return at most 64 of the outermost points, [x, y, z], but no strays: the page opens with all of them in view."""
+    sampled = points[:: max(1, len(points) // _OUTLINE_SAMPLE)].astype(np.float64)
+    if not len(sampled):
+        return []
+    along = sampled @ spiral_rays(64).T
+    outer = round(0.995 * (len(sampled) - 1))
+    return np.unique(sampled[np.argpartition(along, outer, axis=0)[outer]], axis=0).tolist()
+
+
 def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_quality: int) -> dict[str, Any]:
-    """Write the pieces and the texture of a mesh in the frame of the page; return what the page needs to know of it."""
-    described = []
-    for idx, (piece, text) in enumerate(mesh_pieces(mesh, shown.facts(mesh.vertices))):
-        page.put(f"mesh/{idx}", text)
-        described.append(piece)
+    """Write the pieces and the texture of a mesh in the frame of the page; return what the page needs to know of it.
+
+    A mesh that would arrive slowly is preceded by a coarse one.
+    """
+    coarse = coarser(mesh, COARSE_FACES)
+    described: dict[str, list[dict[str, Any]]] = {"mesh": [], "mesh/coarse": []}
+    for folder, part in (("mesh", mesh), ("mesh/coarse", coarse)):
+        for idx, (piece, text) in enumerate(mesh_pieces(part, shown.facts(part.vertices)) if part is not None else ()):
+            page.put(f"{folder}/{idx}", text)
+            described[folder].append(piece)
     if mesh.texture is not None:
         shrink = min(1.0, MAX_TEXTURE / max(mesh.texture.shape[:2]))
         size = (max(1, round(mesh.texture.shape[1] * shrink)), max(1, round(mesh.texture.shape[0] * shrink)))
         texture = mesh.texture if shrink == 1 else cv2.resize(mesh.texture, size, interpolation=cv2.INTER_AREA)
         page.put("mesh/texture", encode_jpeg(np.asarray(texture, np.uint8), jpeg_quality))
     return {
-        "pieces": described,
+        "pieces": described["mesh"],
+        "coarse": described["mesh/coarse"],
         "textured": mesh.texture is not None,
         "bounds": np.percentile(mesh.vertices, [1, 99], axis=0).astype(float).tolist(),
     }
@@ -146,14 +169,14 @@ def put_maps(
     """Write the floor plans, or without them the cloud from above; return where they lie."""
     if plans:
         return [
-            _put_map(page, number, plan.place, colors=encode_png(plan.picture), shown=shown, heights=plan.heights)
+            _put_map(page, number, plan.place, colors=encode_webp(plan.picture), shown=shown, heights=plan.heights)
             for number, plan in enumerate(plans)
         ]
     if not len(shown.cloud):
         return []
     place = place_around(shown.cloud.points_in_world, centers)
     heights = (-np.inf, cut_height(shown.cloud.points_in_world, centers))
-    colors = encode_png(top_view(shown.cloud, place, heights)[0])
+    colors = encode_webp(top_view(shown.cloud, place, heights)[0])
     return [_put_map(page, 0, place, colors=colors, shown=shown, heights=heights)]
 
 
@@ -169,7 +192,7 @@ def _put_map(
     page.put(f"map/{number}/colors", colors)
     coverage = top_view(shown.cloud, place, heights)[1] if len(shown.cloud) else None
     if coverage is not None:
-        page.put(f"map/{number}/coverage", encode_png(coverage))
+        page.put(f"map/{number}/coverage", encode_webp(coverage))
     return {
         "page_from_map": [*place.corner.tolist(), *place.right.tolist(), *place.down.tolist()],
         "aspect": float(np.linalg.norm(place.right) / np.linalg.norm(place.down)),
@@ -188,9 +211,9 @@ def put_camera(
     options: ShareOptions,
 ) -> dict[str, Any]:
     """Write the tiles, the ranges and their uncertainty of a panorama; return what the page needs to know of it."""
-    levels = level_count(image.shape[1], options.max_width) if image is not None else 0
+    levels, tile_width = tile_layout(image.shape[1], options.max_width) if image is not None else (0, 0)
     if image is not None:
-        for level, column, row, tile in panorama_tiles(image, levels):
+        for level, column, row, tile in panorama_tiles(image, levels, tile_width):
             page.put(f"panorama/{idx}/{level}-{column}-{row}", encode_jpeg(tile, options.jpeg_quality))
     ranges = view.range_map if view is not None else None
     text, low, high = encode_ranges(reduced(ranges)) if ranges is not None else ("", 1.0, 2.0)
@@ -204,6 +227,7 @@ def put_camera(
         "center": cam_from_page.center.tolist(),
         "page_from_cam": cam_from_page.rotation.T.tolist(),
         "levels": levels,
+        "width": (tile_width << levels) // 2,
         "ranges": [low, high] if text else None,
         "sigmas": [sigmas.low, sigmas.high] if sigmas is not None else None,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,18 @@ from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.scene_parts import RANGES_HW, ShareOptions, put_camera, put_cloud, put_maps, put_mesh, shown_cloud
+from pano_mvs.share.rooms import Sight, rooms_of
+from pano_mvs.share.scene_parts import (
+    RANGES_HW,
+    ShareOptions,
+    outline,
+    put_camera,
+    put_cloud,
+    put_maps,
+    put_mesh,
+    reduced,
+    shown_cloud,
+)
 
 
 def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rigid3:
@@ -130,7 +141,7 @@ def share_run(
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
     frame = page_from_world(cameras, is_level=states_y_down(largest.frame))
     page = PageFolder(folder)
-    title = options.title or resolved(run.out).name
+    title = options.title or _capture_name(run)
     scene: dict[str, Any] = {"title": title, "unit": "m" if largest.metric else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
     geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
@@ -154,6 +165,12 @@ def share_run(
     )
 
 
+def _capture_name(run: RunOutput) -> str:
+    """Return the name of the folder of the capture, which may hold its images in `images`; else of the output."""
+    folder = resolved(run.summary.source_folder or run.out)
+    return (folder.parent if folder.name == "images" else folder).name
+
+
 def _put_geometry(
     page: PageFolder,
     run: RunOutput,
@@ -173,6 +190,7 @@ def _put_geometry(
         mesh, note = thinned(mesh, options.max_triangles)
         notes.append(note)
         described["mesh"] = put_mesh(page, mesh.moved(frame), shown, jpeg_quality=options.jpeg_quality)
+    described["outline"] = outline(mesh.moved(frame).vertices if mesh is not None else shown.cloud.points_in_world)
     plans, note = run_plans(run, frame)
     notes.append(note)
     described["maps"] = put_maps(page, shown, plans, centers=centers)
@@ -190,22 +208,35 @@ def _put_cameras(
     progress: Progress | None,
 ) -> list[dict[str, Any]]:
     """Write the panoramas, and return what the page needs to know of each camera."""
-    described = []
+    described: list[dict[str, Any]] = []
+    sights = {}
     for idx, name in enumerate(poses.names if poses is not None else ()):
         assert poses is not None
         view = run.views.get(name)
-        image = _image(run, name, images)
+        image = _image(run, name, images, max_width=options.max_width)
         pose = poses.cam_from_world(idx) @ frame.inverse()
         described.append(
             {"name": name, **put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)}
         )
+        if view is not None and view.range_map is not None:
+            sights[name] = Sight(pose, reduced(view.range_map))
         if progress is not None:
             progress(idx + 1, len(poses.names))
+    rooms = rooms_of([entry["name"] for entry in described], sights, options.rooms)
+    for entry, room in zip(described, rooms, strict=True):
+        entry["room"] = room
     return described
 
 
-def _image(run: RunOutput, name: str, images: Path | None) -> NDArray[np.uint8] | None:
-    """Return a panorama from the given folder, else from where the run found it; None if it is not there."""
+def _image(run: RunOutput, name: str, images: Path | None, *, max_width: int) -> NDArray[np.uint8] | None:
+    """Return a panorama from the given folder, else from where the run found it; None if it is not there.
+
+    What the run found is loaded at the resolution of its file, which may be higher than that of the run.
+    """
+    panorama = run.values.panorama(name) if images is None else None
+    if panorama is not None:
+        width = min(panorama.source_size_hw[1], max_width) // 4 * 4
+        return replace(panorama, size_hw=(width // 2, width)).load()
     if images is None and (view := run.views.get(name)) is not None:
         return view.image
     path = run.summary.source_file(name, images)

@@ -1,6 +1,8 @@
-"""How soon a shared page shows its first complete picture, and how often it draws while it is turned.
+"""How soon a shared page shows its first picture, and how often it draws while it is turned.
 
-PAGE is a folder that `pano-mvs share` wrote. The browsers draw in software. Beside the frames per second stands the
+PAGE is a folder that `pano-mvs share` wrote. In Chromium the first picture of the whole scene is also timed over a line
+of 10 Mbit/s with a latency of 40 ms, for the start of the page and for a link into a panorama. The browsers draw in
+software. Beside the frames per second stands the
 processor time of the browser per frame, which depends less on what else the machine does: with two free cores, 60 ms
 allow 30 frames per second.
 """
@@ -14,8 +16,13 @@ from typing import Literal
 
 from tests.benchmarks.table import print_table
 from tests.share.browser import Browser, open_browser
+from tests.share.chromium import Chromium
+from tests.share.server import served
 
 _READY = "typeof PanoMvs === 'object' && PanoMvs.page && PanoMvs.page.settled"
+_ASKED_FOR = """[...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
+  .filter(({ startTime }) => startTime < PanoMvs.page.firstPicture)
+  .reduce((sum, { encodedBodySize }) => sum + encodedBodySize, 0)"""
 # The page adapts within the first second; it is not counted.
 _TURN = """new Promise((resolve) => {
   const page = PanoMvs.page, vertical = new THREE.Vector3(0, 1, 0), times = [], end = performance.now() + %d;
@@ -45,6 +52,9 @@ def main(
         opened = [_opening_ms(window, page / "index.html") for _ in range(openings)]
         middle, worst = statistics.median(opened), max(opened)
         print(f"first complete picture: median {middle:.0f} ms of {len(opened)}, worst {worst:.0f} ms\n")
+        if isinstance(window, Chromium):
+            rows = (_slow_line(window, page, link, openings) for link in ("", "#i=0,0,0,80"))
+            print_table(["10 Mbit/s, 40 ms", "first picture, s: median", "worst", "MB"], rows)
         shown = (name for name, script in _VIEWS.items() if window.evaluate(f"(async () => {script})()"))
         print_table(
             ["view", "frames/s", "CPU ms/frame", "pace"], ([name, *_turning(window, seconds)] for name in shown)
@@ -57,6 +67,22 @@ def _opening_ms(browser: Browser, page: Path) -> float:
     browser.open(page.resolve().as_uri())
     browser.wait(_READY)
     return float(browser.evaluate("PanoMvs.page.firstComplete"))
+
+
+def _slow_line(browser: Chromium, page: Path, link: str, openings: int) -> list[str]:
+    """Return what the address ends with, seconds until the first picture, and what was asked for until then in MB."""
+    times_ms, sizes = [], []
+    with served(page) as server:
+        for _ in range(openings):
+            browser.open("about:blank")
+            browser.throttle(bits_per_s=10e6, latency_ms=40)
+            browser.open(server.address + link)
+            browser.wait("typeof PanoMvs === 'object' && PanoMvs.page?.firstPicture")
+            times_ms.append(browser.evaluate("PanoMvs.page.firstPicture"))
+            sizes.append(browser.evaluate(_ASKED_FOR))
+        browser.throttle(bits_per_s=1e12, latency_ms=0)
+    middle, worst = statistics.median(times_ms) / 1000, max(times_ms) / 1000
+    return [link or "start", f"{middle:.1f}", f"{worst:.1f}", f"{max(sizes) / 1e6:.1f}"]
 
 
 def _turning(browser: Browser, seconds: float) -> list[str]:

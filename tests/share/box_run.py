@@ -24,7 +24,6 @@ RELATIVE_SIGMA = 0.01
 """Standard deviation of each range, divided by the range."""
 
 _SIZE_HW = (256, 512)
-_CELLS = 12
 
 
 def box_ranges(cam_from_world: Rigid3, size_hw: tuple[int, int]) -> NDArray[np.float32]:
@@ -45,11 +44,12 @@ def wall_color(points: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(128 + 90 * np.sin(2 * points)), np.uint8)
 
 
-def box_mesh() -> MeshArrays:
-    """Return the walls as triangles that face the inside."""
-    steps = np.linspace(-1, 1, _CELLS + 1)
-    first = (np.arange(_CELLS)[:, None] * (_CELLS + 1) + np.arange(_CELLS)).reshape(-1)
-    cells = np.stack([first, first + 1, first + _CELLS + 2, first, first + _CELLS + 2, first + _CELLS + 1], axis=-1)
+def box_mesh(across_wall: int = 12) -> MeshArrays:
+    """Return the walls as triangles that face the inside; each wall has so many cells along its sides."""
+    count = across_wall + 1
+    steps = np.linspace(-1, 1, count)
+    first = (np.arange(across_wall)[:, None] * count + np.arange(across_wall)).reshape(-1)
+    cells = np.stack([first, first + 1, first + count + 1, first, first + count + 1, first + count], axis=-1)
     points: list[NDArray[np.float64]] = []
     faces: list[NDArray[np.int64]] = []
     for axis in range(3):
@@ -65,8 +65,11 @@ def box_mesh() -> MeshArrays:
     return vertices.astype(np.float32), wall_color(vertices), np.concatenate(faces).astype(np.int32)
 
 
-def box_run(folder: Path, *, points: int = 20_000, metric: bool = True, mesh: bool = False) -> RunOutput:
-    """Write the output of three level cameras in the box, and return it."""
+def box_run(folder: Path, *, points: int = 20_000, metric: bool = True, mesh: bool | int = False) -> RunOutput:
+    """Write the output of three level cameras in the box, and return it.
+
+    `mesh`: whether there is one, or how many cells its walls have along their sides.
+    """
     poses = turned_poses(3, level=True)
     out = write_output(folder, poses, points=0, metric=metric)
     cloud = box_cloud(points, quality=True)
@@ -74,7 +77,7 @@ def box_run(folder: Path, *, points: int = 20_000, metric: bool = True, mesh: bo
     cloud = replace(cloud, colors_rgb=wall_color(cloud.points_in_world.astype(np.float64)), uncertainty=sigmas)
     write_ply(out / "cloud.ply", cloud, quality=True, uncertainty=True)
     if mesh:
-        write_ply_mesh(out / "mesh.ply", box_mesh())
+        write_ply_mesh(out / "mesh.ply", box_mesh() if mesh is True else box_mesh(mesh))
     for name, pose in poses.items():
         ranges = box_ranges(pose, _SIZE_HW)
         for kind, values in (("range", ranges), ("uncertainty", np.full_like(ranges, RELATIVE_SIGMA))):

@@ -81,9 +81,10 @@ class Browser(ABC):
         ]
         self.perform({"sources": strokes})
 
-    def press(self, key: str) -> None:
-        """Press and release a key."""
-        keys = [{"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}]
+    def press(self, key: str, *, holding: str = "") -> None:
+        """Press and release a key, while another one is held down or not."""
+        held = [{"type": kind, "value": holding} for kind in ("keyDown", "keyUp") if holding]
+        keys = [*held[:1], {"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}, *held[1:]]
         self.perform({"type": "key", "id": "keyboard", "actions": keys})
 
 

@@ -53,6 +53,13 @@ class Chromium(Browser):
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
         )
 
+    def throttle(self, *, bits_per_s: float, latency_ms: float) -> None:
+        """Let all that arrives take as long as over a slow line; with an empty cache."""
+        self.command("Network.enable")
+        self.command("Network.setCacheDisabled", cacheDisabled=True)
+        speed = {"downloadThroughput": bits_per_s / 8, "uploadThroughput": bits_per_s / 8}
+        self.command("Network.emulateNetworkConditions", offline=False, latency=latency_ms, **speed)
+
     def evaluate(self, script: str) -> Any:
         """Return the value of a JavaScript expression in the page."""
         return _call("POST", f"{self.root}/execute/sync", {"script": f"return ({script})", "args": []})

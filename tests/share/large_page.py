@@ -33,8 +33,9 @@ def large_page(folder: Path, *, panoramas: int, levels: int, present: Sequence[i
                     page.put(f"panorama/{idx}/{level}-{column}-{row}", tile)
         center = [float(idx % 20), 0.0, float(idx // 20)]
         camera = {"name": f"{idx:03}.jpg", "center": center, "page_from_cam": np.diag([1.0, -1.0, -1.0]).tolist()}
-        cameras.append({**camera, "levels": levels, "ranges": None, "sigmas": None})
+        tiles = {"levels": levels, "width": 1024 << levels >> 1}
+        cameras.append({**camera, **tiles, "ranges": None, "sigmas": None, "room": ""})
     scene = {"title": "Many", "unit": "m", "cameras": cameras, "ranges": list(RANGES_HW), "nodes": [], "bounds": []}
-    page.put("scene", {**scene, "sigmas": [1, 2], "coverage": False, "mesh": None, "maps": []})
+    page.put("scene", {**scene, "outline": [], "sigmas": [1, 2], "coverage": False, "mesh": None, "maps": []})
     page.finish("Many", max_single_file_bytes=0)
     return folder / "index.html"

@@ -7,19 +7,35 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.share import ShareOptions, share_run
-from tests.share.box_run import POINT_SIGMA, RELATIVE_SIGMA, box_run, frame_of_page, wall_color, wall_range
+from tests.share.axe import barriers
+from tests.share.box_run import (
+    NAMES,
+    POINT_SIGMA,
+    RELATIVE_SIGMA,
+    box_mesh,
+    box_run,
+    frame_of_page,
+    wall_color,
+    wall_range,
+)
 from tests.share.browser import Browser, open_browser
 from tests.share.large_page import large_page
+from tests.share.server import served
 from tests.viewer.scenes import HALF
 
 pytestmark = pytest.mark.browser
 
-ESCAPE = "\ue00c"
+ESCAPE, ENTER, TAB, SHIFT = "\ue00c", "\ue007", "\ue004", "\ue008"
+LEFT, UP, RIGHT, DOWN = "\ue012", "\ue013", "\ue014", "\ue015"
+PAGE_UP, PAGE_DOWN = "\ue00e", "\ue00f"
 TOOLS = 10
+PHONE, DESKTOP = (390, 844), (1280, 720)
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +116,34 @@ def test_surface_and_cloud_are_drawn_and_the_console_is_empty(browser: Browser) 
         assert (np.abs(picture[60:640].astype(int) - ground).sum(axis=-1) > 40).mean() > 0.1
     assert 0.001 < differing(surface, cloud) < 0.15
     assert browser.console() == []
+
+
+def projected(browser: Browser) -> np.ndarray:
+    """Return the corners and all other vertices of the mesh, (N, 2), in the window from -1 to 1."""
+    matrices = "[PanoMvs.page.eye.projectionMatrix, PanoMvs.page.eye.matrixWorldInverse].map((each) => each.elements)"
+    projection, view = np.array(browser.evaluate(matrices)).reshape(2, 4, 4).transpose(0, 2, 1)
+    points = frame_of_page().apply(box_mesh()[0].astype(float))
+    clip = np.column_stack([points, np.ones(len(points))]) @ (projection @ view).T
+    assert (clip[:, 3] > 0).all()
+    return np.asarray(clip[:, :2] / clip[:, 3:])
+
+
+def test_the_page_opens_with_all_of_the_capture_in_the_window(browser: Browser, page: Path) -> None:
+    for width, height in (DESKTOP, PHONE, PHONE[::-1]):
+        browser.resize(width, height)
+        show(browser, page.as_uri())
+        for _ in ("as opened", "in a window of another shape"):
+            places = projected(browser)
+            assert (np.abs(places) < 1).all(axis=-1).mean() > 0.99
+            tools = browser.evaluate("document.getElementById('tools').getBoundingClientRect().top")
+            free = (tools - 50) / browser.evaluate("innerHeight")  # between the heading and the buttons
+            filled = np.ptp(places, axis=0) / 2 / (1, free)
+            assert filled.max() > 0.9
+            assert filled.prod() > 0.3
+            assert places[:, 1].min() > 0.95 - 2 * tools / browser.evaluate("innerHeight")
+            browser.resize(height, width)
+            browser.wait(f"Math.abs(PanoMvs.page.eye.aspect - {height / width}) < 0.001")
+            settle(browser)
 
 
 def test_the_single_file_shows_the_same(browser: Browser, page: Path) -> None:
@@ -190,6 +234,152 @@ def test_a_link_keeps_the_panorama_the_direction_and_the_measured_distance(brows
     assert differing(before, browser.screenshot()) < 0.01
 
 
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_link_leads_to_a_single_marked_point(browser: Browser, inside: bool) -> None:
+    if inside:
+        step_inside(browser, 0)
+    browser.press("m")
+    browser.click(*((700, 420) if inside else place_of(browser, np.array([-0.9, HALF[1], -1.8]))))
+    said = "document.getElementById('measured').textContent"
+    marked, told = browser.evaluate("PanoMvs.page.ruler.picks[0].point.toArray()"), browser.evaluate(said)
+    assert told.startswith("One point is marked")
+    assert ("from this panorama" in told) == inside
+    settle(browser)
+    before, link = browser.screenshot(), browser.evaluate("location.href")
+    show(browser, link)
+    assert browser.evaluate("PanoMvs.page.ruler.picks.map(({point}) => point.toArray())") == [
+        pytest.approx(marked, rel=1e-4)
+    ]
+    assert browser.evaluate(said) == told
+    assert browser.evaluate("document.querySelector('#labels div').textContent") == "Marked point"
+    assert differing(before, browser.screenshot()) < 0.01
+    assert browser.console() == []
+
+
+def test_a_keyboard_walks_turns_moves_and_measures(browser: Browser) -> None:
+    place, facing = (f"document.getElementById('{name}').textContent" for name in ("place", "facing"))
+    browser.press(TAB)
+    assert browser.evaluate("document.activeElement.id") == "canvas"
+    target = browser.evaluate("PanoMvs.page.orbit.target.toArray()")
+    browser.press(RIGHT, holding=SHIFT)
+    assert np.linalg.norm(np.subtract(browser.evaluate("PanoMvs.page.orbit.target.toArray()"), target)) > 0.1
+    browser.press(ENTER)
+    browser.wait("PanoMvs.page.mode === 'inside' && PanoMvs.page.settled")
+    first = browser.evaluate("PanoMvs.page.here.camera.name")
+    assert browser.evaluate(place) == first
+    for _ in range(60):
+        browser.wait(f"{facing}.startsWith('Facing')", seconds=10)
+        if "Enter walks to" in browser.evaluate(facing):
+            break
+        browser.evaluate("document.getElementById('facing').textContent = ''")
+        browser.press(RIGHT)
+    other = re.search(r"Enter walks to (\S+), ([\d.]+) m away", browser.evaluate(facing))
+    assert other is not None
+    browser.press(ENTER)
+    browser.wait("!PanoMvs.page.move && PanoMvs.page.settled")
+    assert browser.evaluate(place) == other[1] != first
+    browser.press("m")
+    assert browser.evaluate("document.getElementById('aim').hidden") is False
+    ends = []
+    for key in (DOWN, RIGHT):
+        for _ in range(4):
+            browser.press(key)
+        settle(browser)
+        browser.press(ENTER)
+        ray = "((ray) => [...ray.origin.toArray(), ...ray.direction.toArray()])"
+        origin, direction = np.array(browser.evaluate(f"{ray}(PanoMvs.page.raycaster(640, 360).ray)")).reshape(2, 3)
+        world = frame_of_page().inverse()
+        eye, ahead = world.apply(origin), world.rotation @ direction
+        ends.append(eye + wall_range(eye, ahead) * ahead)
+    assert measured(browser)[0] == pytest.approx(np.linalg.norm(ends[0] - ends[1]), rel=0.03)
+    browser.press(ESCAPE)
+    assert browser.evaluate("document.getElementById('aim').hidden") is True
+    browser.press(ESCAPE)
+    browser.wait("PanoMvs.page.mode === 'overview'")
+    browser.press("l")
+    assert browser.evaluate("document.activeElement.textContent") == "lobby/000.png"
+    browser.press(TAB)
+    browser.press(ENTER)
+    browser.wait("PanoMvs.page.here?.index === 1 && PanoMvs.page.settled")
+    browser.press(PAGE_DOWN)
+    browser.wait("PanoMvs.page.here?.index === 2 && PanoMvs.page.settled")
+    browser.press(PAGE_UP)
+    browser.wait("PanoMvs.page.here?.index === 1 && PanoMvs.page.settled")
+    browser.press(ESCAPE)
+    assert browser.evaluate("document.getElementById('panoramas').hidden") is True
+    assert browser.console() == []
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_axe_finds_no_barrier_in_any_panel(browser: Browser, size: tuple[int, int]) -> None:
+    browser.resize(*size)
+    settle(browser)
+    found = {}
+    for _ in ("dark", "light"):
+        for keys in ("", "?", "l", "n", "m", "c", "p", "i"):
+            for key in keys:
+                browser.press(key)
+            if keys == "i":
+                browser.wait("PanoMvs.page.mode === 'inside' && PanoMvs.page.settled")
+            settle(browser)
+            theme = browser.evaluate("document.documentElement.dataset.theme ?? ''")
+            if said := barriers(browser):
+                found[theme, keys] = said
+            for key in keys if keys in ("?", "l", "n", "m", "c") else ("o" if keys else ""):
+                browser.press(key)
+        browser.press("t")
+    assert found == {}
+    assert browser.console() == []
+
+
+@pytest.fixture(scope="module")
+def large_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page as large as that of a room: with so many points, triangles and pixels, and noise that does not shrink."""
+    folder = tmp_path_factory.mktemp("room")
+    run = box_run(folder, points=1_500_000, mesh=150)
+    rng = np.random.default_rng(0)
+    for name in NAMES:
+        image = cv2.resize(decode_image(folder / "images" / name), (5376, 2688)) + rng.normal(0, 8, (2688, 5376, 1))
+        write_png(folder / "images" / name, np.rint(image).clip(0, 255).astype(np.uint8))
+    shared = share_run(run, folder / "page", ShareOptions(title="Room"))
+    assert shared.total_bytes > 40_000_000
+    assert shared.triangles > 250_000
+    return shared.page.parent
+
+
+@pytest.mark.parametrize(
+    ("link", "needed"),
+    [
+        ("", r"scene\.js|mesh/coarse/"),
+        ("#s=0&o=3,4,5,0,0,0", r"scene\.js|cloud/r\.js"),
+        ("#i=1,0.5,-0.1,80", r"scene\.js|panorama/1/(0-0-0|ranges|sigmas)\.js"),
+    ],
+)
+def test_three_megabytes_show_the_whole_room(window: Browser, large_room: Path, link: str, needed: str) -> None:
+    """What more there is makes the picture finer, and is not even asked for before."""
+    window.resize(1280, 720)
+    window.open("about:blank")
+    with served(large_room, held=f"/data/(?!{needed})") as server:
+        window.open(server.address + link)
+        window.wait("typeof PanoMvs === 'object' && PanoMvs.page?.firstPicture")
+        first, limit = window.screenshot(), window.evaluate("PanoMvs.page.firstPicture")
+        entries = "performance.getEntriesByType('resource').map(({name, startTime}) => [name, startTime])"
+        early = [name.removeprefix(server.address) for name, at in window.evaluate(entries) if at < limit]
+        server.release()
+        settle(window)
+    data = [name for name in early if name.startswith("data/")]
+    assert all(re.search(needed, name) for name in data)
+    assert sum((large_room / name).stat().st_size for name in ["index.html", *early]) < 3_000_000, early
+    final = window.screenshot()
+    assert differing(first, final) < 0.3
+    if "i=" not in link:
+        drawn = [np.abs(picture.astype(int) - final[5, 700]).sum(axis=-1) > 40 for picture in (first, final)]
+        assert drawn[1].mean() > 0.2
+        assert (drawn[0] != drawn[1]).mean() < 0.15 * drawn[1].mean()
+    assert len(window.evaluate("PanoMvs.loaded")) > len(data)
+    assert window.console() == []
+
+
 def test_a_link_keeps_points_and_coverage(browser: Browser) -> None:
     for key in ("s", "c", "\ue012"):  # arrow to the left
         browser.press(key)
@@ -250,7 +440,8 @@ def test_everything_can_be_reached_on_small_and_large_windows(browser: Browser, 
     browser.resize(width, height)
     browser.wait(f"Math.abs(PanoMvs.page.eye.aspect - {width / height}) < 0.001")
     settle(browser)
-    boxes = "[...document.querySelectorAll('#tools button')].map((button) => button.getBoundingClientRect().toJSON())"
+    shown = "[...document.querySelectorAll('#tools button')]"
+    boxes = f"{shown}.map((button) => button.getBoundingClientRect().toJSON())"
     buttons = browser.evaluate(boxes)
     assert len(buttons) == TOOLS
     for box in buttons:

@@ -16,9 +16,11 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.results.run_output import load
 from pano_mvs.share import share_run
 from pano_mvs.share.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
-from pano_mvs.share.mesh_file import SharedMesh, read_glb, run_mesh, thinned
+from pano_mvs.share.mesh_file import SharedMesh, coarser, read_glb, run_mesh, thinned
+from pano_mvs.share.scene_parts import outline
 from tests.share.box_run import POINT_SIGMA, box_mesh, box_run, frame_of_page, wall_color
 from tests.share.test_share import value_of
+from tests.viewer.scenes import HALF
 
 GLB_FROM_WORLD = np.diag([1.0, -1.0, -1.0])
 
@@ -64,6 +66,40 @@ def textured_box() -> SharedMesh:
     texture[:, :16], texture[8:, 16:] = (200, 30, 20), (20, 30, 200)
     uv = np.random.default_rng(0).random((len(vertices), 2)).astype(np.float32)
     return SharedMesh(vertices, faces, uv=uv, texture=texture)
+
+
+def test_a_coarser_mesh_keeps_the_shape_and_the_colours_and_has_no_cracks() -> None:
+    vertices, colors, faces = box_mesh(60)
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:, :32], texture[:, 32:] = (200, 30, 20), (20, 30, 200)
+    uv = np.where(vertices[:, :1] < 0, 0.2, 0.8) * [[1, 1]]
+    for mesh, left in (
+        (SharedMesh(vertices, faces, uv=uv.astype(np.float32), texture=texture), (200, 30, 20)),
+        (SharedMesh(vertices, faces, colors_rgb=colors), None),
+    ):
+        coarse = coarser(mesh, 2_000)
+        assert coarse is not None
+        assert coarse.colors_rgb is not None
+        assert 1_000 < len(coarse.faces) < 2_500
+        assert coarse.texture is None
+        assert np.ptp(coarse.vertices, axis=0) == pytest.approx(2 * HALF, rel=0.01)
+        edges = np.sort(coarse.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2}  # closed
+        clear = np.abs(coarse.vertices[:, 0]) > 0.2
+        expected = wall_color(coarse.vertices.astype(float))
+        if left is not None:
+            expected = np.where(coarse.vertices[:, :1] < 0, [left], [(20, 30, 200)])
+        assert np.abs(coarse.colors_rgb[clear].astype(int) - expected[clear]).max() < 40
+    assert coarser(SharedMesh(vertices, faces, colors_rgb=colors), len(faces)) is None
+
+
+def test_the_outline_leaves_out_strays_alone() -> None:
+    points = box_mesh()[0] + np.float32(0)
+    strays = np.array([[100.0, 0, 0]], np.float32)
+    hull = np.array(outline(np.concatenate([np.repeat(points, 10, axis=0), strays])))
+    assert len(hull) <= 64
+    assert np.abs(hull).max(axis=0) == pytest.approx(HALF)
+    assert outline(points[:0]) == []
 
 
 def test_a_textured_mesh_comes_before_a_coloured_one(tmp_path: Path) -> None:

@@ -22,8 +22,10 @@ from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.image_file import write_png
 from pano_mvs.share import ShareOptions, share_run
-from pano_mvs.share.encoding import encode_ranges, level_count, panorama_tiles
+from pano_mvs.share.encoding import encode_ranges, panorama_tiles, tile_layout
 from pano_mvs.share.page_folder import SCRIPTS
 from pano_mvs.share.share import page_from_world
 from tests.share.box_run import NAMES, box_ranges, box_run
@@ -89,11 +91,41 @@ def test_ranges_keep_four_digits_and_gaps() -> None:
 
 def test_tiles_of_all_levels_cover_the_panorama() -> None:
     image = world_color(np.random.default_rng(0).normal(size=(1024, 2048, 3)))
-    tiles = list(panorama_tiles(image, level_count(2048, 8192)))
+    tiles = list(panorama_tiles(image, *tile_layout(2048, 8192)))
     assert [tile[:3] for tile in tiles] == [(0, 0, 0), (1, 0, 0), (1, 1, 0)]
     assert tiles[0][3].shape == (512, 1024, 3)
     assert np.array_equal(np.concatenate([tile[3] for tile in tiles[1:]], axis=1), image)
-    assert [level_count(width, 4096) for width in (512, 1024, 2047, 4096, 11_000)] == [1, 1, 1, 3, 3]
+    assert [tile_layout(width, 8192) for width in (512, 2048, 5376, 6720, 11_000)] == [
+        (1, 1024),
+        (2, 1024),
+        (4, 672),
+        (4, 840),
+        (4, 1024),
+    ]
+
+
+def test_the_last_level_has_the_resolution_of_the_picture() -> None:
+    """A panorama of 5376 pixels was reduced to 4096, and one of 2000 to 1024."""
+    image = world_color(np.random.default_rng(0).normal(size=(1000, 2000, 3)))
+    tiles = list(panorama_tiles(image, *tile_layout(2000, 8192)))
+    assert np.array_equal(np.concatenate([tile[3] for tile in tiles[1:]], axis=1), image)
+
+
+def test_panoramas_keep_the_resolution_of_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run at 512 columns made a page with panoramas of 512 columns."""
+    run = box_run(tmp_path, points=100)
+    picture = np.repeat(np.random.default_rng(0).integers(0, 256, (1024, 2048, 1), np.uint8), 3, axis=2)
+    write_png(tmp_path / "images" / NAMES[1], picture)
+    panorama = Panorama(FilePart(tmp_path / "images" / NAMES[1]), (256, 512), (1024, 2048))
+    known = {NAMES[1]: panorama}
+    monkeypatch.setattr(type(run.values), "panorama", lambda _, name: known.get(name))
+    share_run(run, tmp_path / "page", ShareOptions(jpeg_quality=100))
+    data = tmp_path / "page" / "data"
+    assert [camera["width"] for camera in value_of(data / "scene.js")["cameras"]] == [1024, 2048, 1024]
+    encoded = np.frombuffer(base64.b64decode(value_of(data / "panorama/1/1-1-0.js")), np.uint8)
+    tile = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
+    assert tile is not None
+    assert np.abs(tile.astype(int) - picture[:, 1024:]).mean() < 3
 
 
 def test_the_single_file_refers_to_nothing_and_allows_its_own_scripts_alone(tmp_path: Path) -> None:
@@ -136,6 +168,21 @@ def test_a_run_is_shared_from_python_and_shown_in_a_notebook(tmp_path: Path) -> 
     assert html.unescape(text) == (tmp_path / "page" / "page.html").read_text(encoding="utf-8")
     too_large = pano_mvs.share_run(run.out, tmp_path / "page", ShareOptions(max_single_file_bytes=1000))
     assert f"Open {tmp_path / 'page' / 'index.html'} in a browser" in too_large._repr_html_()
+
+
+@pytest.mark.parametrize(("folder", "title"), [("office/images", "office"), ("2024 <flat>", "2024 <flat>")])
+def test_the_title_is_the_folder_of_the_capture(tmp_path: Path, folder: str, title: str) -> None:
+    run = box_run(tmp_path, points=100)
+    summary = json.loads((run.out / "run.json").read_text())
+    summary["stages"][0]["params"]["path"] = str(tmp_path / folder)
+    (run.out / "run.json").write_text(json.dumps(summary))
+    page = share_run(load(run.out), tmp_path / "page", images=tmp_path / "images").page
+    assert value_of(page.parent / "data" / "scene.js")["title"] == title
+    assert f"<title>{html.escape(title)}</title>" in page.read_text()
+    summary["stages"] = []
+    (run.out / "run.json").write_text(json.dumps(summary))
+    page = share_run(load(run.out), tmp_path / "page", images=tmp_path / "images").page
+    assert "<title>out</title>" in page.read_text()
 
 
 def test_a_folder_with_something_else_is_refused_and_kept(tmp_path: Path) -> None:

@@ -52,16 +52,17 @@ class Cloud {
       vertexShader: POINT_VERTEX,
       fragmentShader: POINT_FRAGMENT,
       uniforms: {
-        pointSize: { value: this.spacing() }, pixelsPerUnit: { value: 1 }, cut: { value: 1e30 }, coverage: { value: false }, hideBacks: { value: true },
+        pointSize: { value: 0.01 }, pixelsPerUnit: { value: 1 }, cut: { value: 1e30 }, coverage: { value: false }, hideBacks: { value: true },
       },
     });
   }
 
-  /** Return twice a typical distance between points, as if they lay on the sides of the box that holds most of them. */
+  /** Return twice a typical distance between loaded points, as if they lay on the sides of the box that holds most of them. */
   spacing() {
-    if (!this.total) return 0.01;
+    const loaded = [...this.nodes.values()].reduce((sum, node) => sum + (node.points ? node.count : 0), 0);
+    if (!loaded) return 0.01;
     const [a, b, c] = [0, 1, 2].map((axis) => this.bounds[1][axis] - this.bounds[0][axis]);
-    return 2 * Math.sqrt((2 * (a * b + b * c + c * a)) / Math.min(this.total, POINT_BUDGET)) || 0.01;
+    return 2 * Math.sqrt((2 * (a * b + b * c + c * a)) / Math.min(loaded, POINT_BUDGET)) || 0.01;
   }
 
   /** Choose the nodes for a camera: nearest and largest first, until the budget is spent; load what is missing.
@@ -102,8 +103,11 @@ class Cloud {
     this.material.uniforms.pointSize.value = this.spacing() * share ** -0.35;
   }
 
+  /** Whether the root, a sample of all points, can be seen, or there is none. */
+  get begun() { return Boolean(!this.nodes.size || this.nodes.get("r").points); }
+
   load(node) {
-    if (node.asked || this.loading >= LOADS_AT_ONCE) return;
+    if (node.asked || this.loading >= LOADS_AT_ONCE || (node.name !== "r" && !this.begun)) return;
     node.asked = true;
     this.loading++;
     PanoMvs.load(`cloud/${node.name}`).then((text) => {

@@ -22,8 +22,9 @@ class Input {
       keys: () => page.toggle("keys", "help"),
     };
     for (const [id, action] of Object.entries(this.actions)) element(id).addEventListener("click", () => { action(); page.writeLink(); });
-    addEventListener("resize", () => page.resize());
+    addEventListener("resize", () => page.reframe());
     addEventListener("keydown", (event) => this.keydown(event));
+    addEventListener("pointerdown", () => page.useKeys(false));
     this.canvas.addEventListener("pointerdown", (event) => this.down(event));
     this.canvas.addEventListener("pointermove", (event) => this.moved(event));
     for (const kind of ["pointerup", "pointercancel"]) this.canvas.addEventListener(kind, (event) => this.up(event));
@@ -72,17 +73,18 @@ class Input {
     const shortcuts = { o: "overview", p: "plan", i: "inside", s: "surface", m: "measure", c: "coverage", l: "list", n: "plot", t: "theme", "?": "keys" };
     const id = shortcuts[event.key.toLowerCase()];
     if (id && !element(id).hidden) element(id).click();
-    else if (event.target.closest?.("button") && event.key !== "Escape" || !this.key(event.key)) return;
+    else if (event.target.closest?.("button") && event.key !== "Escape" || !this.key(event.key, event.shiftKey)) return;
+    this.page.useKeys(true);
     event.preventDefault();
   }
 
   /** Do what a key stands for; return whether it stands for something. */
-  key(name) {
+  key(name, shifted) {
     const { page } = this;
     if (name === "Escape") return page.back();
-    if (name === "Enter" && page.mode === "inside") {
-      const panorama = page.ahead();
-      if (panorama && !page.move) page.stepInside(panorama);
+    if (name === "Enter") return this.enter();
+    if (name === "PageDown" || name === "PageUp") {
+      page.visitNext(name === "PageDown" ? 1 : -1);
       return true;
     }
     const zooms = { "+": 1 / 1.15, "=": 1 / 1.15, "-": 1.15 };
@@ -90,10 +92,33 @@ class Input {
     if (!zooms[name] && !steps[name]) return false;
     if (page.mode === "inside") zooms[name] ? page.zoom(zooms[name]) : page.turn(steps[name][0] * 0.12, steps[name][1] * 0.12);
     else if (page.mode === "plan") this.glide(zooms[name], steps[name]);
+    else if (shifted && steps[name]) this.pan(steps[name]);
     else this.orbit(zooms[name], steps[name]);
     page.changed();
+    page.describe();
     page.writeLink();
     return true;
+  }
+
+  /** Mark the point in the middle of the window, walk to the panorama ahead, or step inside the nearest one. */
+  enter() {
+    const { page, canvas } = this;
+    if (page.move) return true;
+    if (page.measuring) page.mark(canvas.clientWidth / 2, canvas.clientHeight / 2);
+    else {
+      const panorama = page.mode === "inside" ? page.ahead() : page.nearest();
+      if (panorama) page.stepInside(panorama);
+      else say("No panorama lies ahead. Turn, or press Page Down for the next one.");
+    }
+    return true;
+  }
+
+  pan([right, up]) {
+    const { eye, orbit } = this.page;
+    const way = eye.position.distanceTo(orbit.target) * 0.06;
+    const move = new THREE.Vector3(right * way, up * way, 0).applyQuaternion(eye.quaternion);
+    for (const moved of [eye.position, orbit.target]) moved.add(move);
+    orbit.update();
   }
 
   glide(zoom, step) {

@@ -1,5 +1,5 @@
 "use strict";
-// The address keeps the view: "#i=3,yaw,pitch,fov&m=x,y,z,x,y,z&s=0&c=1".
+// The address keeps the view and the marked points: "#i=3,yaw,pitch,fov&m=x,y,z,sigma,ray,ray,ray&s=0&c=1".
 
 /** Return the part of the address that leads back to what the page shows. */
 function linkOf(page) {
@@ -9,7 +9,7 @@ function linkOf(page) {
   if (page.mode === "inside") parts.push(`i=${page.here.index},${short([look.yaw, look.pitch, look.fov])}`);
   else if (page.mode === "plan") parts.push(`p=${short([above.position.x, above.position.z, above.zoom])}`);
   else parts.push(`o=${short([...eye.position.toArray(), ...orbit.target.toArray()])}`);
-  if (page.ruler.picks.length === 2) {
+  if (page.ruler.picks.length) {
     const numbers = page.ruler.picks.flatMap(({ point, sigma, ray }) => [...point.toArray(), sigma, ...(ray ?? new THREE.Vector3()).toArray()]);
     parts.push(`m=${short(numbers)}`);
   }
@@ -27,12 +27,14 @@ function followLink(page, link) {
   if (![...parts.values()].every((numbers) => numbers.every(Number.isFinite))) return false;
   if (page.surface) page.showSurface(parts.get("s")?.[0] !== 0);
   page.coverage(parts.get("c")?.[0] === 1);
-  const found = followView(page, parts);
+  const found = followView(page, parts), inside = parts.has("i") ? page.panoramas[parts.get("i")[0]] : null;
   const measured = parts.get("m");
-  if (found && measured?.length === 14) {
+  if (found && (measured?.length === 7 || measured?.length === 14)) {
     page.measure(true);
-    for (const [x, y, z, sigma, ...ray] of [measured.slice(0, 7), measured.slice(7)]) {
-      page.ruler.add({ point: new THREE.Vector3(x, y, z), sigma, ray: ray.some(Boolean) ? new THREE.Vector3(...ray) : null });
+    for (let first = 0; first < measured.length; first += 7) {
+      const [x, y, z, sigma, ...ray] = measured.slice(first, first + 7);
+      const pick = { point: new THREE.Vector3(x, y, z), sigma, ray: ray.some(Boolean) ? new THREE.Vector3(...ray) : null };
+      page.ruler.add(pick, inside);
     }
   }
   return found;

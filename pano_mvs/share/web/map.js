@@ -7,6 +7,7 @@ class PlanMap {
     this.panoramas = panoramas;
     this.coverage = false;
     this.shown = null;
+    this.opened = new Promise((resolve) => { this.open = resolve; }); // pictures are loaded as soon as somebody opens the map
     this.figure = element("map");
     this.image = this.figure.querySelector("img");
     this.you = element("you");
@@ -14,11 +15,16 @@ class PlanMap {
       const button = document.createElement("button");
       button.type = "button";
       button.tabIndex = -1;
-      button.ariaLabel = button.title = panorama.camera.name;
+      button.ariaLabel = button.title = panorama.camera.title;
       button.disabled = !panorama.camera.levels;
       button.addEventListener("click", () => visit(panorama));
       element("places").append(button);
       return button;
+    });
+    this.rooms = roomsOf(panoramas).map(({ name, center }) => {
+      const tag = Object.assign(document.createElement("span"), { className: "room", textContent: name });
+      element("places").append(tag);
+      return { tag, center };
     });
     element("places").addEventListener("keydown", (event) => this.key(event));
     this.current(null);
@@ -45,10 +51,16 @@ class PlanMap {
       Object.assign(this.buttons[idx].style, { left: `${100 * u}%`, top: `${100 * v}%` });
       this.buttons[idx].hidden = Boolean(map.heights) && (panorama.center.y < map.heights[0] || panorama.center.y > map.heights[1]);
     }
+    for (const { tag, center } of this.rooms) {
+      const [u, v] = this.place(center);
+      Object.assign(tag.style, { left: `${100 * u}%`, top: `${100 * v}%` });
+      tag.hidden = Boolean(map.heights) && (center.y < map.heights[0] || center.y > map.heights[1]);
+    }
+    await this.opened;
     map.pictures ??= new Map();
     if (!map.pictures.has(kind)) map.pictures.set(kind, PanoMvs.load(`map/${this.maps.indexOf(map)}/${kind}`));
     const text = await map.pictures.get(kind);
-    if (this.shown === map && this.kind === kind) this.image.src = `data:image/png;base64,${text}`;
+    if (this.shown === map && this.kind === kind) this.image.src = `data:image/webp;base64,${text}`;
   }
 
   /** Mark the panorama in which one stands; null outside. */

@@ -1,5 +1,5 @@
 "use strict";
-// Distances between two points that somebody clicks, and their uncertainty.
+// Points that somebody marks, the distance between two of them, and its uncertainty.
 
 class Ruler {
   constructor(unit) {
@@ -11,15 +11,22 @@ class Ruler {
     document.getElementById("labels").append(this.label);
   }
 
-  /** Add a point: `{ point, sigma, ray }`, where `sigma` is 0 if unknown, and `ray` null if the error has no direction. */
-  add(pick) {
+  /** Add a point: `{ point, sigma, ray }`, where `sigma` is 0 if unknown, and `ray` null if the error has no direction.
+   *
+   * `here` is the panorama from which it was marked, or null.
+   */
+  add(pick, here) {
     if (this.picks.length === 2) this.clear();
     this.picks.push(pick);
     const dot = new THREE.Sprite(new THREE.SpriteMaterial({ color: 0xffb02e, depthTest: false, sizeAttenuation: false }));
-    dot.scale.setScalar(0.014);
+    dot.scale.setScalar(0.018);
     dot.position.copy(pick.point);
     this.group.add(dot);
-    if (this.picks.length < 2) return say("Click the second point.");
+    if (this.picks.length < 2) {
+      const away = here ? `, ${withUncertainty(pick.point.distanceTo(here.center), this.unit, pick.sigma)} from this panorama` : "";
+      this.label.textContent = "Marked point";
+      return say(`One point is marked${away}. The address of this page leads to it. Mark another one for the distance.`);
+    }
     const [a, b] = this.picks.map((each) => each.point);
     this.group.add(new THREE.Line(new THREE.BufferGeometry().setFromPoints([a, b]), new THREE.LineBasicMaterial({ color: 0xffb02e, depthTest: false })));
     const text = withUncertainty(a.distanceTo(b), this.unit, this.sigma());
@@ -47,9 +54,9 @@ class Ruler {
   }
 
   place(camera, width, height) {
-    this.label.hidden = this.picks.length < 2;
+    this.label.hidden = !this.picks.length;
     if (this.label.hidden) return;
-    const middle = this.picks[0].point.clone().add(this.picks[1].point).multiplyScalar(0.5).project(camera);
+    const middle = this.picks[0].point.clone().lerp(this.picks.at(-1).point, 0.5).project(camera);
     this.label.hidden = middle.z > 1;
     const box = this.label.getBoundingClientRect();
     const x = THREE.MathUtils.clamp(((middle.x + 1) / 2) * width - box.width / 2, 4, width - box.width - 4);

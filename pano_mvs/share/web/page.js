@@ -5,6 +5,7 @@ const WALK_MS = 1100;
 const FLY_MS = 900;
 const RING_PIXELS = 34; // how near a click must come
 const OPEN_PANORAMAS = 4; // kept in memory
+const FAR = 200; // times the radius of the scene
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 const narrow = matchMedia("(max-width: 520px)");
 
@@ -19,6 +20,7 @@ function problem(error) {
 
 class Page {
   constructor(scene) {
+    scene.cameras.forEach((camera) => { camera.title = camera.room ? `${camera.room} · ${camera.name}` : camera.name; });
     this.canvas = element("canvas");
     this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: false });
     this.renderer.autoClear = false;
@@ -54,7 +56,8 @@ class Page {
     this.glide = this.controls(this.above);
     this.glide.enableRotate = false;
     this.glide.screenSpacePanning = true;
-    this.map = new PlanMap(scene.maps, this.panoramas, (panorama) => !this.move && this.stepInside(panorama));
+    this.map = new PlanMap(scene.maps, this.panoramas, (panorama) => this.visit(panorama));
+    this.rooms = new Rooms(this.panoramas);
     this.prepare();
     this.resize();
     if (!location.hash || !followLink(this, location.hash)) this.overview();
@@ -120,7 +123,7 @@ class Page {
     const box = new THREE.Box3();
     for (const corner of this.scene.bounds.length ? this.scene.bounds : this.scene.mesh?.bounds ?? []) box.expandByPoint(new THREE.Vector3(...corner));
     for (const panorama of this.panoramas) box.expandByPoint(panorama.center);
-    return box;
+    return box.expandByScalar(0.01 * box.getSize(new THREE.Vector3()).length() || 1); // a single place has no size
   }
 
   enter(mode) {
@@ -130,9 +133,9 @@ class Page {
     if (mode !== "inside") this.here = null;
     const cut = mode === "plan" ? this.cutHeight() : 1e30;
     this.cloud.material.uniforms.cut.value = cut;
-    if (this.surface) this.surface.material.uniforms.cut.value = cut;
+    if (this.surface) this.surface.uniforms.cut.value = cut;
     this.cloud.material.uniforms.hideBacks.value = mode === "overview";
-    element("place").textContent = this.here ? this.here.camera.name : "";
+    element("place").textContent = { overview: "Overview", plan: "Floor plan" }[mode] ?? this.here.camera.title;
     for (const name of ["overview", "plan", "inside"]) element(name).setAttribute("aria-current", String(name === mode));
     for (const [index, button] of [...element("panoramas").querySelectorAll("button")].entries()) {
       button.setAttribute("aria-current", String(this.here?.index === index));
@@ -140,6 +143,8 @@ class Page {
     this.map.current(this.here);
     this.map.show((this.here ?? this.nearest())?.center.y ?? 0).catch(problem);
     this.placeRings();
+    element("facing").textContent = "";
+    this.describe();
     this.changed();
   }
 
@@ -150,34 +155,56 @@ class Page {
 
   overview() {
     this.move = null;
-    const box = this.box(), center = box.getCenter(new THREE.Vector3());
-    const radius = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 1e-3);
-    const distance = radius / Math.sin(THREE.MathUtils.degToRad(this.fitted(55)) / 2) * 0.9;
+    const box = this.box();
     this.eye.fov = 55;
-    this.eye.position.copy(center).add(new THREE.Vector3(0.55, 0.75, 0.9).normalize().multiplyScalar(distance));
-    this.orbit.target.copy(center);
-    this.nearFar(radius);
+    this.nearFar(box.getSize(new THREE.Vector3()).length() / 2);
+    this.fit(box.getCenter(new THREE.Vector3()));
     this.enter("overview");
     this.orbit.update();
+    this.opening = this.eye.position.clone();
   }
 
-  /** Return the smaller of a camera's two fields of view. */
-  fitted(fov) {
-    const aspect = this.canvas.clientWidth / this.canvas.clientHeight;
-    return aspect >= 1 ? fov : THREE.MathUtils.radToDeg(2 * Math.atan(Math.tan(THREE.MathUtils.degToRad(fov) / 2) * aspect));
+  /** Place the eye above and aside of the scene, as near as all of it fits into the part of the window that is free. */
+  fit(middle) {
+    const { eye } = this, { top, bottom, height } = this.free();
+    const backward = new THREE.Vector3(0.55, 0.75, 0.9).normalize();
+    const right = new THREE.Vector3(0, 1, 0).cross(backward).normalize(), up = backward.clone().cross(right);
+    const slope = Math.tan(THREE.MathUtils.degToRad(eye.fov) / 2), least = 0.01 * eye.far / FAR; // of a single place
+    const corners = this.scene.outline.map((point) => new THREE.Vector3(...point));
+    for (const { center } of this.panoramas) for (const side of [-least, least]) corners.push(center.clone().addScalar(side));
+    // A corner at p appears within the limits if -low (away - p.backward) < p.axis - place < high (away - p.backward).
+    const span = (axis, low, high) => {
+      const from = Math.max(...corners.map((corner) => corner.dot(axis) + high * corner.dot(backward)));
+      const to = Math.min(...corners.map((corner) => corner.dot(axis) - low * corner.dot(backward)));
+      const away = (from - to) / (low + high);
+      return { away, place: (at) => (from - high * at + to + low * at) / 2 };
+    };
+    const across = span(right, slope * eye.aspect, slope * eye.aspect);
+    const upright = span(up, slope * (1 - (2 * bottom) / height), slope * (1 - (2 * top) / height));
+    const away = 1.03 * (Math.max(across.away, upright.away) - middle.dot(backward)) + middle.dot(backward);
+    eye.position.copy(backward).multiplyScalar(away);
+    eye.position.addScaledVector(right, across.place(away)).addScaledVector(up, upright.place(away));
+    this.orbit.target.copy(eye.position).addScaledVector(backward, middle.dot(backward) - away);
+  }
+
+  /** Return how many pixels the heading and the buttons take of the height of the window. */
+  free() {
+    const height = this.canvas.clientHeight;
+    return { height, top: Math.min(height / 4, 50), bottom: Math.min(height / 4, element("tools").offsetHeight + 16) };
   }
 
   nearFar(radius) {
     this.eye.near = radius / 2000;
-    this.eye.far = radius * 200;
+    this.eye.far = radius * FAR;
     this.eye.updateProjectionMatrix();
   }
 
   plan() {
     this.move = null;
     const box = this.box(), center = box.getCenter(new THREE.Vector3()), size = box.getSize(new THREE.Vector3());
-    const aspect = this.canvas.clientWidth / this.canvas.clientHeight;
-    this.halfHeight = 0.58 * Math.max(size.z, size.x / aspect, 1e-3);
+    const { top, bottom, height } = this.free();
+    this.halfHeight = 0.53 * Math.max((size.z * height) / (height - top - bottom), size.x / this.eye.aspect);
+    center.z += (this.halfHeight * (bottom - top)) / height;
     this.above.zoom = 1;
     this.above.up.set(0, 0, -1);
     this.above.position.set(center.x, center.y + size.length(), center.z);
@@ -187,9 +214,10 @@ class Page {
     this.glide.update();
   }
 
-  /** Go back by one step: close the help, end measuring, leave a panorama. */
+  /** Go back by one step: close the help or the list, end measuring, leave a panorama. */
   back() {
     if (!element("help").hidden) this.toggle("keys", "help");
+    else if (!element("panoramas").hidden) this.toggle("list", "panoramas");
     else if (this.measuring) this.measure(false);
     else if (this.mode !== "overview") this.overview();
     this.writeLink();
@@ -224,6 +252,20 @@ class Page {
     this.writeLink();
   }
 
+  /** Step inside a panorama that was chosen from the list or the map; the keys then act on the view. */
+  visit(panorama) {
+    if (this.move) return;
+    this.canvas.focus({ preventScroll: true });
+    this.stepInside(panorama);
+  }
+
+  /** Step inside the panorama that comes so many places later in the list. */
+  visitNext(places) {
+    const usable = this.panoramas.filter((panorama) => panorama.camera.levels > 0);
+    const now = usable.indexOf(this.here ?? (places > 0 ? usable.at(-1) : usable[0]));
+    if (usable.length) this.visit(usable[(now + places + usable.length) % usable.length]);
+  }
+
   keep(panorama) {
     this.recent = [panorama, ...this.recent.filter((other) => other !== panorama)];
     for (const old of this.recent.splice(OPEN_PANORAMAS)) old.close();
@@ -241,13 +283,13 @@ class Page {
     }
   }
 
-  /** Return the panorama that lies best ahead; null if none does. */
-  ahead() {
-    const forward = this.eye.getWorldDirection(new THREE.Vector3());
+  /** Return the panorama that lies best ahead of a camera; null if none does. */
+  ahead(camera = this.eye) {
+    const forward = camera.getWorldDirection(new THREE.Vector3()), eye = camera.getWorldPosition(new THREE.Vector3());
     let best = null, bestScore = 0;
     for (const [index, panorama] of this.panoramas.entries()) {
       if (!this.rings[index].visible || panorama === this.here) continue;
-      const there = panorama.center.clone().sub(this.eye.position);
+      const there = panorama.center.clone().sub(eye);
       const score = Math.max(0, there.clone().normalize().dot(forward) - 0.5) / Math.sqrt(there.length() + 1e-9);
       if (score > bestScore) [best, bestScore] = [panorama, score];
     }
@@ -255,7 +297,7 @@ class Page {
   }
 
   nearest() {
-    const target = this.orbit.target;
+    const { target } = this.mode === "plan" ? this.glide : this.orbit;
     const usable = this.panoramas.filter((panorama) => panorama.camera.levels > 0);
     return usable.sort((a, b) => a.center.distanceTo(target) - b.center.distanceTo(target))[0];
   }
@@ -291,13 +333,7 @@ class Page {
   click(x, y) {
     this.canvas.focus({ preventScroll: true });
     if (this.move) return;
-    if (this.measuring) {
-      const picked = this.pick(x, y);
-      if (picked) this.ruler.add(picked);
-      else say("Nothing was measured there. Click a surface.");
-      this.writeLink();
-      return this.changed();
-    }
+    if (this.measuring) return this.mark(x, y);
     let best = null, bestApart = RING_PIXELS;
     for (const [index, ring] of this.rings.entries()) {
       if (!ring.visible || !this.panoramas[index].camera.levels) continue;
@@ -309,19 +345,52 @@ class Page {
     if (best) this.stepInside(best);
   }
 
+  /** Mark the point of the scene below a pixel of the window. */
+  mark(x, y) {
+    const picked = this.pick(x, y);
+    if (picked) this.ruler.add(picked, this.here);
+    else say("Nothing was measured there. Choose a surface.");
+    this.writeLink();
+    this.changed();
+  }
+
   measure(on) {
     this.measuring = on;
     element("measure").setAttribute("aria-pressed", String(on));
     this.ruler.clear();
-    if (on) say("Click two points.");
+    if (on) say("Click two points, or aim with the arrow keys and press Enter.");
+    this.showAim();
     this.changed();
+  }
+
+  /** Say whether keys or pointers are used: with keys, a cross hair shows what Enter marks, and a larger ring where it leads. */
+  useKeys(on) {
+    if (this.keys === on) return;
+    this.keys = on;
+    this.showAim();
+    this.changed();
+  }
+
+  showAim() { element("aim").hidden = !(this.keys && this.measuring); }
+
+  /** Tell a screen reader, once the view stands still, what lies in the middle of the window. */
+  describe() {
+    clearTimeout(this.describing);
+    this.describing = setTimeout(() => {
+      if (this.mode !== "inside" || !this.here || this.move) return;
+      const parts = [`Facing ${Math.round((THREE.MathUtils.radToDeg(this.look.yaw) % 360 + 360) % 360) % 360}°`];
+      const ahead = this.ahead(), seen = this.here.pick(this.eye.getWorldDirection(new THREE.Vector3()));
+      if (seen) parts.push(`surface at ${lengthText(seen.point.distanceTo(this.here.center), this.scene.unit)}`);
+      parts.push(ahead ? `Enter walks to ${ahead.camera.title}, ${lengthText(ahead.center.distanceTo(this.here.center), this.scene.unit)} away` : "no panorama ahead");
+      element("facing").textContent = parts.join(", ");
+    }, 400);
   }
 
   coverage(on) {
     if (on === this.covered) return;
     this.covered = this.map.coverage = on;
     this.cloud.material.uniforms.coverage.value = on;
-    if (this.surface) this.surface.material.uniforms.coverage.value = on;
+    if (this.surface) this.surface.uniforms.coverage.value = on;
     element("coverage").setAttribute("aria-pressed", String(on));
     if (on && this.mode === "inside") this.overview();
     else if (this.mode) this.enter(this.mode);
@@ -334,15 +403,17 @@ class Page {
     this.surfaceShown = on && Boolean(this.surface);
     if (this.surface) this.surface.group.visible = this.surfaceShown;
     this.cloud.group.visible = !this.surfaceShown;
-    if (this.surfaceShown) this.surface.open();
     element("surface").textContent = this.surfaceShown ? "Show points" : "Show surface";
     this.changed();
   }
 
+  /** Show or hide a panel. The focus goes into an opened list, and back to its button when it was in a closed panel. */
   toggle(button, panel) {
-    const hidden = !element(panel).hidden;
-    element(panel).hidden = hidden;
+    const shown = element(panel), hidden = !shown.hidden;
+    if (hidden && shown.contains(document.activeElement)) element(button).focus();
+    shown.hidden = hidden;
     element(button).setAttribute("aria-expanded", String(!hidden));
+    if (!hidden) (shown.querySelector("[aria-current=true]") ?? shown.querySelector("li button:enabled"))?.focus();
   }
 
   theme() {
@@ -355,9 +426,9 @@ class Page {
     for (const panorama of this.panoramas) {
       const row = document.createElement("li"), button = document.createElement("button");
       button.type = "button";
-      button.textContent = panorama.camera.name;
+      button.textContent = panorama.camera.title;
       button.disabled = !panorama.camera.levels;
-      button.addEventListener("click", () => !this.move && this.stepInside(panorama));
+      button.addEventListener("click", () => this.visit(panorama));
       row.append(button);
       element("panoramas").querySelector("ol").append(row);
     }
@@ -370,6 +441,12 @@ class Page {
   }
 
   // --- Drawing ---
+
+  /** Fit the scene into a window of another shape, unless somebody has moved it. */
+  reframe() {
+    this.resize();
+    if (this.mode === "overview" && !this.move && this.opening?.equals(this.eye.position)) this.overview();
+  }
 
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
@@ -386,7 +463,7 @@ class Page {
   frame(now) {
     requestAnimationFrame((next) => this.frame(next));
     if (this.move) this.moved();
-    const pace = this.pace.moving(now) ? this.pace.frame(now) : this.loading ? PACES[3] : this.pace.frame(now);
+    const pace = this.pace.moving(now) ? this.pace.frame(now) : this.cloud.loading ? PACES[3] : this.pace.frame(now);
     if (pace.resolution !== this.resolution || (pace === PACES[0] && this.coarse)) {
       this.coarse = false;
       if (pace.resolution !== this.resolution) {
@@ -395,18 +472,20 @@ class Page {
       }
       this.changed();
     }
-    if (!this.dirty) return;
+    if (!this.dirty || (this.mode === "inside" && !this.here)) return; // or a link leads to a panorama on its way
     this.dirty = false;
     this.coarse = pace !== PACES[0];
     const t = this.move ? Math.min(1, Math.max(0, (now - this.move.began) / this.move.length)) : 1;
     const smooth = t * t * (3 - 2 * t);
     if (this.move || (this.mode === "inside" && this.here)) this.lookFrom(smooth);
     this.draw(smooth, pace);
+    if (!this.firstPicture && this.hasPicture) this.loadRest(now);
     if (this.settled) this.firstComplete ??= performance.now(); // for measurements
     if (this.move && t >= 1) {
       this.move = null;
       if (this.mode !== "inside") this.enter("inside");
       this.placeRings();
+      this.describe();
       this.writeLink();
       this.changed();
     }
@@ -415,6 +494,20 @@ class Page {
   /** Whether everything that the view needs was loaded and drawn. */
   get settled() {
     return !this.dirty && !this.move && !this.wanted && !this.coarse && !this.loading && !this.here?.loading;
+  }
+
+  /** Whether there is something to see of all that the view shows, however coarse. */
+  get hasPicture() {
+    if (this.mode === "inside") return Boolean(this.here?.group.children.length) && !this.move;
+    return this.surfaceShown ? this.surface.ready : this.cloud.begun;
+  }
+
+  /** Load what can wait until after the first picture. */
+  loadRest(now) {
+    this.firstPicture = now;
+    this.map.open();
+    if (this.surfaceShown) this.surface.open(false);
+    this.changed();
   }
 
   /** Whether parts of the scene are on their way. */
@@ -442,17 +535,21 @@ class Page {
     if (this.mode === "inside" || this.move) this.drawPanoramas(t, height, pace);
     else this.drawWorld(height, pace);
     renderer.clearDepth();
-    for (const ring of this.rings) ring.scale.setScalar(camera === this.above ? (0.05 * this.halfHeight) / this.above.zoom : 0.04 * Math.tan(THREE.MathUtils.degToRad(this.eye.fov) / 2));
+    const ahead = this.keys && this.mode === "inside" ? this.ahead() : null;
+    for (const [index, ring] of this.rings.entries()) ring.scale.setScalar((this.panoramas[index] === ahead ? 1.6 : 1) * (camera === this.above ? (0.05 * this.halfHeight) / this.above.zoom : 0.04 * Math.tan(THREE.MathUtils.degToRad(this.eye.fov) / 2)));
     renderer.render(this.marks, camera);
     this.ruler.place(camera, this.canvas.clientWidth, this.canvas.clientHeight);
+    this.rooms.place(this.mode === "inside" || this.move ? null : camera, this.canvas.clientWidth, this.canvas.clientHeight);
     const forward = this.eye.getWorldDirection(new THREE.Vector3());
     this.map.look(this.mode === "plan" ? null : this.eye.position, Math.atan2(forward.x, -forward.z));
   }
 
-  drawWorld(height, pace) {
-    if (this.surfaceShown) this.surface.detail(pace.coarse);
-    else this.cloud.update(this.camera, height, pace.points);
-    this.renderer.render(this.world, this.camera);
+  drawWorld(height, pace, camera = this.camera) {
+    if (this.surfaceShown) {
+      this.surface.open(Boolean(this.firstPicture));
+      this.surface.detail(pace.coarse);
+    } else this.cloud.update(camera, height, pace.points);
+    this.renderer.render(this.world, camera);
   }
 
   drawPanoramas(t, height, pace) {

@@ -12,8 +12,6 @@ const DOUBTFUL = 0.5; // and of parts whose place is doubtful
 
 // Where a quadrilateral is torn, it is drawn at the nearer and at the farther range: `split` is the range between, as
 // a value of the texture of ranges, positive for the part in front of it and negative for the part behind.
-// Where a quadrilateral is torn, it is drawn at the nearer and at the farther range: `split` is the range between, as
-// a value of the texture of ranges, positive for the part in front of it and negative for the part behind.
 const TILE_VERTEX = `
 attribute vec2 whole; attribute float split;
 varying vec2 place; varying vec2 inWhole; varying float limit; varying vec3 inPage;
@@ -282,7 +280,8 @@ class Panorama {
   /** Load the tiles that a view needs, and draw those up to the level that fits. */
   update(camera, height) {
     const pixelsPerTurn = (height / camera.fov) * 360;
-    const wanted = Math.min(this.camera.levels - 1, Math.max(0, Math.ceil(Math.log2(pixelsPerTurn / 1024) - 0.4)));
+    const coarsest = this.camera.width / 2 ** (this.camera.levels - 1); // the width of level 0
+    const wanted = Math.min(this.camera.levels - 1, Math.max(0, Math.ceil(Math.log2(pixelsPerTurn / coarsest) - 0.4)));
     const forward = camera.getWorldDirection(new THREE.Vector3()).transformDirection(this.camFromPage);
     const diagonal = THREE.MathUtils.radToDeg(Math.atan(Math.tan(THREE.MathUtils.degToRad(camera.fov) / 2) * Math.hypot(1, camera.aspect)));
     for (const tile of this.tiles.values()) tile.visible = tile.userData.level <= wanted;

@@ -1,5 +1,5 @@
 "use strict";
-// The surface: a mesh in pieces, with one texture or with coloured vertices.
+// The surface: a mesh in pieces, with one texture or with coloured vertices; before it a coarse one, which arrives sooner.
 
 const SURFACE_VERTEX = `
 #ifdef TEXTURED
@@ -50,34 +50,57 @@ class Surface {
     this.changed = changed;
     this.group = new THREE.Group();
     this.loading = 0;
-    this.opened = null;
+    this.opened = this.refined = null;
     this.ready = false;
-    this.material = new THREE.ShaderMaterial({
-      vertexShader: SURFACE_VERTEX,
-      fragmentShader: SURFACE_FRAGMENT,
-      defines: described.textured ? { TEXTURED: 1 } : {},
-      uniforms: { map: { value: null }, cut: { value: 1e30 }, coverage: { value: false } },
+    this.uniforms = { map: { value: null }, cut: { value: 1e30 }, coverage: { value: false } };
+    [this.colored, this.textured] = [{}, { TEXTURED: 1 }].map((defines) => new THREE.ShaderMaterial({
+      vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, defines, uniforms: this.uniforms,
+    }));
+  }
+
+  /** Load the coarse surface, if there is one, and then or as soon as `whole` is true the whole one. */
+  open(whole) {
+    const { coarse } = this.described;
+    this.opened ??= this.load(async () => {
+      if (coarse.length) this.show(await this.parts("mesh/coarse", coarse, false));
+    });
+    if (whole || !coarse.length) this.refined ??= this.load(() => this.opened.then(() => this.loadWhole()));
+  }
+
+  /** Do what loads, and return a promise that is kept in the end. */
+  load(task) {
+    this.loading++;
+    return task().catch(problem).finally(() => {
+      this.loading--;
+      this.changed();
     });
   }
 
-  /** Load everything; return a promise that is kept when it can be seen. */
-  open() {
-    this.opened ??= this.load().catch(problem);
-    return this.opened;
+  async loadWhole() {
+    const { pieces, textured } = this.described;
+    const texture = textured ? PanoMvs.load("mesh/texture").then((text) => textureOf(text, "the texture")) : null;
+    const parts = await this.parts("mesh", pieces, textured);
+    this.uniforms.map.value = await texture;
+    this.show(parts);
+    this.makeCoarse();
   }
 
-  async load() {
-    this.loading++;
-    const texture = this.described.textured ? PanoMvs.load("mesh/texture").then((text) => textureOf(text, "the texture")) : null;
-    for (let first = 0; first < this.described.pieces.length; first += LOADS_AT_ONCE) {
-      const pieces = this.described.pieces.slice(first, first + LOADS_AT_ONCE);
-      await Promise.all(pieces.map(async (piece, idx) => this.add(piece, await PanoMvs.load(`mesh/${first + idx}`))));
+  /** Load the pieces of a surface, and return them as meshes. */
+  async parts(folder, pieces, textured) {
+    const parts = [];
+    for (let first = 0; first < pieces.length; first += LOADS_AT_ONCE) {
+      const some = pieces.slice(first, first + LOADS_AT_ONCE);
+      parts.push(...await Promise.all(some.map(async (piece, idx) => this.part(piece, await PanoMvs.load(`${folder}/${first + idx}`), textured))));
     }
-    this.material.uniforms.map.value = await texture;
-    this.loading--;
+    return parts;
+  }
+
+  /** Show these meshes instead of earlier ones. */
+  show(parts) {
+    for (const { geometry } of this.group.children) geometry.dispose();
+    this.group.clear();
+    this.group.add(...parts);
     this.ready = true;
-    this.changed();
-    await this.makeCoarse();
   }
 
   /** Compute coarser indices of the same vertices, one piece after the other, so that the page stays responsive. */
@@ -99,7 +122,7 @@ class Surface {
     }
   }
 
-  add(piece, text) {
+  part(piece, text, textured) {
     const bytes = bytesOf(text).buffer, count = piece.vertices;
     const geometry = new THREE.BufferGeometry();
     let offset = 0;
@@ -109,23 +132,23 @@ class Surface {
       return values;
     };
     geometry.setAttribute("position", new THREE.BufferAttribute(next(Uint16Array, 3 * count), 3, true));
-    if (this.described.textured) geometry.setAttribute("uv", new THREE.BufferAttribute(next(Uint16Array, 2 * count), 2, true));
+    if (textured) geometry.setAttribute("uv", new THREE.BufferAttribute(next(Uint16Array, 2 * count), 2, true));
     geometry.setIndex(new THREE.BufferAttribute(next(Uint16Array, 3 * piece.faces), 1));
-    if (!this.described.textured) geometry.setAttribute("color", new THREE.BufferAttribute(next(Uint8Array, 3 * count), 3, true));
+    if (!textured) geometry.setAttribute("color", new THREE.BufferAttribute(next(Uint8Array, 3 * count), 3, true));
     const sigmaSteps = next(Uint8Array, count);
     geometry.setAttribute("views", new THREE.BufferAttribute(next(Uint8Array, count), 1, true));
-    const mesh = new THREE.Mesh(geometry, this.material);
+    const mesh = new THREE.Mesh(geometry, textured ? this.textured : this.colored);
     mesh.position.set(...piece.lower);
     mesh.scale.setScalar(piece.size);
     mesh.updateMatrixWorld(true);
     mesh.userData.sigmaSteps = sigmaSteps;
-    this.group.add(mesh);
+    return mesh;
   }
 
   /** Return the first point of the surface along a ray, and its uncertainty; null if there is none. */
   pick(raycaster) {
     this.detail(false);
-    const hit = raycaster.intersectObjects(this.group.children, false).find((found) => found.point.y <= this.material.uniforms.cut.value);
+    const hit = raycaster.intersectObjects(this.group.children, false).find((found) => found.point.y <= this.uniforms.cut.value);
     if (!hit) return null;
     return { point: hit.point, sigma: valueOfStep(hit.object.userData.sigmaSteps[hit.face.a], this.sigmas, 255), ray: null };
   }
