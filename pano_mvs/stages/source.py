@@ -249,8 +249,8 @@ def list_tour(params: TourParams) -> Iterator[SourceItem]:
     scenes = list_scenes(params.path, notes)
     if len(scenes) < 2:
         raise InputError(f"{params.path}: contains only one scene ({scenes[0].name}); depth needs two or more")
-    links = sum(len(scene.links) for scene in scenes)
-    linked = f"; {links} links between them are hints for the selection of pairs" if links else ""
+    count = sum(len(scene.links) for scene in scenes)
+    linked = f"; {count} links between them are hints for the selection of pairs" if count else ""
     notes.append(f"{len(scenes)} scenes of a virtual tour are read{linked}")
     items = {
         scene.name: f"{scene.name}{'.png' if scene.panorama is None else scene.panorama.suffix}" for scene in scenes

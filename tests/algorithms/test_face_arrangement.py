@@ -30,7 +30,7 @@ def test_any_order_and_quarter_turns_are_undone(seed: int) -> None:
     names = list(CUBE)
     order = ["f", *rng.permutation(names[1:]).tolist()]
     mixed = {name: rendered()[other] for name, other in zip(names, order, strict=True)}
-    turned = {name: np.rot90(face, 0 if name == "f" else rng.integers(4)) for name, face in mixed.items()}
+    turned = {name: np.rot90(face, 0 if name == "f" else int(rng.integers(4))) for name, face in mixed.items()}
     faces, rearranged = arranged_faces(turned)
     assert rearranged
     for name, face in rendered().items():

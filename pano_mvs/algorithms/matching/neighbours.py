@@ -186,9 +186,9 @@ def automatic_pairs(
         left -= nearest
         reasons.append(f"the {nearest.max()} nearest by the positions of {np.count_nonzero(located)}")
     _choose(chosen, left, looks)
-    links = _joined(np.argwhere(np.triu(chosen, 1)), looks)
+    found = _joined(np.argwhere(np.triu(chosen, 1)), looks)
     reasons.append(f"{'the rest' if reasons else f'the {candidates} most similar'} by their key points")
-    return _named(names, {(a, b) for a, b in links.tolist()}), ", ".join(reasons)
+    return _named(names, {(a, b) for a, b in found.tolist()}), ", ".join(reasons)
 
 
 def _linked(names: Sequence[str], links: Mapping[str, Collection[str]]) -> NDArray[np.bool_]:
