@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -370,10 +371,10 @@ def _capture_features(seen: _Seen, state: _State, capture: int) -> Features:
     views = [(capture, lens) for lens in (0, 1)]
     rays = [state.rays(view, seen.pixels[view]) for view in views]
     rays[1] = rays[1] @ state.second_from_first.rotation
-    # Key points beyond the field of view as it is known now have no matches (see `_known`).
+    # Beyond the field of view as it is known now, any direction will do: `_agreeing` drops these matches.
     bearings = np.nan_to_num(np.concatenate(rays), nan=1 / np.sqrt(3))
     features = [seen.features[view] for view in views]
-    joined = {
+    joined: dict[str, Any] = {
         name: np.concatenate([getattr(one, name) for one in features])
         for name in ("descriptors", "sizes_rad", "scores", "colors_rgb")
     }
@@ -475,7 +476,7 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         points /= np.linalg.norm(points, axis=1, keepdims=True)
         used = angle_between(points[tracks.track_idx], in_world) < max(max_error, np.radians(_RIM_THRESHOLD_DEG))
         valid = np.bincount(tracks.track_idx[used], minlength=tracks.count) >= 2
-    number = {capture: idx for idx, capture in enumerate(order)}
+    order_idx = {capture: idx for idx, capture in enumerate(order)}
     bundle = RigBundle(
         lenses=np.array([[lens.focal_xy[0], *lens.principal_xy, *lens.distortion] for lens in state.lenses]),
         turn=state.second_from_first.rotation,
@@ -485,7 +486,7 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         points=points,
         pixels=pixels,
         lens_idx=lens_idx.astype(np.intp),
-        camera_idx=np.array([number[view[0]] for view in views], np.intp)[tracks.image_idx],
+        camera_idx=np.array([order_idx[view[0]] for view in views], np.intp)[tracks.image_idx],
         point_idx=tracks.track_idx.astype(np.intp),
     )
     return bundle.only(used & _some_points(valid)[tracks.track_idx])
