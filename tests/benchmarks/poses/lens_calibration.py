@@ -107,7 +107,8 @@ def raw_picture(
     radius = np.hypot(columns - lens.principal_xy[0] - circle_px[0], rows - lens.principal_xy[1] - circle_px[1]) / reach
     light = np.clip((1 - radius) * reach / 3, 0, 1) * (1 - 0.5 * np.clip(radius, 0, 1) ** 4)
     noisy = picture * light[..., None] + rng.normal(3, 1.5, picture.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    recorded: NDArray[np.uint8] = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return recorded
 
 
 def write_raw_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, rig: LensRig, seed: int = 0) -> None:
