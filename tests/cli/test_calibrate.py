@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.geometry import Rigid3
 from pano_mvs.io.rig_calibration import read_rig
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import write_png
@@ -15,7 +14,6 @@ from tests.benchmarks.poses.lens_calibration import (
     calibration_errors,
     place,
     random_rig,
-    without_offset,
     write_raw_capture,
 )
 from tests.cli.conftest import Command, pano_mvs
@@ -90,19 +88,3 @@ def test_the_lenses_of_a_rendered_camera_are_found(pano_mvs: Command, tmp_path: 
     assert found.metric
     assert found.lens_offset_m == pytest.approx(rig.lens_offset_m)
     assert "the standard deviations cover noise in the key points only" in (tmp_path / "rig.yaml").read_text()
-
-
-@pytest.mark.slow
-def test_pictures_from_one_place_give_the_lenses_without_their_offset(pano_mvs: Command, tmp_path: Path) -> None:
-    rig, (room, poses) = random_rig(6, size_px=320), place("room", 6, 4)
-    turned = [Rigid3.from_center(pose.rotation, poses[0].center) for pose in poses]
-    write_raw_capture(tmp_path, room, turned, rig=without_offset(rig), seed=6)
-    result = pano_mvs("calibrate", tmp_path / "images", "--out", tmp_path / "rig.yaml", "--distance", "30mm")
-    assert result.code == 0, result.text
-    assert "not determined: the offset between the lenses, which is 0 in the file" in result.flat
-    found = read_rig(FilePart(tmp_path / "rig.yaml"))
-    errors = calibration_errors(found, rig)
-    assert errors.ray_deg < 0.05
-    assert errors.turn_deg < 0.1
-    assert not found.metric
-    assert found.lens_offset_m == 0

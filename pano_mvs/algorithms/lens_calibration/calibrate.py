@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,8 +149,7 @@ def calibrate_lenses(
 
     Args:
         load: returns the picture of a view, (H, W, 3) uint8; all pictures of a lens have the same size.
-        count: number of captures. If all are from one place, with the camera turned between them, the offset of the
-            second lens is not determined.
+        count: number of captures, from at least two places.
         field_of_view_deg: about the full angle of the image circles.
         rng: draws samples.
         progress: is called with each step.
@@ -332,7 +332,7 @@ def _placed(
     _, start, features, pairs = max(tried, key=lambda one: one[0])
     poses = solve_scaled_translation(features, pairs, rng=rng)
     if not poses.names:
-        return replace(start, cameras=_turned(pairs))
+        raise _not_connected(pairs)
     group = split_groups(poses)[0]
     cameras = {
         int(name): Rigid3(rotation, translation)
@@ -341,28 +341,17 @@ def _placed(
     return replace(start, cameras=cameras)
 
 
-def _turned(pairs: Mapping[tuple[str, str], TwoView]) -> dict[int, Rigid3]:
-    """Return the poses of captures that were taken from one place, by the rotations of their best pairs."""
-    cameras: dict[int, Rigid3] = {}
-    best = sorted(
-        (pair for pair, view in pairs.items() if view.geometry == "rotation"), key=lambda pair: -len(pairs[pair])
-    )
-    if best:
-        cameras[int(best[0][0])] = Rigid3.identity()
-    for _ in best:
-        for first, second in best:
-            turn = Rigid3(pairs[first, second].rotation, np.zeros(3))
-            if int(first) in cameras and int(second) not in cameras:
-                cameras[int(second)] = turn @ cameras[int(first)]
-            elif int(second) in cameras and int(first) not in cameras:
-                cameras[int(first)] = turn.inverse() @ cameras[int(second)]
-    if not cameras:
-        reasons = "; ".join(sorted({view.reason for view in pairs.values() if view.reason})[:2])
-        raise InputError(
-            f"the pictures could not be connected with each other ({reasons}). Give 6 to 12 pictures of one place with "
-            "texture, taken half a metre to a metre apart, with the camera turned between them"
+def _not_connected(pairs: Mapping[tuple[str, str], TwoView]) -> InputError:
+    if any(view.geometry == "rotation" for view in pairs.values()):
+        return InputError(
+            "all pictures were taken from the same place, which does not determine the lenses. Give pictures from two "
+            "or more places, half a metre or more apart"
         )
-    return cameras
+    reasons = "; ".join(sorted({view.reason for view in pairs.values() if view.reason})[:2])
+    return InputError(
+        f"the pictures could not be connected with each other ({reasons}). Give 6 to 12 pictures of one place with "
+        "texture, taken half a metre to a metre apart, with the camera turned between them"
+    )
 
 
 def _capture_features(seen: _Seen, state: _State, capture: int) -> Features:
@@ -370,10 +359,10 @@ def _capture_features(seen: _Seen, state: _State, capture: int) -> Features:
     views = [(capture, lens) for lens in (0, 1)]
     rays = [state.rays(view, seen.pixels[view]) for view in views]
     rays[1] = rays[1] @ state.second_from_first.rotation
-    # Key points beyond the field of view as it is known now have no matches (see `_known`).
+    # Beyond the field of view as it is known now, any direction will do: `_agreeing` drops these matches.
     bearings = np.nan_to_num(np.concatenate(rays), nan=1 / np.sqrt(3))
     features = [seen.features[view] for view in views]
-    joined = {
+    joined: dict[str, Any] = {
         name: np.concatenate([getattr(one, name) for one in features])
         for name in ("descriptors", "sizes_rad", "scores", "colors_rgb")
     }
@@ -475,7 +464,7 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         points /= np.linalg.norm(points, axis=1, keepdims=True)
         used = angle_between(points[tracks.track_idx], in_world) < max(max_error, np.radians(_RIM_THRESHOLD_DEG))
         valid = np.bincount(tracks.track_idx[used], minlength=tracks.count) >= 2
-    number = {capture: idx for idx, capture in enumerate(order)}
+    order_idx = {capture: idx for idx, capture in enumerate(order)}
     bundle = RigBundle(
         lenses=np.array([[lens.focal_xy[0], *lens.principal_xy, *lens.distortion] for lens in state.lenses]),
         turn=state.second_from_first.rotation,
@@ -485,7 +474,7 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         points=points,
         pixels=pixels,
         lens_idx=lens_idx.astype(np.intp),
-        camera_idx=np.array([number[view[0]] for view in views], np.intp)[tracks.image_idx],
+        camera_idx=np.array([order_idx[view[0]] for view in views], np.intp)[tracks.image_idx],
         point_idx=tracks.track_idx.astype(np.intp),
     )
     return bundle.only(used & _some_points(valid)[tracks.track_idx])

@@ -37,7 +37,7 @@ def true_bundle(seed: int, *, count: int = 6, points: int = 400, noise_px: float
         for lens_idx, lens in enumerate(rig.lenses):
             pixels = lens.pixel_from_ray(second_from_first.apply(in_first) if lens_idx else in_first)
             chosen = np.flatnonzero(np.isfinite(pixels[:, 0]) & (rng.random(points) < 0.6))
-            seen += [(camera, lens_idx, idx, *pixels[idx]) for idx in chosen]
+            seen += [(camera, lens_idx, idx, *pixels[idx]) for idx in chosen.tolist()]
     table = np.array(seen)
     moved = [pose @ world.inverse() for pose in poses]
     bundle = RigBundle(

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.lens_calibration.circles import brightest, find_circle
 
 
-def disc(center_xy: tuple[float, float], radius: float, *, dark: float = 3.0) -> np.ndarray:
+def disc(center_xy: tuple[float, float], radius: float, *, dark: float = 3.0) -> NDArray[np.uint8]:
     rng = np.random.default_rng(0)
     rows, columns = np.mgrid[:400, :420] + 0.5
     away = np.hypot(columns - center_xy[0], rows - center_xy[1])
     light = np.clip(radius - away + 0.5, 0, 1) * (1 - 0.6 * np.clip(away / radius, 0, 1) ** 4)
     texture = rng.uniform(60, 250, (400, 420))
-    return np.clip(np.rint(dark + light * texture), 0, 255).astype(np.uint8)
+    picture: NDArray[np.uint8] = np.clip(np.rint(dark + light * texture), 0, 255).astype(np.uint8)
+    return picture
 
 
 @pytest.mark.parametrize(

@@ -70,10 +70,8 @@ def test_an_assumed_distance_helps_but_gives_no_metres(metric: bool) -> None:
 
 def test_lenses_in_one_place_are_a_central_camera() -> None:
     capture = rig_capture()
-    rigs = {
-        name: replace(rig, lens_from_rig=tuple(Rigid3(pose.rotation, np.zeros(3)) for pose in rig.lens_from_rig))
-        for name, rig in capture.rigs.items()
-    }
+    first, second = (Rigid3(pose.rotation, np.zeros(3)) for pose in capture.rig.lens_from_rig)
+    rigs = {name: replace(rig, lens_from_rig=(first, second)) for name, rig in capture.rigs.items()}
     known, central = refine_poses(capture.poses, rigs=rigs), refine_poses(capture.poses)
     assert np.array_equal(known.centers, central.centers)
     assert not known.metric

@@ -107,7 +107,8 @@ def raw_picture(
     radius = np.hypot(columns - lens.principal_xy[0] - circle_px[0], rows - lens.principal_xy[1] - circle_px[1]) / reach
     light = np.clip((1 - radius) * reach / 3, 0, 1) * (1 - 0.5 * np.clip(radius, 0, 1) ** 4)
     noisy = picture * light[..., None] + rng.normal(3, 1.5, picture.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    recorded: NDArray[np.uint8] = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return recorded
 
 
 def write_raw_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, rig: LensRig, seed: int = 0) -> None:
@@ -203,8 +204,19 @@ class CaptureErrors:
     within_5_percent: float
 
 
-def capture_errors(folder: Path, rig: LensRig, room: Room, true: Sequence[Rigid3], *, width: int) -> CaptureErrors:
-    """Return the errors of a capture that is stitched with a rig, at 3 m, or at infinity if it has no offset."""
+def capture_errors(
+    folder: Path, rig: LensRig, room: Room, *, true: Sequence[Rigid3], width: int, references: int = 3
+) -> CaptureErrors:
+    """Return the errors of a capture that is stitched with a rig, at 3 m, or at infinity if it has no offset.
+
+    Args:
+        folder: with the pictures in images/.
+        rig: how they are stitched.
+        room: the place.
+        true: true pose of each capture.
+        width: of the panoramas.
+        references: number of panoramas whose ranges are compared.
+    """
     has_offset = rig.lens_offset_m > 0
     rig = replace(rig, stitch_distance_m=3.0 if has_offset else np.inf)
     panoramas, masks = {}, {}
@@ -231,7 +243,7 @@ def capture_errors(folder: Path, rig: LensRig, room: Room, true: Sequence[Rigid3
     off = np.linalg.norm(fit.apply(poses.centers) - centers, axis=1)
     relative = []
     small = {name: cv2.resize(panoramas[name], (512, 256), interpolation=cv2.INTER_AREA) for name in poses.names}
-    for reference in poses.names[:3]:
+    for reference in poses.names[:references]:
         truth = render(room, known[reference], (256, 512), supersample=1)[1]
         near, far = np.nanpercentile(truth, [0.5, 99.5]) / fit.scale
         cameras = cameras_of(poses)
@@ -285,4 +297,4 @@ def main(
         width = round(2 * np.pi * max(lens.focal_xy[0] for lens in rig.lenses)) // 4 * 4
         cases = {"true": rig, "found": found, "factory": without_offset(rig), "nominal": nominal(rig)}
         for label, one in cases.items():
-            print(label, capture_errors(here, one, room, poses, width=width), flush=True)
+            print(label, capture_errors(here, one, room, true=poses, width=width), flush=True)
