@@ -136,7 +136,8 @@ def outline(points: NDArray[np.float32]) -> list[list[float]]:
         return []
     along = sampled @ spiral_rays(64).T
     outer = round(0.995 * (len(sampled) - 1))
-    return np.unique(sampled[np.argpartition(along, outer, axis=0)[outer]], axis=0).tolist()
+    outermost: list[list[float]] = np.unique(sampled[np.argpartition(along, outer, axis=0)[outer]], axis=0).tolist()
+    return outermost
 
 
 def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_quality: int) -> dict[str, Any]:

@@ -32,7 +32,8 @@ def sight(center: tuple[float, float, float], turned: float) -> Sight:
 
 def _to_walls(origin: np.ndarray, rays: np.ndarray, side: float) -> np.ndarray:
     low, high = np.array([min(0, 4 * side), -1.5, -2.5]), np.array([max(0, 4 * side), 1.5, 2.5])
-    return np.min(np.where(rays > 0, high - origin, low - origin) / rays, axis=-1, where=rays != 0, initial=np.inf)
+    distances = np.where(rays > 0, high - origin, low - origin) / rays
+    return np.asarray(np.min(distances, axis=-1, where=rays != 0, initial=np.inf))
 
 
 CENTERS = [(-1.0, 0, 0), (1.2, 0.1, -1), (-3.0, 0.1, 1.5), (3.0, 0, 2), (-2.5, 0, -1.8), (2.2, 0, 0)]

@@ -230,8 +230,8 @@ def test_points_of_an_e57_file_lie_on_their_pixels_as_the_standard_defines_them(
         azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
         x_image = width / 2 - azimuth / sphere["pixelWidth"].value()
         y_image = height / 2 - elevation / sphere["pixelHeight"].value()
-        picture = cv2.imdecode(blob(sphere["jpegImage"]), cv2.IMREAD_COLOR)[..., ::-1]
-        mask = cv2.imdecode(blob(sphere["imageMask"]), cv2.IMREAD_GRAYSCALE)
+        picture = np.asarray(cv2.imdecode(blob(sphere["jpegImage"]), cv2.IMREAD_COLOR))[..., ::-1]
+        mask = np.asarray(cv2.imdecode(blob(sphere["imageMask"]), cv2.IMREAD_GRAYSCALE))
     assert picture.shape == (height, width, 3) == CAPTURE.pictures[idx].shape
     np.testing.assert_array_equal(mask > 0, CAPTURE.images[CAPTURE.names[idx]].load_mask())
     size_hw = (height, width)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import signal
@@ -156,7 +157,7 @@ def test_answers_to_other_requests_are_ignored(tmp_path: Path) -> None:
     ):
         lines.put(line)
     worker._lines = lines
-    found = worker._listen(process, {"nonce": "new", "key": "k"}, None)
+    found = worker._listen(process, {"nonce": "new", "key": "k"}, math.inf)
     process.wait()
     assert found is not None
     assert found.cause == "mine"
