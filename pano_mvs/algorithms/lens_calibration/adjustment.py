@@ -75,12 +75,10 @@ class Freedom:
         sigmas: (20,) standard deviations of f, cx, cy and k1 to k4 of both lenses, the rotation (radians) and the
             offset of the second lens about their start values; 0 holds a value, inf leaves it free.
         start: (20,) the start values; those of the rotation are 0.
-        moving: whether the centres of the cameras are adjusted. If they are held in one place, points are directions.
     """
 
     sigmas: FloatArray
     start: FloatArray
-    moving: bool = True
 
 
 def residuals_px(bundle: RigBundle) -> FloatArray:
@@ -153,8 +151,6 @@ class _System:
         held = np.zeros(size, np.bool_)
         held[: len(freedom.sigmas)] = freedom.sigmas == 0
         held[CAMERAS : CAMERAS + 6] = True
-        if not freedom.moving:
-            held[CAMERAS:].reshape(-1, 6)[:, 3:] = True
         self._free = ~held
 
     def _add_prior(self, bundle: RigBundle, freedom: Freedom, turned: FloatArray) -> None:

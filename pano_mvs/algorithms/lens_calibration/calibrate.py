@@ -122,11 +122,6 @@ class _State:
     second_from_first: Rigid3
     cameras: Mapping[int, Rigid3]
 
-    @property
-    def is_moving(self) -> bool:
-        """Whether the cameras are in more than one place."""
-        return any(pose.translation.any() for pose in self.cameras.values())
-
     def rays(self, view: View, pixels: FloatArray) -> FloatArray:
         """Return the rays of pixels (K, 2) in the frame of the view's lens, (K, 3)."""
         return self.lenses[view[1]].ray_from_pixel(pixels)
@@ -447,23 +442,14 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
     )
     rotations = np.array([pose.rotation for pose in lens_from_world])
     in_world = np.einsum("nji,nj->ni", rotations[tracks.image_idx], rays)
-    max_error = float(np.radians(max_error_deg))
-    if state.is_moving:
-        centers = np.array([pose.center for pose in lens_from_world])[tracks.image_idx]
-        found = triangulate_observations(
-            centers,
-            in_world,
-            tracks.track_idx,
-            count=tracks.count,
-            max_error_rad=max_error,
-            min_angle_rad=float(np.radians(_MIN_ANGLE_DEG)),
-        )
-        points, valid, used = found.points_in_world, found.valid, found.used
-    else:
-        points = np.stack([np.bincount(tracks.track_idx, axis, tracks.count) for axis in in_world.T], axis=1)
-        points /= np.linalg.norm(points, axis=1, keepdims=True)
-        used = angle_between(points[tracks.track_idx], in_world) < max(max_error, np.radians(_RIM_THRESHOLD_DEG))
-        valid = np.bincount(tracks.track_idx[used], minlength=tracks.count) >= 2
+    found = triangulate_observations(
+        np.array([pose.center for pose in lens_from_world])[tracks.image_idx],
+        in_world,
+        tracks.track_idx,
+        count=tracks.count,
+        max_error_rad=float(np.radians(max_error_deg)),
+        min_angle_rad=float(np.radians(_MIN_ANGLE_DEG)),
+    )
     order_idx = {capture: idx for idx, capture in enumerate(order)}
     bundle = RigBundle(
         lenses=np.array([[lens.focal_xy[0], *lens.principal_xy, *lens.distortion] for lens in state.lenses]),
@@ -471,13 +457,13 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         offset=state.second_from_first.translation,
         rotations=np.array([pose.rotation for pose in poses]),
         translations=np.array([pose.translation for pose in poses]),
-        points=points,
+        points=found.points_in_world,
         pixels=pixels,
         lens_idx=lens_idx.astype(np.intp),
         camera_idx=np.array([order_idx[view[0]] for view in views], np.intp)[tracks.image_idx],
         point_idx=tracks.track_idx.astype(np.intp),
     )
-    return bundle.only(used & _some_points(valid)[tracks.track_idx])
+    return bundle.only(found.used & _some_points(found.valid)[tracks.track_idx])
 
 
 def _some_points(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
