@@ -84,7 +84,7 @@ def placed_by_creases(
         if idx in clear
         else plane
         for idx, plane in enumerate(planes)
-        if plane.support or idx in clear
+        if plane.is_level or plane.support or idx in clear
     ]
 
 

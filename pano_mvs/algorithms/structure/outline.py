@@ -44,6 +44,9 @@ _TURNS_RAD, _FINE_TURNS_RAD = np.radians(np.arange(0.0, 90.0, 3.0)), np.radians(
 # The turn is searched at every fourth azimuth of some views, with planes that are clear over 36°.
 _TURN_VIEWS, _TURN_STEP, _TURN_SPAN = 6, 4, 9
 _LEAST_MARGIN, _MOST_ROOMS, _NEARLY = 0.1, 6, 0.95
+# Heights of a ceiling above the cameras that are tried, in heights of the camera above the floor.
+_CEILINGS = np.geomspace(0.3, 1.6, 36)
+_ROOF_COSINE = 0.7  # of the angle to the zenith
 _SAME_RAD, _SAME_DISTANCE = np.radians(4.0), 0.05
 OUTLINE_UNCERTAINTY = 0.03
 """Relative standard deviation of ranges on a wall that creases of single views alone show."""
@@ -155,17 +158,40 @@ def room_labels(room: Room, rays: FloatArray, ranges: Sequence[FloatArray]) -> L
     return np.where(wall >= 0, label, -1)
 
 
+def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
+    """Return a ceiling at the height at which creases of all views are clearest; none if one is known, or no floor is.
+
+    A room and a lower, narrower one look much the same in one view, but not in several. `views`: those with sky above
+    are ignored. `planes`: the level planes of the views.
+    """
+    lowest = max((view.cam_from_world.center[1] for view in views), default=0.0)
+    floors = [plane for plane in planes if plane.normal[1] < 0 and plane.y > lowest]
+    roofed = [view for view in views if _is_roofed(view)]
+    if not floors or not roofed or any(_rooms(planes, view.cam_from_world.center) for view in views):
+        return []
+    floor = max(floors, key=lambda plane: plane.support)
+    middle = float(np.mean([view.cam_from_world.center[1] for view in roofed]))
+    tried = [
+        [floor, ScenePlane(-floor.normal, y, 0.0, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=True)]
+        for y in middle - (floor.y - middle) * _CEILINGS
+    ]
+    drawn = _coarsely(roofed, tried[len(tried) // 2])
+    turn = _turn(drawn, tried[len(tried) // 2])
+    return [max(tried, key=lambda planes: _total(drawn, planes, turn))[1]]
+
+
+def _is_roofed(view: PlaneView) -> bool:
+    """Return whether most of the sphere around the zenith has a range."""
+    above = view.rays[..., 1] < -_ROOF_COSINE
+    return bool(view.area[above & np.isfinite(view.ranges)].sum() > view.area[above].sum() / 2)
+
+
 def outline_planes(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
     """Return upright planes that outlines show and that are not among `planes`, which have the level ones."""
     indoors = [view for view in views if _rooms(planes, view.cam_from_world.center)]
     if not indoors:
         return []
-    drawn = []
-    for view in indoors[:: -(-len(indoors) // _TURN_VIEWS)]:
-        one = _around(view, planes)
-        drawn.append(one._replace(sky=Skyline(one.sky.differences[:, ::_TURN_STEP], half_window=1)))
-    turn = max(_TURNS_RAD, key=lambda turn: _total(drawn, planes, turn))
-    turn += max(_FINE_TURNS_RAD, key=lambda more: _total(drawn, planes, turn + more))
+    turn = _turn(_coarsely(indoors, planes), planes)
     walls = [wall for view in indoors for wall in _walls_of(_around(view, planes), planes, turn)]
     found: list[ScenePlane] = []
     for _, wall, center in sorted(walls, key=lambda wall: -wall[0]):
@@ -211,6 +237,18 @@ def _clearest(tried: Sequence[_Tried]) -> _Tried:
     """
     totals = [float(np.maximum(clarity.max(axis=0), 0).sum()) for _, _, clarity in tried]
     return next(found for found, total in zip(tried, totals, strict=True) if total >= _NEARLY * max(totals))
+
+
+def _coarsely(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[_Around]:
+    """Return some views at a quarter of the azimuths."""
+    around = [_around(view, planes) for view in views[:: -(-len(views) // _TURN_VIEWS)]]
+    return [one._replace(sky=Skyline(one.sky.differences[:, ::_TURN_STEP], half_window=1)) for one in around]
+
+
+def _turn(around: Sequence[_Around], planes: Sequence[ScenePlane]) -> float:
+    """Return the turn of the four directions whose walls are clearest around some views."""
+    turn = max(_TURNS_RAD, key=lambda turn: _total(around, planes, turn))
+    return float(turn + max(_FINE_TURNS_RAD, key=lambda more: _total(around, planes, turn + more)))
 
 
 def _total(around: Sequence[_Around], planes: Sequence[ScenePlane], turn: float) -> float:

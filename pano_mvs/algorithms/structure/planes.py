@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.creases import placed_by_creases
-from pano_mvs.algorithms.structure.outline import outline_planes, same_wall
+from pano_mvs.algorithms.structure.outline import outline_planes, same_wall, supposed_ceiling
 from pano_mvs.algorithms.structure.view import (
     PLAIN_WEIGHT,
     FloatArray,
@@ -61,6 +61,7 @@ def find_planes(
         for normal in (_UP, -_UP)
         for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
     ]
+    planes += supposed_ceiling(views, planes)
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
     planes += outline_planes(views, planes)
     placed = placed_by_creases(views, planes, max_relative_error=max_relative_error)
