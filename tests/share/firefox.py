@@ -45,7 +45,8 @@ class Firefox(Browser):
         self._count = 0
         self._messages: list[str] = []
         self._call("session.new", capabilities={})
-        self._context = self._call("browsingContext.getTree")["contexts"][0]["context"]
+        # The first tab has the focus in the address bar, and in a page without focus Enter presses no button.
+        self._context = self._call("browsingContext.create", type="tab")["context"]
         self._call("session.subscribe", events=["log.entryAdded"])
 
     def open(self, address: str) -> None:
