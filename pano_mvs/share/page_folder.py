@@ -29,6 +29,7 @@ SCRIPTS = (
     "map.js",
     "link.js",
     "rooms.js",
+    "headset.js",
     "input.js",
     "page.js",
 )

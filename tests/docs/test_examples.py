@@ -30,7 +30,7 @@ from tests.io.images.videos import tiny_video
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-NO_WORKFLOW = ("<!-- variants -->\n", "<!-- calibration -->\n", "<!-- queue -->\n")
+NO_WORKFLOW = ("<!-- variants -->\n", "<!-- calibration -->\n", "<!-- queue -->\n", "<!-- rooms -->\n")
 # What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
     "phone",

@@ -33,6 +33,10 @@ class Browser(ABC):
         """Set the size of the area that shows the page."""
 
     @abstractmethod
+    def prelude(self, script: str) -> Callable[[], None]:
+        """Run a script in each page before its own ones; return a function that ends this."""
+
+    @abstractmethod
     def evaluate(self, script: str) -> Any:
         """Return the value of a JavaScript expression in the page; of a promise, what it resolves to."""
 

@@ -7,8 +7,9 @@ import json
 import subprocess
 import time
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -52,6 +53,11 @@ class Chromium(Browser):
         self.command(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
         )
+
+    def prelude(self, script: str) -> Callable[[], None]:
+        """Run a script in each page before its own ones."""
+        added = self.command("Page.addScriptToEvaluateOnNewDocument", source=script)
+        return partial(self.command, "Page.removeScriptToEvaluateOnNewDocument", **added)
 
     def throttle(self, *, bits_per_s: float, latency_ms: float) -> None:
         """Let all that arrives take as long as over a slow line; with an empty cache."""

@@ -6,8 +6,9 @@ import base64
 import json
 import os
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -45,7 +46,8 @@ class Firefox(Browser):
         self._count = 0
         self._messages: list[str] = []
         self._call("session.new", capabilities={})
-        self._context = self._call("browsingContext.getTree")["contexts"][0]["context"]
+        # The first tab has the focus in the address bar, and in a page without focus Enter presses no button.
+        self._context = self._call("browsingContext.create", type="tab")["context"]
         self._call("session.subscribe", events=["log.entryAdded"])
 
     def open(self, address: str) -> None:
@@ -56,6 +58,11 @@ class Firefox(Browser):
         """Set the size of the area that shows the page."""
         viewport = {"width": width, "height": height}
         self._call("browsingContext.setViewport", context=self._context, viewport=viewport, devicePixelRatio=1)
+
+    def prelude(self, script: str) -> Callable[[], None]:
+        """Run a script in each page before its own ones."""
+        added = self._call("script.addPreloadScript", functionDeclaration=f"() => {{ {script} }}")
+        return partial(self._call, "script.removePreloadScript", **added)
 
     def evaluate(self, script: str) -> Any:
         """Return the value of a JavaScript expression in the page."""

@@ -440,7 +440,7 @@ def test_everything_can_be_reached_on_small_and_large_windows(browser: Browser, 
     browser.resize(width, height)
     browser.wait(f"Math.abs(PanoMvs.page.eye.aspect - {width / height}) < 0.001")
     settle(browser)
-    shown = "[...document.querySelectorAll('#tools button')]"
+    shown = "[...document.querySelectorAll('#tools button:not([hidden])')]"
     boxes = f"{shown}.map((button) => button.getBoundingClientRect().toJSON())"
     buttons = browser.evaluate(boxes)
     assert len(buttons) == TOOLS

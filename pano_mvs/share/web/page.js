@@ -58,6 +58,7 @@ class Page {
     this.glide.screenSpacePanning = true;
     this.map = new PlanMap(scene.maps, this.panoramas, (panorama) => this.visit(panorama));
     this.rooms = new Rooms(this.panoramas);
+    this.headset = new Headset(this);
     this.prepare();
     this.resize();
     if (!location.hash || !followLink(this, location.hash)) this.overview();
@@ -449,6 +450,7 @@ class Page {
   }
 
   resize() {
+    if (this.renderer.xr.isPresenting) return; // the headset has its own size
     const { clientWidth: width, clientHeight: height } = this.canvas;
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.resolution);
     this.renderer.setSize(width, height, false);
@@ -462,6 +464,7 @@ class Page {
 
   frame(now) {
     requestAnimationFrame((next) => this.frame(next));
+    if (this.headset.session) return; // it draws itself
     if (this.move) this.moved();
     const pace = this.pace.moving(now) ? this.pace.frame(now) : this.cloud.loading ? PACES[3] : this.pace.frame(now);
     if (pace.resolution !== this.resolution || (pace === PACES[0] && this.coarse)) {
