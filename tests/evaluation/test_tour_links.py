@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,20 @@ from tests.evaluation.test_placements import poses_of
 
 
 def test_links_are_read_from_the_scenes_of_a_tour(tmp_path: Path) -> None:
+    levels = [{"size": 16, "tileSize": 16}]
+    link = {"yaw": 0.5, "pitch": 0.1, "target": "1-room"}
     scenes = [
-        {"id": "0-hall", "linkHotspots": [{"yaw": 0.5, "pitch": 0.1, "target": "1-room"}]},
-        {"id": "1-room", "linkHotspots": []},
+        {"id": "0-hall", "name": "Hall", "levels": levels, "linkHotspots": [link]},
+        {"id": "1-room", "name": "Room", "levels": levels, "linkHotspots": []},
     ]
-    (tmp_path / "app-files").mkdir()
+    for scene, face in product(("0-hall", "1-room"), "frblud"):
+        tile = tmp_path / f"app-files/tiles/{scene}/0/{face}/0/0.jpg"
+        tile.parent.mkdir(parents=True)
+        tile.touch()
     (tmp_path / "app-files/data.js").write_text(f"var APP_DATA = {json.dumps({'scenes': scenes})};\n")
-    assert read_links(tmp_path) == (2, {("0-hall", "1-room"): 0.5})
+    assert read_links(tmp_path) == (2, {("Hall", "Room"): 0.5})
     with pytest.raises(SystemExit, match=r"no data\.js"):
-        read_links(tmp_path / "nothing")
+        read_links(tmp_path / "app-files/tiles")
 
 
 def test_a_link_is_off_by_the_angle_to_the_other_camera() -> None:

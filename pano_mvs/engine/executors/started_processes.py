@@ -13,6 +13,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from pano_mvs.core.paths import children
+
 MARK = "PANO_MVS_WORKER"
 """Environment variable of a worker and of what it starts, whose value no other worker has."""
 
@@ -55,7 +57,7 @@ def _started(worker: int, mark: str) -> set[int]:
     """Return the processes below a worker, and those that bear its mark."""
     parents: dict[int, int] = {}
     found = {worker}
-    for folder in Path("/proc").glob("[0-9]*"):
+    for folder in children(Path("/proc"), "[0-9]*"):
         with suppress(OSError):  # it has ended, or belongs to another user
             parents[int(folder.name)] = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
             if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
