@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.share.share import ShareOptions, share_run
+from pano_mvs.share import ShareOptions, share_run
 from tests.foreign import npm_packages
 from tests.share.box_run import box_run, frame_of_page, wall_color, wall_range
 from tests.share.browser import Browser, open_browser
@@ -105,7 +105,7 @@ def push(browser: Browser, x: float, y: float) -> None:
 def head(browser: Browser) -> np.ndarray:
     """Return the place between the eyes."""
     places = "PanoMvs.page.renderer.xr.getCamera().cameras.map(({matrixWorld}) => matrixWorld.elements.slice(12, 15))"
-    return np.mean(browser.evaluate(places), axis=0)
+    return np.asarray(np.mean(browser.evaluate(places), axis=0))
 
 
 def heading(browser: Browser) -> np.ndarray:
