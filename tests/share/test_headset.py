@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.share.share import ShareOptions, share_run
+from pano_mvs.share import ShareOptions, share_run
 from tests.foreign import npm_packages
 from tests.share.box_run import box_run, frame_of_page, wall_color, wall_range
 from tests.share.browser import Browser, open_browser
@@ -44,18 +44,22 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def headset(window: Browser, page: Path, emulator: str) -> Iterator[Browser]:
     """The page in a headset, which looks from the first panorama in the direction of the second one."""
-    end = window.prelude(emulator)
-    show(window, page.as_uri())
-    end()
-    window.wait("!document.getElementById('headset').hidden")
-    window.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[0], true)")
-    window.evaluate(f"(PanoMvs.page.look.yaw = {yaw_to_second(window)}, 0)")
-    window.wait("PanoMvs.page.settled")
-    window.evaluate("document.getElementById('headset').click()")
-    window.wait("PanoMvs.page.renderer.xr.isPresenting")
-    settle(window)
+    put_on(window, page, emulator)
     yield window
     assert window.console() == []
+
+
+def put_on(browser: Browser, page: Path, emulator: str) -> None:
+    end = browser.prelude(emulator)
+    show(browser, page.as_uri())
+    end()
+    browser.wait("!document.getElementById('headset').hidden")
+    browser.evaluate("PanoMvs.page.stepInside(PanoMvs.page.panoramas[0], true)")
+    browser.evaluate(f"(PanoMvs.page.look.yaw = {yaw_to_second(browser)}, 0)")
+    browser.wait("PanoMvs.page.settled")
+    browser.evaluate("document.getElementById('headset').click()")
+    browser.wait("PanoMvs.page.renderer.xr.isPresenting")
+    settle(browser)
 
 
 def show(browser: Browser, address: str) -> None:
@@ -101,7 +105,7 @@ def push(browser: Browser, x: float, y: float) -> None:
 def head(browser: Browser) -> np.ndarray:
     """Return the place between the eyes."""
     places = "PanoMvs.page.renderer.xr.getCamera().cameras.map(({matrixWorld}) => matrixWorld.elements.slice(12, 15))"
-    return np.mean(browser.evaluate(places), axis=0)
+    return np.asarray(np.mean(browser.evaluate(places), axis=0))
 
 
 def heading(browser: Browser) -> np.ndarray:
@@ -157,6 +161,21 @@ def test_the_thumb_stick_turns_by_30_degrees_for_each_push(headset: Browser) -> 
     assert np.cross(before, after)[1] < 0  # to the right
     push(headset, -1, 0)
     assert heading(headset) == pytest.approx(before, abs=1e-4)
+
+
+def test_without_metres_a_camera_stands_as_high_as_a_person_sees(
+    window: Browser, emulator: str, tmp_path: Path
+) -> None:
+    shared = share_run(box_run(tmp_path, metric=False), tmp_path / "page", ShareOptions(title="Lobby"))
+    put_on(window, shared.page, emulator)
+    before, world = head(window), frame_of_page().inverse()
+    assert before == pytest.approx(center_of(window, 0), abs=1e-3)
+    window.evaluate("(emulated.position.y -= 1.6, 0)")  # down to the floor
+    settle(window)
+    down = world.rotation @ np.array([0.0, -1.0, 0.0])
+    height = float(wall_range(world.apply(before), down))
+    assert head(window) == pytest.approx(before - [0, height, 0], rel=0.02, abs=1e-3)
+    assert window.console() == []
 
 
 def test_the_page_is_as_before_once_the_headset_is_taken_off(headset: Browser, page: Path) -> None:
