@@ -35,7 +35,7 @@ class TilesetWriter:
     """
 
     def __init__(self, folder: Path, cloud: PointCloud, file_from_world: FloatArray, *, tile_points: int) -> None:
-        """Take the folder to write to, the cloud, the rotation (3, 3) into axes with z up, and `node_points`."""
+        """Take the folder to write to, the cloud, the rotation (3, 3) into axes with z up, and the points of a tile."""
         self._folder = folder
         self._cloud = cloud
         self._tile_points = tile_points

@@ -118,12 +118,14 @@ def _stereo_layout(path: Path, size_hw: tuple[int, int]) -> StereoLayout:
 def _movie_header(path: Path) -> bytes:
     """Return the box `moov` of an MP4 file, in which its metadata are; nothing for other files."""
     with path.open("rb") as file:
+        length = file.seek(0, os.SEEK_END)
+        file.seek(0)
         while len(head := file.read(16)) == 16:
             size, kind = int.from_bytes(head[:4], "big"), head[4:8]
             size = int.from_bytes(head[8:], "big") if size == 1 else size
             if kind == b"moov":
                 return head + file.read(min(size, _MAX_HEADER_BYTES))
-            if size < 8:
+            if not 8 <= size <= length:  # it ends with the file, or is damaged
                 break
             file.seek(size - 16, os.SEEK_CUR)
     return b""

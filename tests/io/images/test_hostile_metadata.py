@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.metadata import focal_from_exif, orientation_from_exif, position_from_exif, read_container
-from pano_mvs.io.images.video import describe_video, frames_between
+from pano_mvs.io.images.video import _movie_header, describe_video, frames_between
 from pano_mvs.scene.image_file import MAX_PIXELS
 from tests.io.images.pictures import app1, exif, full_sphere, picture, png_chunk, xmp
 
@@ -216,3 +216,11 @@ def test_any_boxes_of_a_video_are_read(changes: list[tuple[int, int, int, int]])
                 assert frame.size <= 3 * MAX_PIXELS
         except InputError as error:
             assert str(path) in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("size", [0, 15, 2**40, 2**64 - 1])
+def test_a_box_may_state_any_size(tmp_path: Path, size: int) -> None:
+    """The position behind it may be none that a file can have."""
+    path = tmp_path / "video.mp4"
+    path.write_bytes(b"\0\0\0\1free" + size.to_bytes(8, "big") + bytes(64))
+    assert _movie_header(path) == b""
