@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,17 @@ def test_each_layout_gives_the_same_panoramas_with_their_rig(tmp_path: Path, lay
     assert again.rig is not None
     assert again.rig.to_values() == panorama.rig.to_values()
     assert (again.second_lens is None) == (layout == "side_by_side")
+
+
+def test_files_of_insta360_cameras_are_jpeg(tmp_path: Path) -> None:
+    shutil.copytree(tiny_rig_capture(), tmp_path, dirs_exist_ok=True)
+    for path in sorted((tmp_path / "images").iterdir()):
+        path.with_suffix(".insp").write_bytes(
+            cv2.imencode(".jpg", cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, 99])[1]
+        )
+        path.unlink()
+    panorama = stitched(params(tmp_path), tmp_path)["000.png"]
+    assert np.abs(panorama.load().astype(int) - tiny_rig_panorama().load()).mean() < 3
 
 
 def test_the_panorama_shows_the_room(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".insp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
-_OTHER_PICTURES = frozenset({".bmp", ".dng", ".gif", ".insp", ".jp2", ".jxl", ".psd"})
+_OTHER_PICTURES = frozenset({".bmp", ".dng", ".gif", ".jp2", ".jxl", ".psd"})
 _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = (
     "an EXIF orientation that rotates or mirrors them, which was ignored: the pixels of a panorama are used as "

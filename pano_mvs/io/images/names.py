@@ -12,7 +12,7 @@ from pano_mvs.core.paths import below, children, is_file, is_folder
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES
 
 _SEPARATOR = "|"  # between the two names of a pair
-_EXTENSIONS = PICTURE_SUFFIXES | {".bmp", ".dng", ".exr", ".insp", ".npy", ".npz"}
+_EXTENSIONS = PICTURE_SUFFIXES | {".bmp", ".dng", ".exr", ".npy", ".npz"}
 
 
 def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
