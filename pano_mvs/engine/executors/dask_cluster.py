@@ -19,7 +19,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from tempfile import gettempdir
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -332,7 +331,10 @@ def _own_version() -> str:
 
 
 def _new_worker(threads: int) -> WorkerProcess:
-    return WorkerProcess(threads, Path(gettempdir()) / f"pano-mvs-worker-{os.getpid()}-{uuid.uuid4().hex}.txt")
+    """Return a worker process whose messages lie in the folder of the dask worker, which dask removes after a crash."""
+    from distributed import get_worker
+
+    return WorkerProcess(threads, Path(get_worker().local_directory) / f"pano-mvs-{uuid.uuid4().hex}.txt")
 
 
 def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
