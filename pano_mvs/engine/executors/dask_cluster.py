@@ -65,13 +65,13 @@ class DaskExecutor:
             _check_address(scheduler)
             self._connect(store, scheduler)
         else:
-            # Threads suffice for dask workers, because each starts one of our worker processes.
-            self._connect(
-                store,
-                distributed.LocalCluster(
+            # Threads suffice for dask workers, because each starts one of our worker processes. They cannot be lost,
+            # but after minutes of sleep dask takes them for lost, and nothing would start them again.
+            with importlib.import_module("dask").config.set({"distributed.scheduler.worker-ttl": None}):
+                cluster = distributed.LocalCluster(
                     n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
-                ),
-            )
+                )
+            self._connect(store, cluster)
         try:
             places, share, cores = self._check_workers()
         except UsageError:

@@ -175,3 +175,13 @@ def test_scheduler_that_does_not_answer_is_a_usage_error(tmp_path: Path, monkeyp
     monkeypatch.setattr(dask_cluster, "_CONNECT_S", 1.0)
     with pytest.raises(UsageError, match="does not answer"):
         DaskExecutor(Store(tmp_path), scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_cluster_of_the_run_outlasts_sleep(tmp_path: Path) -> None:
+    """After minutes without heartbeats, dask removes workers, and nothing would start that of our process again."""
+    executor = DaskExecutor(Store(tmp_path))
+    try:
+        assert executor._cluster is not None
+        assert executor._cluster.scheduler.worker_ttl is None
+    finally:
+        executor.close()
