@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.mesh import atlas as atlas_module
 from pano_mvs.algorithms.mesh.atlas import Atlas, texels_of, unwrapped
 from pano_mvs.algorithms.mesh.texture import TexturedMesh, balanced_views, textured
 from pano_mvs.algorithms.mesh.view_quality import PaintView
@@ -143,14 +144,18 @@ def test_gaps_between_charts_continue_the_charts() -> None:
     assert {tuple(color) for color in mesh.texture.reshape(-1, 3).tolist()} == known
 
 
-def test_the_atlas_keeps_the_triangles_and_its_limit() -> None:
+@pytest.mark.parametrize("triangles_of_part", [50, 1000])
+def test_the_atlas_keeps_the_triangles_and_its_limit(monkeypatch: pytest.MonkeyPatch, triangles_of_part: int) -> None:
+    monkeypatch.setattr(atlas_module, "_TRIANGLES_OF_PART", triangles_of_part)
     vertices, faces, _ = capture([]).surface
+    assert len(faces) > 150
     atlas = unwrapped(vertices, faces, texels_per_unit=1e4, max_px=100)
     assert max(atlas.size_hw) <= 100
     np.testing.assert_array_equal(atlas.vertex[atlas.faces], faces)
     assert atlas.uv.min() >= 0
     assert atlas.uv.max() <= 1
     assert isinstance(atlas, Atlas)
+    assert set(texels_of(atlas).triangle) == set(range(len(faces)))
 
 
 def test_pictures_and_ranges_must_have_one_size() -> None:
