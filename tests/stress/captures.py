@@ -22,11 +22,14 @@ _HOLD = """
 def _hold(name):
     time.sleep(float(os.environ.get("TOY_SLEEP_S", "0")))
     folder = os.environ.get("TOY_HOLD", "")
-    path = os.path.join(folder, name)
-    if not folder or not os.path.exists(path):
+    if not folder:
         return
-    with open(path) as stream:
-        eaten = ["x"] if stream.read() == "eat" else []
+    path = os.path.join(folder, name)
+    try:
+        with open(path) as stream:
+            eaten = ["x"] if stream.read() == "eat" else []
+    except FileNotFoundError:
+        return
     if eaten:
         os.remove(path)
     with open(os.path.join(folder, f"met-{os.getpid()}"), "w") as stream:
