@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.process_state import has_plugins
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors import execute
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
@@ -50,11 +52,13 @@ def ended(pids: Path) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [SerialExecutor, one_process])
 @pytest.mark.parametrize("at_import", [False, True])
-def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_import: bool) -> None:
+def test_changed_libraries_do_not_reach_other_units(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, make: Make, at_import: bool
+) -> None:
     """A plugin that switched OpenCV's optimisation off changed 12 of 12 files of built-in stages, with exit 0."""
+    monkeypatch.setattr(execute, "has_plugins", has_plugins)
     clean = run_with(toy, SerialExecutor, name="clean")
     edit(
-        toy,
         """import cv2, math
 from pano_mvs.api import Panorama
 if not cv2.useOptimized() or math.floor(1.5) != 1 or Panorama.load is None: raise ValueError("tainted")
@@ -80,7 +84,6 @@ def test_a_forked_child_neither_stores_nor_answers(toy: Toy, how: str) -> None:
     clean = run_with(toy, SerialExecutor, name="clean")
     pids = toy.folder / "pids"
     edit(
-        toy,
         f"""if (child := os.fork()) == 0:
     {"return Number(666.0)" if how == "returns" else "raise ValueError('child')"}
 open({str(pids)!r}, "a").write(f"{{child}} ")""",
@@ -97,7 +100,6 @@ def test_a_timeout_ends_what_the_unit_started(toy: Toy, child: str) -> None:
     """A child that held the pipe of the worker made the run wait for it for ever."""
     pids = toy.folder / "pids"
     edit(
-        toy,
         f"""import subprocess
 if x.value == 20:
     {child}
@@ -115,7 +117,6 @@ if x.value == 20:
 def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> None:
     pids = toy.folder / "pids"
     edit(
-        toy,
         f"""if x.value == 20:
     if os.fork() == 0:
         open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
