@@ -272,12 +272,12 @@ def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cac
     assert files_of(toy.folder / "cache") == before
 
 
-@pytest.mark.parametrize(("option", "text"), [("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")])
-def test_time_that_is_none_is_refused(toy: Toy, cache: Cache, option: str, text: str) -> None:
+def test_time_that_is_none_is_refused(toy: Toy, cache: Cache) -> None:
     toy.run()
-    code, said = cache("gc", option, text)
-    assert code == 2
-    assert "such as 30d" in said
+    for option, text in (("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")):
+        code, said = cache("gc", option, text)
+        assert code == 2
+        assert "such as 30d" in said
 
 
 def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
@@ -421,16 +421,16 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("layout", ['{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"])
-def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache, layout: str) -> None:
+def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache) -> None:
     toy.run()
-    (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
-    before = files_of(toy.folder / "cache")
-    for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
-        code, said = cache(*command)
-        assert code == 2
-        assert "with --cache DIR" in said
-    assert files_of(toy.folder / "cache") == before
+    for layout in ('{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"):
+        (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
+        before = files_of(toy.folder / "cache")
+        for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
+            code, said = cache(*command)
+            assert code == 2, layout[:10]
+            assert "with --cache DIR" in said
+        assert files_of(toy.folder / "cache") == before
 
 
 @pytest.mark.slow

@@ -59,6 +59,7 @@ def test_changed_libraries_do_not_reach_other_units(
     monkeypatch.setattr(execute, "has_plugins", has_plugins)
     clean = run_with(toy, SerialExecutor, name="clean")
     edit(
+        toy,
         """import cv2, math
 from pano_mvs.api import Panorama
 if not cv2.useOptimized() or math.floor(1.5) != 1 or Panorama.load is None: raise ValueError("tainted")
@@ -84,6 +85,7 @@ def test_a_forked_child_neither_stores_nor_answers(toy: Toy, how: str) -> None:
     clean = run_with(toy, SerialExecutor, name="clean")
     pids = toy.folder / "pids"
     edit(
+        toy,
         f"""if (child := os.fork()) == 0:
     {"return Number(666.0)" if how == "returns" else "raise ValueError('child')"}
 open({str(pids)!r}, "a").write(f"{{child}} ")""",
@@ -100,6 +102,7 @@ def test_a_timeout_ends_what_the_unit_started(toy: Toy, child: str) -> None:
     """A child that held the pipe of the worker made the run wait for it for ever."""
     pids = toy.folder / "pids"
     edit(
+        toy,
         f"""import subprocess
 if x.value == 20:
     {child}
@@ -117,6 +120,7 @@ if x.value == 20:
 def test_a_unit_that_dies_leaves_no_process_that_holds_its_pipe(toy: Toy) -> None:
     pids = toy.folder / "pids"
     edit(
+        toy,
         f"""if x.value == 20:
     if os.fork() == 0:
         open({str(pids)!r}, "a").write(f"{{os.getpid()}} ")
