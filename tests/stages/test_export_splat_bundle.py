@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from numpy.typing import NDArray
 
 from pano_mvs.api import (
     Context,
@@ -25,6 +24,7 @@ from pano_mvs.api import (
     ray_grid,
     write_png,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
@@ -48,7 +48,6 @@ from tests.synthetic.photograph import render_photograph
 SIZE_HW = (128, 256)
 STEP = 0.001
 HALF_WIDTH = 2.0
-FloatArray = NDArray[np.float64]
 
 
 def delivered(

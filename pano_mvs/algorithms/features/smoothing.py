@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pad_panorama
-
-FloatArray = NDArray[np.float64]
 
 _PIXEL_STD = np.sqrt(1 / 12)  # standard deviation of a box one pixel wide
 

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring, plane_from_lattice
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.smoothing import smooth_panorama
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import Features
-
-FloatArray = NDArray[np.float64]
 
 _SCALE = 1.2
 _MIN_STEPS = 24

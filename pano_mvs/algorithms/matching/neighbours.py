@@ -13,11 +13,10 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry.geodesy import local_from_lla
 from pano_mvs.scene import Features, GlobalDescriptor, Pairs
-
-FloatArray = NDArray[np.float64]
 
 _SHORTLISTED = 20
 _WINDOW, _NEAREST = 5, 10  # the defaults of pairs.sequential and pairs.position

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 
 def face_size(size_hw: tuple[int, int]) -> int:

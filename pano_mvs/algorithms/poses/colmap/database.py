@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_NAMES, CUBE_ROTATIONS
 from pano_mvs.algorithms.poses.colmap.cube_rig import face_of_bearing, face_pixels, face_size
+from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.geometry import Rigid3, pixel_from_ray, skew
 from pano_mvs.scene import Features, TwoView
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 Cameras = Literal["sphere", "faces"]
 TwoViews = Mapping[tuple[str, str], TwoView]
 

@@ -22,9 +22,8 @@ from pano_mvs.algorithms.poses.joining.proposals import (
     pair_proposals,
     pivoted,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 _FINALISTS, _PIVOTED = 10, 6
 _MAX_EVALUATIONS = 12
