@@ -33,8 +33,8 @@ from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.image_file import decode_image
+from pano_mvs.testing.paint import noise
 from pano_mvs.testing.scenes import courtyard
-from pano_mvs.testing.texture import noise
 from tests.benchmarks.captures import read_capture
 from tests.synthetic.persons import OUTFITS, Person, draw_people, person
 
