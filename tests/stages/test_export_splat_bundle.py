@@ -33,12 +33,7 @@ from pano_mvs.io.ranges import read_confidence_png, read_normals
 from pano_mvs.io.splats import SplatFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import TrackedPoints
-from pano_mvs.stages.exports.splat_bundle import (
-    SplatBundleParams,
-    SplatFramesParams,
-    splat_bundle,
-    splat_frames,
-)
+from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, SplatFramesParams, splat_bundle, splat_frames
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points

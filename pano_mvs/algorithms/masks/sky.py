@@ -25,13 +25,7 @@ from pano_mvs.algorithms.masks.sky_comparison import (
     pixel_errors,
     source_errors,
 )
-from pano_mvs.algorithms.panoramas import (
-    box_sum,
-    contrast_around,
-    filtered,
-    largest_channel,
-    nearest_resized,
-)
+from pano_mvs.algorithms.panoramas import box_sum, contrast_around, filtered, largest_channel, nearest_resized
 from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError

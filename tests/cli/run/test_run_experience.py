@@ -15,18 +15,8 @@ import pytest
 
 from pano_mvs.cli.run.command import interrupted_by_termination
 from pano_mvs.core.processes import start_of
-from tests.engine.conftest import (
-    PATIENCE_S,
-    Toy,
-    finished_records,
-    start,
-    wait_for_records,
-)
-from tests.engine.running.test_resume import (
-    BEFORE_MEANS,
-    hold_means,
-    wait_for_means,
-)
+from tests.engine.conftest import PATIENCE_S, Toy, finished_records, start, wait_for_records
+from tests.engine.running.test_resume import BEFORE_MEANS, hold_means, wait_for_means
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 

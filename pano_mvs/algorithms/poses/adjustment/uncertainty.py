@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import (
-    Bundle,
-    Loss,
-    ReducedCameras,
-    reduced_cameras,
-    with_camera_order,
-)
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, ReducedCameras, reduced_cameras, with_camera_order
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, held
 from pano_mvs.core.arrays import FloatArray
 

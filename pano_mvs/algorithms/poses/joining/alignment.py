@@ -8,12 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.joining.cross_matches import (
-    CrossMatches,
-    alignment_cost,
-    errors_and_residuals,
-    parts_of,
-)
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
 from pano_mvs.algorithms.poses.joining.proposals import (
     PairHypothesis,

@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
-from pano_mvs.algorithms.poses.joining.cross_matches import (
-    CrossMatches,
-    match_errors,
-    stacked,
-)
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors, stacked
 from pano_mvs.algorithms.poses.joining.floor import Floors
 from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.joining.cross_matches import (
-    CrossMatches,
-    alignment_cost,
-    errors_and_residuals,
-    parts_of,
-)
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.three_points import candidate_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
