@@ -32,12 +32,7 @@ Units
 from pano_mvs.core import kernel_cache
 from pano_mvs.geometry.lens_rig import FisheyeLens, LensRig
 from pano_mvs.geometry.pinhole import PinholeView
-from pano_mvs.geometry.resample import (
-    pad_panorama,
-    roll_panorama,
-    rotate_panorama,
-    sample_panorama,
-)
+from pano_mvs.geometry.resample import pad_panorama, roll_panorama, rotate_panorama, sample_panorama
 from pano_mvs.geometry.sphere import (
     angle_between,
     pixel_from_ray,

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry.geodesy import earth_from_lla, earth_from_local
 from pano_mvs.io.meshes import write_glb_parts
 from pano_mvs.scene import PointCloud
-
-FloatArray = NDArray[np.float64]
 
 _FLOAT, _UINT16, _POINTS, _ARRAY_BUFFER = 5126, 5123, 0, 34962
 _UNLIT = "KHR_materials_unlit"

@@ -8,18 +8,7 @@ from pano_mvs.algorithms.learned.lightglue import match_learned
 from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.api import (
-    All,
-    Context,
-    Features,
-    Near,
-    Params,
-    TwoView,
-    TwoViews,
-    arguments_from,
-    params_from,
-    stage,
-)
+from pano_mvs.api import All, Context, Features, Near, Params, TwoView, TwoViews, arguments_from, params_from, stage
 from pano_mvs.core.text import plural
 from pano_mvs.scene import WeakImages
 from pano_mvs.stages.features import NetworkParams

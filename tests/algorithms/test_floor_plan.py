@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, Storey, WallCells, find_storeys
 from pano_mvs.algorithms.floor_plan.wall_lines import Walls, wall_lines
+from pano_mvs.core.arrays import FloatArray
 from tests.algorithms.floor_plan_rooms import HEIGHT, L_SHAPE, RoomCloud, room_cloud, walls_of
 
-FloatArray = NDArray[np.float64]
 ROOM = Storey(0.0, HEIGHT, (0,))
 EXTENT = Extent(-0.2, 5.2, 0.01, (540, 640))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.masks.areas import dilated, share_of_sphere
 from pano_mvs.algorithms.masks.expected_view import OtherView, expected_view
 from pano_mvs.algorithms.masks.moving import Moving, moving_pixels
+from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
@@ -24,7 +25,6 @@ CENTERS = ((0.0, 0.0, 0.0), (0.7, 0.05, 0.3), (-0.5, -0.05, 0.6), (0.1, 0.0, -0.
 FLOOR_Y = 1.3
 BOX = Cuboid((1.0, 0.3, -0.6), (1.6, 1.3, 0.6), ((0.9, 0.2, 0.1), (0.8, 0.3, 0.1)))
 
-Mask = NDArray[np.bool_]
 View = tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]
 
 

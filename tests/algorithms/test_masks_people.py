@@ -23,6 +23,7 @@ from pano_mvs.algorithms.masks.person_views import (
     rolled,
     stereographic_look,
 )
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.testing.room import default_room, render
@@ -31,9 +32,6 @@ from tests.synthetic.persons import Drawn, draw_people, person
 SIZE_HW = (512, 1024)
 SAMPLE = Path(__file__).parents[2] / "workflows" / "samples" / "classroom" / "images" / "003.png"
 AREA = np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW)
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_of
 from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.algorithms.structure.view import ScenePlane, plane_view
+from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap
@@ -25,7 +26,6 @@ from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 SIZE = (128, 256)
 HALF = (3.0, 1.4, 2.5)
 CENTERS = ((0.4, -0.3, 0.2), (-0.6, -0.1, 0.5), (0.1, -0.2, -0.8))
-Picture = NDArray[np.uint8]
 
 
 class Box:

@@ -1,11 +1,12 @@
 """Run a benchmark or another script of the tests: `python -m tests.benchmarks NAME [options]`.
 
 NAME is a module of `tests.benchmarks`, such as `depth.thin`, or of `tests`, such as `stress.kills`. The parameters of
-its function `main` are the options; `--help` describes the script. Without a name, all names are listed.
+its function `main` are the options; `--help` describes the script. Without a name, all scripts are listed.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
 import inspect
 import runpy
@@ -20,16 +21,16 @@ import typer
 HERE = Path(__file__).parent
 
 
-def names() -> list[str]:
-    """Return the names of all scripts."""
+def scripts() -> dict[str, str]:
+    """Return the names of all scripts, each with the first line of its docstring."""
     folders = {HERE: "", HERE.with_name("stress"): "stress."}
     found = {
-        prefix + ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__main__")
+        prefix + ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__main__"): text
         for folder, prefix in folders.items()
         for path in folder.rglob("*.py")
-        if path != Path(__file__) and "\ndef main(" in path.read_text(encoding="utf-8")
+        if path != Path(__file__) and "\ndef main(" in (text := path.read_text(encoding="utf-8"))
     }
-    return sorted(found)
+    return {name: str(ast.get_docstring(ast.parse(text))).split("\n")[0] for name, text in sorted(found.items())}
 
 
 def module_of(name: str) -> str:
@@ -43,7 +44,7 @@ def run(name: str, arguments: list[str]) -> None:
     """Run a script with the arguments of its command line."""
     module = module_of(name)
     if find_spec(module) is None:
-        raise SystemExit(f"{name} is not a script of the tests; these are: {', '.join(names())}")
+        raise SystemExit(f"{name} is not a script of the tests; these are: {', '.join(scripts())}")
     source = Path(str(find_spec(module).origin)) if find_spec(module) else HERE  # type: ignore[union-attr]
     if "argparse" in source.read_text(encoding="utf-8") or source.name == "__init__.py":
         sys.argv = [name, *arguments]
@@ -62,6 +63,6 @@ def run(name: str, arguments: list[str]) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
-        print(f"{__doc__}\n" + "\n".join(names()))
+        print(f"{__doc__}\n" + "\n".join(f"{name:24} {summary}" for name, summary in scripts().items()))
     else:
         run(sys.argv[1], sys.argv[2:])

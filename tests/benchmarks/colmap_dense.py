@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import read_ply_points
@@ -32,7 +32,6 @@ from tests.benchmarks.captures import Capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, context, true_poses
 from tests.benchmarks.table import print_table
 
-FloatArray = NDArray[np.float64]
 _AT = 3.0
 
 

@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import (
     Rigid3,
     pad_panorama,
@@ -46,7 +47,6 @@ from tests.benchmarks.dense_chain import DenseChain, DenseRun, Overrides
 from tests.benchmarks.table import print_table
 
 Ranges = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Turns = Mapping[str, NDArray[np.float64]]
 _MARGIN_PX = 8
 _RAYS_PER_PIXEL = 3

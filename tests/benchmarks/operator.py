@@ -29,16 +29,15 @@ from pano_mvs.algorithms.masks.expected_view import OtherView
 from pano_mvs.algorithms.masks.moving import MAX_OTHERS, moving_pixels
 from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.static_content import static_content
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.image_file import decode_image
+from pano_mvs.testing.paint import noise
 from pano_mvs.testing.scenes import courtyard
-from pano_mvs.testing.texture import noise
 from tests.benchmarks.captures import read_capture
 from tests.synthetic.persons import OUTFITS, Person, draw_people, person
 
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 View = tuple[Picture, NDArray[np.float32], Rigid3]
 
 SIZE_HW = (256, 512)

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -25,8 +26,6 @@ from tests.benchmarks.dense_chain import DenseChain, Overrides
 from tests.benchmarks.table import print_table
 
 _EDGE = 1.1
-
-FloatArray = NDArray[np.float64]
 
 
 def confirmed_errors(range_map: RangeMap, truth: NDArray[np.float32]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -13,6 +13,9 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.engine.conftest import toy
+
+__all__ = ["toy"]
 
 SIZE_HW = (160, 320)
 SMALL = ("--set", "depth.planes=32", "--set", "features.max_keypoints=1500")

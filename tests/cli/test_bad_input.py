@@ -21,15 +21,13 @@ STOPS_AFTER_FEATURES = """\
 pano_mvs: 1
 stages:
   images:   {{use: source.folder, path: {images}}}
-  features: {{use: features.sift_tangent, max_keypoints: 200}}
-  pairs:    {{use: pairs.exhaustive}}
-  matches:  {{use: matches.brute_force}}
+  features: {{use: features.orb_tangent, max_keypoints: 200}}
 """
 
 
 @pytest.fixture
 def short(tmp_path: Path, capture: Path) -> Path:
-    """A workflow that is over after the matches."""
+    """A workflow that is over after the features."""
     path = tmp_path / "short.yaml"
     path.write_text(STOPS_AFTER_FEATURES.format(images=capture / "images"))
     return path
@@ -64,23 +62,27 @@ def test_one_image(pano_mvs: Command, capture: Path) -> None:
     assert "depth needs two or more panoramas" in result.flat
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "not 2:1", "huge sphere"])
-def test_one_bad_picture_among_good_ones(pano_mvs: Command, short: Path, capture: Path, damage: str) -> None:
+def test_bad_pictures_among_good_ones(pano_mvs: Command, short: Path, capture: Path) -> None:
     image = read_picture(capture / "images" / "001.png")
     (capture / "images" / "001.png").unlink()
-    bad = capture / "images" / "001.jpg"
-    cv2.imwrite(str(bad), image[:, : image.shape[1] - 64] if damage == "not 2:1" else image)
-    data = bad.read_bytes()
+    data = cv2.imencode(".jpg", image)[1].tobytes()
     sphere = full_sphere(*image.shape[:2], FullPanoWidthPixels=2 * 10**9, FullPanoHeightPixels=10**9)
-    huge = data[:2] + app1(b"http://ns.adobe.com/xap/1.0/\0" + xmp(sphere)) + data[2:]
-    damaged = {"truncated": data[: len(data) // 2], "text": b"not a picture", "empty": b"", "huge sphere": huge}
-    bad.write_bytes(damaged.get(damage, data))
+    damaged = {
+        "truncated": data[: len(data) // 2],
+        "text": b"not a picture",
+        "empty": b"",
+        "not 2:1": cv2.imencode(".jpg", image[:, :-64])[1].tobytes(),
+        "huge sphere": data[:2] + app1(b"http://ns.adobe.com/xap/1.0/\0" + xmp(sphere)) + data[2:],
+    }
+    for name, content in damaged.items():
+        (capture / "images" / f"{name}.jpg").write_bytes(content)
     result = pano_mvs("run", short, "--out", "out")
     assert result.code == 3, result.text
-    assert "001.jpg" in result.flat
-    assert "001.jpg" in (Path("out") / "report.html").read_text()
+    report = (Path("out") / "report.html").read_text()
+    assert [name for name in damaged if f"{name}.jpg" not in result.flat or f"{name}.jpg" not in report] == []
     assert run_json(Path("out"))["stages"][1]["run"] == 3
-    (capture / "images" / "001.jpg").unlink()
+    for name in damaged:
+        (capture / "images" / f"{name}.jpg").unlink()
     cv2.imwrite(str(capture / "images" / "001.png"), image)
     again = pano_mvs("run", short, "--out", "out")
     assert again.code == 0

@@ -22,7 +22,7 @@ from pano_mvs.core.files import temporary_prefix
 from pano_mvs.engine.cache.blobs import BlobStore
 from pano_mvs.engine.cache.maintenance import collect
 from pano_mvs.engine.cache.store import Store
-from tests.engine.conftest import Toy, settle, toy  # noqa: F401 (a fixture)
+from tests.engine.conftest import Toy, settle
 from tests.engine.running.test_run import ALL_UNITS
 from tests.stress.captures import deliverables
 
@@ -31,7 +31,7 @@ UNITS = sum(ALL_UNITS.values())
 
 
 @pytest.fixture
-def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:  # noqa: F811
+def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:
     """Run a `cache` command on the toy's store."""
     monkeypatch.setenv("COLUMNS", "200")
 
@@ -42,7 +42,7 @@ def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:  # noqa: F811
     return call
 
 
-def run(toy: Toy, out: str, *options: str) -> tuple[int, str]:  # noqa: F811
+def run(toy: Toy, out: str, *options: str) -> tuple[int, str]:
     result = CliRunner().invoke(
         app,
         [
@@ -67,7 +67,7 @@ def make_old(folder: Path) -> None:
         os.utime(path, (1e9, 1e9), follow_symlinks=False)
 
 
-def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:
     toy.run()
     folder = toy.folder / "cache" / "tmp"
     (folder / f"{temporary_prefix()}scratch").mkdir()
@@ -94,7 +94,7 @@ def unwritable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_a_cache_that_can_only_be_read_is_enough_to_plan(
-    toy: Toy,  # noqa: F811
+    toy: Toy,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -115,7 +115,7 @@ def test_a_cache_that_can_only_be_read_is_enough_to_plan(
         Store(toy.folder / "none")
 
 
-def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None:
     toy.run()
     code, said = cache("du")
     assert code == 0
@@ -124,7 +124,7 @@ def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None: 
     assert f"{on_disk / 1000:.1f} kB on the disk" in said
 
 
-def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:
     for out in ("here", "there", "here"):
         run(toy, out)
     code, said = cache("ls")
@@ -134,13 +134,13 @@ def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:
     assert said.count(f"│ {UNITS} │") == 2
 
 
-def test_verification_of_a_sound_cache_ends_well(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_verification_of_a_sound_cache_ends_well(toy: Toy, cache: Cache) -> None:
     toy.run()
     blobs = len(list((toy.folder / "cache" / "blobs").rglob("*.*")))
     assert cache("verify") == (0, f"{UNITS} records and {blobs} blobs are intact, 0 damaged")
 
 
-def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy, cache: Cache) -> None:
     toy.run()
     root = toy.folder / "cache"
     record = sorted((root / "records").rglob("*.json"))[0]
@@ -161,7 +161,7 @@ def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy,
     assert cache("verify")[0] == 0
 
 
-def test_collection_tells_first_and_deletes_when_asked(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_collection_tells_first_and_deletes_when_asked(toy: Toy, cache: Cache) -> None:
     run(toy, "out", "--set", "scaled.by=5")
     run(toy, "out")
     before = files_of(toy.folder / "cache")
@@ -180,7 +180,7 @@ def test_collection_tells_first_and_deletes_when_asked(toy: Toy, cache: Cache) -
     assert cache("verify")[0] == 0
 
 
-def test_what_is_young_stays(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_what_is_young_stays(toy: Toy, cache: Cache) -> None:
     run(toy, "out", "--set", "scaled.by=5")
     run(toy, "out")
     assert "0 units, 0 blobs" in cache("gc", "--delete")[1]
@@ -189,7 +189,7 @@ def test_what_is_young_stays(toy: Toy, cache: Cache) -> None:  # noqa: F811
     assert "deleted: 2" in cache("gc", "--delete", "--unused", "1h")[1]
 
 
-def test_two_captures_with_one_workflow_are_both_kept(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_two_captures_with_one_workflow_are_both_kept(toy: Toy, cache: Cache) -> None:
     other = toy.folder / "other"
     shutil.copytree(toy.folder / "capture", other)
     (other / "1.txt").write_text("77")
@@ -200,14 +200,14 @@ def test_two_captures_with_one_workflow_are_both_kept(toy: Toy, cache: Cache) ->
     assert "(nothing to compute)" in run(toy, "two", "--images", str(other))[1]
 
 
-def test_failed_units_do_not_expose_the_others(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_failed_units_do_not_expose_the_others(toy: Toy, cache: Cache) -> None:
     toy.number("2.txt", "13")
     assert run(toy, "out")[0] == 3
     assert "0 units, 0 blobs" in cache("gc", "--delete", "--unused", "0s")[1]
     assert toy.run().computed == 0
 
 
-def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) -> None:
     """What an unfinished run had not reached was taken from the latest run into any folder, not from its own."""
     run(toy, "mine", "--set", "scaled.by=5")
     run(toy, "other")
@@ -219,7 +219,7 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
 
 
-def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: Cache) -> None:
     run(toy, "pinned", "--set", "scaled.by=5")
     run(toy, "out")
     code, said = cache("pin", str(toy.folder / "pinned"), "good")
@@ -237,7 +237,7 @@ def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: C
     assert not [path for path in (toy.folder / "cache" / "blobs").rglob("*") if path.is_file()]
 
 
-def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
     for run_name, name, why in (
@@ -260,7 +260,7 @@ def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F
 
 
 @pytest.mark.parametrize("folder", ["runs", "pins"])
-def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cache: Cache, folder: str) -> None:  # noqa: F811
+def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cache: Cache, folder: str) -> None:
     run(toy, "out")
     cache("pin", str(toy.folder / "out"), "good")
     (entry,) = (toy.folder / "cache" / folder).iterdir()
@@ -272,15 +272,15 @@ def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cac
     assert files_of(toy.folder / "cache") == before
 
 
-@pytest.mark.parametrize(("option", "text"), [("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")])
-def test_time_that_is_none_is_refused(toy: Toy, cache: Cache, option: str, text: str) -> None:  # noqa: F811
+def test_time_that_is_none_is_refused(toy: Toy, cache: Cache) -> None:
     toy.run()
-    code, said = cache("gc", option, text)
-    assert code == 2
-    assert "such as 30d" in said
+    for option, text in (("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")):
+        code, said = cache("gc", option, text)
+        assert code == 2
+        assert "such as 30d" in said
 
 
-def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
     """A note in the folder of blobs was deleted by `verify` if its name was long, and by `gc` if it was old."""
     toy.run()
     root, outside = toy.folder / "cache", toy.folder / "outside"
@@ -317,7 +317,7 @@ def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
     assert (outside / "mine.json").is_file()
 
 
-def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: Toy, cache: Cache) -> None:
     toy.run()
     (toy.folder / "cache" / "runs" / ".tmp-abc.json").write_text("half")
     assert cache("gc")[0] == 0
@@ -325,7 +325,7 @@ def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: T
 
 
 @pytest.mark.slow
-def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cache) -> None:
     """Everything is collected, again and again, while two processes compute; the run heals what it finds gone.
 
     It does so three times for each file, and then takes the disk to be damaged, so there are three collections.
@@ -351,7 +351,7 @@ def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cach
 
 
 def test_verification_while_a_run_writes_reports_nothing_wrong(
-    toy: Toy,  # noqa: F811
+    toy: Toy,
     cache: Cache,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -372,7 +372,7 @@ def test_verification_while_a_run_writes_reports_nothing_wrong(
     assert (code, said) == (0, f"{UNITS} records and 0 blobs are intact, 0 damaged")
 
 
-def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:
     toy.run()
     from pano_mvs.engine.cache import maintenance as upkeep
 
@@ -382,7 +382,7 @@ def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache
     assert upkeep._digest(gone) == ""
 
 
-def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.run()
     root = toy.folder / "cache"
     shutil.rmtree(root / "runs")
@@ -403,7 +403,7 @@ def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.
     assert files_of(root) == before
 
 
-def test_store_may_be_reached_through_another_path(toy: Toy, cache: Cache) -> None:  # noqa: F811
+def test_store_may_be_reached_through_another_path(toy: Toy, cache: Cache) -> None:
     toy.run()
     (toy.folder / "link").symlink_to(toy.folder / "cache")
     assert toy.run(cache=toy.folder / "link").computed == 0
@@ -421,20 +421,20 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("layout", ['{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"])
-def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache, layout: str) -> None:  # noqa: F811
+def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache) -> None:
     toy.run()
-    (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
-    before = files_of(toy.folder / "cache")
-    for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
-        code, said = cache(*command)
-        assert code == 2
-        assert "with --cache DIR" in said
-    assert files_of(toy.folder / "cache") == before
+    for layout in ('{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"):
+        (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
+        before = files_of(toy.folder / "cache")
+        for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
+            code, said = cache(*command)
+            assert code == 2, layout[:10]
+            assert "with --cache DIR" in said
+        assert files_of(toy.folder / "cache") == before
 
 
 @pytest.mark.slow
-def test_cache_that_cannot_be_written_says_so(toy: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+def test_cache_that_cannot_be_written_says_so(toy: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
     """By permissions, or, where these do not bind us, by a stand-in of the calls that would fail."""
     toy.run()
     root = toy.folder / "cache"

@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 import pytest
 
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy, toy  # noqa: F401 (toy is a fixture)
+from tests.engine.conftest import Toy
 
 
 def read(folder: Path) -> Any:
@@ -26,7 +26,7 @@ def blake2b_128(path: Path) -> str:
     return f"blake2b-128:{hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()}"
 
 
-def test_crate_states_software_settings_inputs_and_outputs(toy: Toy, pano_mvs: Command) -> None:  # noqa: F811
+def test_crate_states_software_settings_inputs_and_outputs(toy: Toy, pano_mvs: Command) -> None:
     (toy.folder / "capture" / "1.txt").rename(toy.folder / "capture" / "ä 1.txt")
     run = ("run", toy.folder / "wf.yaml", "--executor", "serial", "--set", "scaled.by=4", "--out", "out")
     assert pano_mvs(*run).code == 0
@@ -55,7 +55,7 @@ def test_crate_states_software_settings_inputs_and_outputs(toy: Toy, pano_mvs: C
     assert outputs == {name: blake2b_128(out / name) for name in outputs}
 
 
-def test_crate_of_a_stopped_run(toy: Toy, pano_mvs: Command) -> None:  # noqa: F811
+def test_crate_of_a_stopped_run(toy: Toy, pano_mvs: Command) -> None:
     toy.number("3.txt", "13")
     toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "on_error: stop, use: toy.scale"))
     assert pano_mvs("run", toy.folder / "wf.yaml", "--executor", "serial", "--out", "out").code == 4

@@ -6,9 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 def explain(toy: Toy, unit: str) -> str:

@@ -10,9 +10,7 @@ import pytest
 
 from pano_mvs.core.digest import digest_from_bytes
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.cli.conftest import Command, run_json
-from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.engine.conftest import Toy
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
 
@@ -89,12 +89,12 @@ def test_a_folder_without_a_run_is_refused(pano_mvs: Command, text: str | None) 
     assert "run.json" in result.flat
 
 
-def run(pano_mvs: Command, toy: Toy, *options: str) -> int:  # noqa: F811
+def run(pano_mvs: Command, toy: Toy, *options: str) -> int:
     folder = toy.folder
     return pano_mvs("run", folder / "wf.yaml", "--cache", folder / "cache", "--out", folder / "out", *options).code
 
 
-def test_an_interrupted_run_has_a_report(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+def test_an_interrupted_run_has_a_report(pano_mvs: Command, toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace('"""Mean of the', 'raise KeyboardInterrupt\n    """Mean of the'))
     assert run(pano_mvs, toy) == 130
     summary = run_json(toy.folder / "out")
@@ -104,7 +104,7 @@ def test_an_interrupted_run_has_a_report(pano_mvs: Command, toy: Toy) -> None:  
     assert "Run the same command again to continue" in page.words
 
 
-def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -> None:
     toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scale, gate: {value: 1000}"))
     assert run(pano_mvs, toy) == 4
     page = page_in(toy.folder / "out")
@@ -114,7 +114,7 @@ def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -
 
 def test_a_run_that_breaks_has_a_report_and_keeps_its_error(
     pano_mvs: Command,
-    toy: Toy,  # noqa: F811  # the fixture above
+    toy: Toy,  # the fixture above
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def broken(*_args: object, **_options: object) -> None:
@@ -128,7 +128,7 @@ def test_a_run_that_breaks_has_a_report_and_keeps_its_error(
     assert "the disk has gone" in page.words
 
 
-def test_a_run_that_does_nothing_leaves_the_report_before(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+def test_a_run_that_does_nothing_leaves_the_report_before(pano_mvs: Command, toy: Toy) -> None:
     assert run(pano_mvs, toy) == 0
     before = (toy.folder / "out" / "report.html").read_bytes()
     toy.edit(

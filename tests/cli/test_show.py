@@ -14,9 +14,7 @@ from pano_mvs.engine.planning.resolve import _static_identity
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.session.session import Session, open_session, presets_folder
 from tests.cli.conftest import SMALL, Command
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 PRESETS = sorted(path.stem for path in presets_folder().glob("*.yaml"))
 

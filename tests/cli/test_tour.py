@@ -12,9 +12,7 @@ from pano_mvs.cli.tour_command import open_in_browser
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.session import Session
 from tests.cli.conftest import SMALL, Command
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 @pytest.fixture(autouse=True)

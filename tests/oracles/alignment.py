@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_from_ray
-
-FloatArray = NDArray[np.float64]
 
 
 def cubic_value(picture: FloatArray, column: float, row: float) -> float:

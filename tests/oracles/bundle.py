@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 
 def tangent_residuals(bundle: Bundle, bases: FloatArray, steps: FloatArray) -> FloatArray:

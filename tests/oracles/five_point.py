@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _SAMPLE = 5
 # Exponents of x, y, z in the twenty monomials up to degree three. The last ten are a basis of what is left of all

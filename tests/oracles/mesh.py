@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.mesh.atlas import Texels
 from pano_mvs.algorithms.mesh.kernels_mesh import MIN_COSINE, RANGE_TOLERANCE, SLOPE_PX
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
-
-FloatArray = NDArray[np.float64]
 
 
 def nearest_triangles(corners_in_cam: FloatArray, size_hw: tuple[int, int]) -> tuple[FloatArray, NDArray[np.int64]]:

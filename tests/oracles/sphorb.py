@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 # Unit steps to the six neighbours (v, u) with their directions.
 STEPS = {(0, 1): 0, (1, 0): 60, (1, -1): 120, (0, -1): 180, (-1, 0): 240, (-1, 1): 300}

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.points import ROUNDS, Triangulated
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
+from pano_mvs.core.arrays import FloatArray, IndexArray
 
 _UPPER = np.triu_indices(3)
 

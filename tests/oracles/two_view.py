@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.algorithms.two_view.refinement import _linearised, tangent_basis
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

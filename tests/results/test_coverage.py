@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.results.coverage import (
     LonelyArea,
@@ -25,7 +25,6 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.tiny_capture import TinyCapture
 
-FloatArray = NDArray[np.float64]
 HALF = np.array([3.0, 1.5, 3.0])
 
 

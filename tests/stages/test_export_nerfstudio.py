@@ -20,12 +20,7 @@ from pano_mvs.io.ply import open_ply_points, read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.stages.exports.nerfstudio import (
-    NerfstudioFramesParams,
-    NerfstudioParams,
-    nerfstudio,
-    nerfstudio_frames,
-)
+from pano_mvs.stages.exports.nerfstudio import NerfstudioFramesParams, NerfstudioParams, nerfstudio, nerfstudio_frames
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import documented_rays, world_points

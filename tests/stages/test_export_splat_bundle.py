@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from numpy.typing import NDArray
 
 from pano_mvs.api import (
     Context,
@@ -25,6 +24,7 @@ from pano_mvs.api import (
     ray_grid,
     write_png,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
@@ -33,12 +33,7 @@ from pano_mvs.io.ranges import read_confidence_png, read_normals
 from pano_mvs.io.splats import SplatFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import TrackedPoints
-from pano_mvs.stages.exports.splat_bundle import (
-    SplatBundleParams,
-    SplatFramesParams,
-    splat_bundle,
-    splat_frames,
-)
+from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, SplatFramesParams, splat_bundle, splat_frames
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points
@@ -48,7 +43,6 @@ from tests.synthetic.photograph import render_photograph
 SIZE_HW = (128, 256)
 STEP = 0.001
 HALF_WIDTH = 2.0
-FloatArray = NDArray[np.float64]
 
 
 def delivered(

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.stage import SourceItem
@@ -27,7 +27,6 @@ from tests.io.images.videos import write_video
 SIZE_HW = (64, 128)
 EYES_M = 0.065
 XMP = b'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta><rdf:Description GSpherical:StereoMode="%s"/></x:xmpmeta>'
-Picture = NDArray[np.uint8]
 
 
 @pytest.fixture(scope="module", name="eyes")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.keyframes import select_keyframes
+from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.io.images.video import describe_video, frames_between
@@ -18,7 +19,7 @@ from pano_mvs.scene import Panorama
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.stages.source_video import VideoParams, list_frames, video
 from tests.algorithms.keyframes.walked_room import grey_from
-from tests.io.images.videos import Picture, counted, number_of, retimed, write_video
+from tests.io.images.videos import counted, number_of, retimed, write_video
 
 
 def params(path: Path | list[Path], **more: Any) -> VideoParams:

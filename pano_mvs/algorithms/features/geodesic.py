@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import face_corners
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pad_panorama, pixel_from_ray
-
-FloatArray = NDArray[np.float64]
 
 _PAD_PX = 4
 _EDGE_RAD = float(np.arctan(2.0))  # angle between two neighbouring corners of an icosahedron

@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import bilinear
-
-FloatArray = NDArray[np.float64]
 
 ARC = 10  # of the 18 cells of the ring
 

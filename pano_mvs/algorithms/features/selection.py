@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting
 
-FloatArray = NDArray[np.float64]
 MaxKeypoints: TypeAlias = Annotated[int, Setting("maximum number, spread over the sphere by strength", ge=8)]
 
 _KEYPOINTS_PER_CELL = 8

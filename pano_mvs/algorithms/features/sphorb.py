@@ -15,16 +15,15 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring, plane_from_lattice
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
-from pano_mvs.algorithms.features.smoothing import smooth_panorama
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import pixel_from_ray
+from pano_mvs.geometry import pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
-
-FloatArray = NDArray[np.float64]
 
 _SCALE = 1.2
 _MIN_STEPS = 24
@@ -234,3 +233,45 @@ def _smoothing_kernel() -> FloatArray:
     kernel[u**2 + u * v + v**2 > reach**2] = 0
     kernel /= kernel.sum()
     return kernel
+
+
+_PIXEL_STD = np.sqrt(1 / 12)  # standard deviation of a box one pixel wide
+
+
+def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[NDArray[np.uint8]]:
+    """Smooth a panorama by Gaussians, with one result for each width.
+
+    Rows are smoothed by 1 / cos φ times as many pixels as columns. Towards the poles, the pixels of a row are narrower
+    than at the equator; the additional sharpness along the row is removed as well, so that noise and detail are
+    isotropic. Only within about two standard deviations of a pole is the smoothing weaker, because the rows are such
+    small circles there.
+
+    Args:
+        panorama: (H, W) uint8, the full sphere.
+        sigmas_px: (S,) standard deviations in pixels at the equator, not negative.
+
+    Returns:
+        S arrays (H, W) uint8.
+    """
+    height, width = panorama.shape
+    spectrum = fft.rfft(panorama.astype(np.float32), axis=1)
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    frequency = np.arange(spectrum.shape[1]) * (2 * np.pi / width)
+    cosine = np.cos(elevation)[:, None]
+    smoothed = []
+    for sigma_px in sigmas_px:
+        spread = (sigma_px**2 + (_PIXEL_STD * np.sin(elevation[:, None])) ** 2) / cosine**2
+        decay = np.exp(-0.5 * spread * frequency**2).astype(np.float32)
+        rows = fft.irfft(spectrum * decay, n=width, axis=1)
+        smoothed.append(np.rint(_smooth_columns(rows, float(sigma_px))).clip(0, 255).astype(np.uint8))
+    return smoothed
+
+
+def _smooth_columns(panorama: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    reach = min(int(np.ceil(4 * sigma_px)), *panorama.shape)
+    if reach == 0:
+        return panorama
+    kernel = cv2.getGaussianKernel(2 * reach + 1, sigma_px)
+    padded = pad_panorama(panorama, reach)
+    smoothed = cv2.sepFilter2D(padded, -1, np.ones(1), kernel)
+    return np.asarray(smoothed[reach:-reach, reach:-reach], np.float32)

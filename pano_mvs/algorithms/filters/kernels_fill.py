@@ -8,6 +8,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
@@ -61,8 +62,6 @@ def label_surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.i
         labels[index] = _root(parents, index) if math.isfinite(flat[index]) else -1
     return labels
 
-
-FloatArray = NDArray[np.float64]
 
 _DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 

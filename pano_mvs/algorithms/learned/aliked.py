@@ -13,12 +13,11 @@ from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, Array, Networks
 from pano_mvs.algorithms.learned.tiles import FOCAL_PX, level_tiles
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, pixel_from_ray
 from pano_mvs.scene import Features
-
-FloatArray = NDArray[np.float64]
 
 # Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
 _RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1

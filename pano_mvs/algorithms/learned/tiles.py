@@ -5,12 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.learned.networks import TILE_PX
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors
-
-FloatArray = NDArray[np.float64]
 
 FOV_DEG = 60.0
 _COLUMNS, _ELEVATIONS_DEG = 8, (-18.0, 18.0)

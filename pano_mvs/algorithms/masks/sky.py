@@ -25,21 +25,13 @@ from pano_mvs.algorithms.masks.sky_comparison import (
     pixel_errors,
     source_errors,
 )
-from pano_mvs.algorithms.panoramas import (
-    box_sum,
-    contrast_around,
-    filtered,
-    largest_channel,
-    nearest_resized,
-)
+from pano_mvs.algorithms.panoramas import box_sum, contrast_around, filtered, largest_channel, nearest_resized
 from pano_mvs.algorithms.sweep.preparation import is_bare
+from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
-
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 _RADII = (24, 6)
 _MIN_SEEDS = 40.0

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import DARK_LEVEL
 from pano_mvs.algorithms.panoramas import largest_channel, mean_around
+from pano_mvs.core.arrays import Mask
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, sample_panorama
 
 Colors = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # Below this parallax, infinity and the range look the same.
 _MIN_PARALLAX_PX = 1.0

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, GlobalDescriptor
-
-FloatArray = NDArray[np.float64]
 
 _CELL_BITS = 4
 _RESIDUAL_SIZE = 128

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_from_ray
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Targets = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
 
@@ -154,7 +154,6 @@ def draw_charts(uv_px: FloatArray, triangle: NDArray[np.int32], weights: NDArray
                     weights[row, column, 0], weights[row, column, 1] = of_b, of_c
 
 
-FloatImage = NDArray[np.float32]
 TexelArrays = tuple[NDArray[np.int32], NDArray[np.float32]]
 MeshArrays = tuple[FloatArray, FloatArray, NDArray[np.int32]]
 ViewArrays = tuple[FloatImage, FloatImage, NDArray[np.uint8], FloatImage]

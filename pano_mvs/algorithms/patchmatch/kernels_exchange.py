@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.patchmatch.kernels_match import STRETCH, Sources, row_matrix
 from pano_mvs.algorithms.patchmatch.kernels_refine import Reference
 from pano_mvs.algorithms.ranges.kernels_agreement import locate_row
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, pixel_at
 
-FloatArray = NDArray[np.float64]
 Window = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 _F = np.float32

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip, wrapped_column, wrapped_row
 
@@ -46,7 +47,6 @@ def pack_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return packed
 
 
-FloatArray = NDArray[np.float64]
 Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
 Sources = tuple[
     NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.uint8], NDArray[np.int64]

@@ -19,10 +19,9 @@ from pano_mvs.algorithms.patchmatch.kernels_match import (
     sum_windows,
     weigh_window,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import azimuth_from_x, elevation_from_y, wrapped_column, wrapped_row
-
-FloatArray = NDArray[np.float64]
 
 _F = np.float32
 _U = np.uint64

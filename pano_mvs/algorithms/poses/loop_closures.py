@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.scene import Features, Poses, TwoView
 
-FloatArray = NDArray[np.float64]
 Pair = tuple[str, str]
 
 # Pairs of images at most this number of places apart are in sequence; all others are closures. Only captures are tested

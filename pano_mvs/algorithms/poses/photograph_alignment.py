@@ -18,12 +18,7 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_patches import (
-    MIN_SIDE_PX,
-    panorama_levels,
-    photograph_levels,
-    sight_points,
-)
+from pano_mvs.algorithms.poses.photograph_patches import MIN_SIDE_PX, panorama_levels, photograph_levels, sight_points
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
 from pano_mvs.core.errors import UsageError
 

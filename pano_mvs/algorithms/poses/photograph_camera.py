@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 _ROUNDS, _MIN_POINTS = 4, 6
 # Typical changes of rotation, translation, log focal length and distortion.

@@ -12,8 +12,8 @@ from pano_mvs.algorithms.poses.adjustment.patch_alignment import MARGIN, SIZE, a
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera, Sightings
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MIN_SIDE_PX = SIZE + 2 * MARGIN + 1

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Features, RangeMap
-
-FloatArray = NDArray[np.float64]
 
 # A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
 _OFFSETS_PX = (-4, -2, 0, 2, 4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, TypedDict
+from typing import Annotated
 
 import numpy as np
 
@@ -23,11 +23,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
-
-
-class _GrowthArguments(TypedDict):
-    adjust: bool
-    confirmation: Confirmation | None
 
 
 @checks_settings

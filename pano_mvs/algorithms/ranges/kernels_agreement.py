@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import inlined, kernel
 from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, even_atan2, pixel_at, pixel_from_ray
 
-FloatArray = NDArray[np.float64]
 Triple = FloatArray | tuple[float, float, float]
 
 # Verdicts of a source on a point: no information; it sees the same surface; it sees something farther away through

@@ -21,7 +21,6 @@ from pano_mvs.algorithms.structure.outline import room_labels, room_of
 from pano_mvs.algorithms.structure.view import (
     HALF_DIFFERENCE,
     STEP_RAD,
-    FloatArray,
     PlaneView,
     ScenePlane,
     blurred,
@@ -29,6 +28,7 @@ from pano_mvs.algorithms.structure.view import (
     plane_ranges,
     world_rays,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Profiles across a crease: steps to either side.

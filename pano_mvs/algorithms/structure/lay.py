@@ -20,16 +20,8 @@ from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
-from pano_mvs.algorithms.structure.view import (
-    FloatArray,
-    Mask,
-    Picture,
-    ScenePlane,
-    on_grid,
-    plane_ranges,
-    plane_view,
-    stride_of,
-)
+from pano_mvs.algorithms.structure.view import ScenePlane, on_grid, plane_ranges, plane_view, stride_of
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap

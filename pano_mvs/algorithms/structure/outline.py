@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.view import (
     STEP_RAD,
-    FloatArray,
     PlaneView,
     ScenePlane,
     blurred,
@@ -27,6 +26,7 @@ from pano_mvs.algorithms.structure.view import (
     plane_ranges,
     world_rays,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 

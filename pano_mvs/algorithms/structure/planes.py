@@ -16,15 +16,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.creases import placed_by_creases
 from pano_mvs.algorithms.structure.outline import outline_planes, same_wall, supposed_ceiling
-from pano_mvs.algorithms.structure.view import (
-    PLAIN_WEIGHT,
-    FloatArray,
-    Mask,
-    Picture,
-    PlaneView,
-    ScenePlane,
-    plane_view,
-)
+from pano_mvs.algorithms.structure.view import PLAIN_WEIGHT, PlaneView, ScenePlane, plane_view
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups

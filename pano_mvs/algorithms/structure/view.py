@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 Value = TypeVar("Value", bound=np.generic)
 
 STEP_RAD = np.radians(0.1)

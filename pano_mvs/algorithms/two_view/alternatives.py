@@ -24,9 +24,9 @@ from pano_mvs.algorithms.two_view.significance import (
     independent_count,
     log10_false_alarms,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _TWINS = 16  # number of samples among the matches of a known geometry

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 

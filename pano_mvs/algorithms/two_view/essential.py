@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _DIAGONAL = np.array([1.0, 1.0, 0.0])
 

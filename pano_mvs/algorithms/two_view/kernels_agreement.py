@@ -12,9 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
-
-FloatArray = NDArray[np.float64]
 
 _CHECKS = (16, 32, 64, 128)  # number of matches after which a hypothesis that lags too far behind is dropped
 

@@ -13,9 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
-
-FloatArray = NDArray[np.float64]
 
 _DEGREE = 10
 _MAX_INTERVALS = 64

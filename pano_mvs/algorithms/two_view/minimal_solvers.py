@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.essential import essential_from_bearings
+from pano_mvs.core.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 Solver: TypeAlias = Literal["five_point", "eight_point"]
 
 _SAMPLE = 5

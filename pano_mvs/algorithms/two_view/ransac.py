@@ -13,11 +13,10 @@ from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver,
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
-
-FloatArray = NDArray[np.float64]
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import facing_costs
 from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
-
-FloatArray = NDArray[np.float64]
 
 _MATCHES = 1000  # number of matches on which directions are compared
 _ROUNDS = 2

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import angle_between, nearest_rotation
-
-FloatArray = NDArray[np.float64]
 
 _SAMPLES = 200
 

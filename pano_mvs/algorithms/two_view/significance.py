@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
-
-FloatArray = NDArray[np.float64]
 
 MAX_LOG10_FALSE_ALARMS = -6.0
 

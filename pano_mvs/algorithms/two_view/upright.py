@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 _HEADINGS_RAD = np.deg2rad(np.arange(0.0, 360.0, 2.0))
 _DIRECTIONS = 100

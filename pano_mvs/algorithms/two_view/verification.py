@@ -21,12 +21,11 @@ from pano_mvs.algorithms.two_view.significance import (
     log10_false_alarms,
 )
 from pano_mvs.algorithms.two_view.upright import upright_poses
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
 from pano_mvs.scene import Features, TwoView
-
-FloatArray = NDArray[np.float64]
 
 MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""

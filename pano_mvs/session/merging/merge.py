@@ -29,14 +29,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.report.page import gather_report, write_page
-from pano_mvs.results.records import (
-    CloudSummary,
-    ImageReason,
-    MergedSummary,
-    PairLink,
-    ViewSummary,
-    WorkflowSummary,
-)
+from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, PairLink, ViewSummary, WorkflowSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, RunSummary
 from pano_mvs.scene import Poses

@@ -9,19 +9,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.algorithms.faces.layout import panorama_faces
-from pano_mvs.api import (
-    All,
-    Context,
-    Each,
-    Files,
-    One,
-    Panorama,
-    PointCloud,
-    Poses,
-    RangeMap,
-    arguments_from,
-    stage,
-)
+from pano_mvs.api import All, Context, Each, Files, One, Panorama, PointCloud, Poses, RangeMap, arguments_from, stage
 from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups

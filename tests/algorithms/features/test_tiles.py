@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import beyond_face_rad, face_centers, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.features import tangent, tile_sampling
-from pano_mvs.algorithms.features.tile_sampling import owned_pixels, sample_tile
+from pano_mvs.algorithms.features import tangent
+from pano_mvs.algorithms.features.tangent import owned_pixels, sample_tile
 from pano_mvs.geometry import Rigid3
 from pano_mvs.testing.room import default_room, render
 
@@ -25,7 +25,7 @@ def room_image() -> NDArray[np.uint8]:
 def test_a_tile_is_sampled_as_any_view(
     monkeypatch: pytest.MonkeyPatch, room_image: NDArray[np.uint8], max_width: int
 ) -> None:
-    monkeypatch.setattr(tile_sampling, "_MAX_WIDTH", max_width)
+    monkeypatch.setattr(tangent, "_MAX_WIDTH", max_width)
     grey = np.ascontiguousarray(room_image[..., 1])
     for idx, tile in enumerate(tangent_tiles(SIZE)):
         np.testing.assert_array_equal(sample_tile(grey, idx), sample_view(grey, tile))

@@ -21,14 +21,7 @@ from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Net
 from pano_mvs.algorithms.learned.photographs import match_photograph, view_of_photograph
 from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import (
-    PinholeView,
-    angle_between,
-    ray_grid,
-    roll_panorama,
-    rotate_panorama,
-    rotation_from_rotvec,
-)
+from pano_mvs.geometry import PinholeView, angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features
 
 UP = np.array([0.0, -1.0, 0.0])

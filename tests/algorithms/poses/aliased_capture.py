@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, TwoView
-from tests.algorithms.poses.synthetic_capture import (
-    features_from_bearings,
-    noisy_bearings,
-    points_in_box,
-    random_poses,
-)
+from tests.algorithms.poses.synthetic_capture import features_from_bearings, noisy_bearings, points_in_box, random_poses
 from tests.algorithms.two_view.test_two_view import rng_of
 
 TILE = np.array([0.7, 0.0, 0.0])

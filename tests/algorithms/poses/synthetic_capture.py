@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, TwoView
-
-FloatArray = NDArray[np.float64]
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, TwoView
 from tests.algorithms.poses.synthetic_capture import features_from_bearings, noisy_bearings, random_rotation
-
-FloatArray = NDArray[np.float64]
 
 STEP = 0.7  # between two cameras
 SIGHT = 6.0  # farther points are not found

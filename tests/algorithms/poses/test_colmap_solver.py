@@ -14,8 +14,7 @@ import pytest
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.colmap import solver as colmap
-from pano_mvs.algorithms.poses.colmap.cube_rig import face_of_bearing, face_pixels, face_size
-from pano_mvs.algorithms.poses.colmap.database import Cameras, write_database
+from pano_mvs.algorithms.poses.colmap.database import Cameras, face_of_bearing, face_pixels, face_size, write_database
 from pano_mvs.algorithms.poses.colmap.mapping import Mapper
 from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
 from pano_mvs.algorithms.poses.colmap.solver import solve_colmap

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints, photograph_keypoints
@@ -16,6 +15,7 @@ from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photog
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_points import KnownPoints, has_sift, known_points
 from pano_mvs.algorithms.poses.photograph_surface import surface_points
+from pano_mvs.core.arrays import Picture
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
@@ -24,8 +24,6 @@ from tests.synthetic.photograph import render_photograph
 SIZE_HW = (256, 512)
 CENTERS = [(0.0, 0.0, 0.0), (0.5, 0.1, 0.2), (-0.3, 0.0, 0.6)]
 PHOTO_HW, FOCAL_PX = (360, 480), 380.0
-
-Picture = NDArray[np.uint8]
 
 
 Model = tuple[dict[str, KnownPoints], PanoramaPatches]

@@ -16,12 +16,7 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_patches import (
-    MIN_SIDE_PX,
-    panorama_levels,
-    photograph_levels,
-    sight_points,
-)
+from pano_mvs.algorithms.poses.photograph_patches import MIN_SIDE_PX, panorama_levels, photograph_levels, sight_points
 from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec

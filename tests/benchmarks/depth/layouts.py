@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pano_mvs
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_solid_angle, ray_grid
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
-FloatArray = NDArray[np.float64]
 FLOOR, WALL, CEILING, OPENING = range(4)
 
 

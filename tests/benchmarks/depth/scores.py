@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.evaluation.clouds.distances import PointsInMemory, cloud_distances, score_cloud
 from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_views, view_points
 from pano_mvs.geometry import pixel_solid_angle
@@ -17,8 +18,6 @@ from tests.benchmarks.captures import Capture
 from tests.benchmarks.dense_chain import DenseRun
 
 Figures = dict[str, float]
-Mask = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 
 SCORES = ("delta", "kept", "surface_f")
 # Largest ratio of a range that counts as right to the true one, in a map and on a surface.

@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
-from pano_mvs.scene.image_file import write_png
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Colors, albedo_at
+from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from pano_mvs.testing.room import Room, render
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Rod, Surface
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod
+from tests.benchmarks.poses.painted import Paint, Painted, bounded, write_views
 
 # Cells of the plan (column, row), in the order of a walk, and the pairs of rooms with a door between them.
 CELLS = ((0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1))
@@ -28,25 +27,6 @@ _COLORS = (OAK, BRICK, LEAVES, STEEL, BLUE, RED, STONE)
 _NOISE, _TILT_DEG = 1.5, 1.0
 
 Thing = Ball | Cuboid | Quad | Rod
-
-
-@dataclass(frozen=True)
-class _Paint:
-    """The texture "outdoor" or "weak" with a seed and an origin of its own, so that it can repeat elsewhere."""
-
-    colors: Colors
-    seed: int
-    origin: tuple[float, float, float]
-    plain: bool = False
-
-    def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
-        """Return the colours (N, 3) of points (N, 3)."""
-        del normals
-        local = points - np.array(self.origin)
-        return albedo_at(local, self.colors, "weak" if self.plain else "outdoor", seed=self.seed, footprint=footprint)
-
-
-Painted = tuple[Surface, _Paint]
 
 
 @dataclass(frozen=True)
@@ -111,23 +91,19 @@ class House:
         rng = np.random.default_rng([self.seed, like])
         (x, z), origin = _middle(room), (_middle(room)[0], 0.0, _middle(room)[1])
         floor = Quad((x - _LONG / 2, _FLOOR, z - _WIDE / 2), (_LONG, 0, 0), (0, 0, _WIDE), OAK)
-        yield floor, _Paint(_COLORS[like % 3], self.seed + 100 * like + 90, origin, plain=True)
+        yield floor, Paint(_COLORS[like % 3], self.seed + 100 * like + 90, origin, plain=True)
         ceiling = Quad((x - _LONG / 2, _CEILING, z - _WIDE / 2), (_LONG, 0, 0), (0, 0, _WIDE), WHITE)
-        yield ceiling, _Paint(WHITE, self.seed + 100 * like + 91, origin, plain=True)
+        yield ceiling, Paint(WHITE, self.seed + 100 * like + 91, origin, plain=True)
         for number, thing in enumerate(_furniture(rng, x, z)):
             colors = _COLORS[int(rng.integers(len(_COLORS)))]
-            yield _bounded(thing), _Paint(colors, self.seed + 100 * like + number, origin)
+            surface = thing if isinstance(thing, Quad) else bounded(thing)
+            yield surface, Paint(colors, self.seed + 100 * like + number, origin)
 
 
 def write_house(folder: Path, house: House, *, width: int) -> dict[str, Rigid3]:
     """Render the pictures that a folder does not have yet, and return the true cam_from_world of all, by name."""
-    folder.mkdir(parents=True, exist_ok=True)
     truth = {f"{house.room_of(idx)}-{idx:02d}.png": pose for idx, pose in enumerate(house.poses())}
-    for idx, name in enumerate(truth):
-        if not (folder / name).is_file():
-            write_png(folder.with_suffix(".part"), house.view(idx, (width // 2, width)))
-            folder.with_suffix(".part").rename(folder / name)
-    return truth
+    return write_views(folder, truth, lambda idx, _: house.view(idx, (width // 2, width)))
 
 
 def _middle(room: int) -> tuple[float, float]:
@@ -168,7 +144,7 @@ def _wall(first: tuple[int, int], second: tuple[int, int], door: bool, *, seed: 
             low_xz, high_xz = low_xz[::-1], high_xz[::-1]
         cuboid = Cuboid((low_xz[0], top, low_xz[1]), (high_xz[0], bottom, high_xz[1]), WHITE)
         number = 7 * (first[0] + 4 * first[1]) + (3 if along_x else 0) + 5000
-        yield _bounded(cuboid), _Paint(WHITE, seed + number, (0.0, 0.0, 0.0), plain=True)
+        yield bounded(cuboid), Paint(WHITE, seed + number, (0.0, 0.0, 0.0), plain=True)
 
 
 def _furniture(rng: np.random.Generator, x: float, z: float) -> Iterator[Thing]:
@@ -190,16 +166,3 @@ def _furniture(rng: np.random.Generator, x: float, z: float) -> Iterator[Thing]:
         wide, high = rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.7)
         corner = (x - wide / 2, float(rng.uniform(-0.8, -0.5)), z + side * (_WIDE / 2 - _HALF_WALL - 0.01))
         yield Quad(corner, (float(wide), 0.0, 0.0), (0.0, float(high), 0.0), OAK)
-
-
-def _bounded(surface: Thing) -> Surface:
-    """Return a surface within a sphere, outside of which no ray needs to be tried."""
-    if isinstance(surface, Ball):
-        return Bounded(surface, surface.center, surface.radius)
-    if isinstance(surface, Quad):
-        return surface
-    ends = (surface.low, surface.high) if isinstance(surface, Cuboid) else (surface.foot, surface.head)
-    low, high = np.array(ends)
-    center = 0.5 * (low + high)
-    radius = 0.5 * float(np.linalg.norm(high - low)) + getattr(surface, "radius", 0.0)
-    return Bounded(surface, (float(center[0]), float(center[1]), float(center[2])), radius)

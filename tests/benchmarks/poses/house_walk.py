@@ -6,19 +6,17 @@ The first 75 of 300 views close one loop, the first 150 a second one, and all 30
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.scene.image_file import write_png
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors, albedo_at
+from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Surface, Vector
+from tests.benchmarks.poses.painted import Paint, bounded, write_views
 
 STEP = 0.6
 _VIEWS = 300
@@ -40,21 +38,7 @@ _CORNERS = (
 )
 
 
-@dataclass(frozen=True)
-class _Paint:
-    """The texture "outdoor" with its own seed and origin."""
-
-    colors: Colors
-    seed: int
-    shift_x: float = 0.0
-
-    def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
-        """Return the colours (N, 3) of points (N, 3)."""
-        del normals
-        return albedo_at(points - (self.shift_x, 0, 0), self.colors, "outdoor", seed=self.seed, footprint=footprint)
-
-
-Painted = tuple[Bounded, _Paint]
+Painted = tuple[Bounded, Paint]
 
 
 def walk_poses(views: int, *, seed: int = 0) -> list[Rigid3]:
@@ -83,7 +67,7 @@ def walk_view(pose: Rigid3, size_hw: tuple[int, int], *, twins: bool = False, se
     shell = Cuboid((0.0, _CEILING, _LINES[0]), (_COLUMNS * _WIDE, _FLOOR, _LINES[-1]), STONE)
     surfaces: tuple[Surface, ...] = (shell, *(surface for surface, _ in near))
     lamp = (float(center[0] // _WIDE * _WIDE + 2), -1.2, float(center[2]) * 0.5)
-    room = Room(surfaces, lamp=lamp, textures=(_Paint(STONE, seed), *(paint for _, paint in near)))
+    room = Room(surfaces, lamp=lamp, textures=(Paint(STONE, seed), *(paint for _, paint in near)))
     image, _ = render(room, pose, size_hw, supersample=1)
     rng = np.random.default_rng([seed, *np.abs(1e6 * center).astype(int)])
     return np.clip(np.rint(image + rng.normal(0, 1.0, image.shape)), 0, 255).astype(np.uint8)
@@ -91,13 +75,8 @@ def walk_view(pose: Rigid3, size_hw: tuple[int, int], *, twins: bool = False, se
 
 def write_walk(folder: Path, views: int, *, width: int, twins: bool = False, seed: int = 0) -> dict[str, Rigid3]:
     """Render the images that a folder does not have yet, and return the true cam_from_world of all, by name."""
-    folder.mkdir(parents=True, exist_ok=True)
     truth = {f"{idx:03d}.png": pose for idx, pose in enumerate(walk_poses(views, seed=seed))}
-    for name, pose in truth.items():
-        if not (folder / name).is_file():
-            write_png(folder.with_suffix(".part"), walk_view(pose, (width // 2, width), twins=twins, seed=seed))
-            folder.with_suffix(".part").rename(folder / name)
-    return truth
+    return write_views(folder, truth, lambda _, pose: walk_view(pose, (width // 2, width), twins=twins, seed=seed))
 
 
 def _middle(column: int) -> float:
@@ -168,7 +147,7 @@ def _furniture(column: int, shift: float, seed: int, *, rng: np.random.Generator
         colors = _COLORS[int(rng.integers(len(_COLORS)))]
         yield _painted((x0, top, z0), (x0 + wide, _FLOOR, z0 + deep), colors, seed + 40 + number, shift=shift)
         ball = Ball((x0 + 0.5 * wide, top - 0.15, z0 + 0.5 * deep), 0.15, colors)
-        yield Bounded(ball, ball.center, 0.16), _Paint(colors, seed + 60 + number, shift)
+        yield Bounded(ball, ball.center, 0.16), Paint(colors, seed + 60 + number, (shift, 0.0, 0.0))
     for number, z in enumerate((_LINES[1] + 0.1, _LINES[2] - 0.16, _LINES[3] + 0.1, _LINES[4] - 0.08)):
         x0 = left + rng.uniform(0.2, 0.8) + (0 if number % 2 else 2.2)
         top, wide = rng.uniform(-0.8, -0.2), rng.uniform(0.4, 0.8)
@@ -179,6 +158,4 @@ def _furniture(column: int, shift: float, seed: int, *, rng: np.random.Generator
 
 def _painted(low: Vector, high: Vector, colors: Colors, seed: int, *, shift: float) -> Painted:
     """Return a box within its bounding sphere, with its paint."""
-    x, y, z = (0.5 * (a + b) for a, b in zip(low, high, strict=True))
-    radius = 0.5 * float(np.linalg.norm(np.subtract(high, low)))
-    return Bounded(Cuboid(low, high, colors), (x, y, z), radius), _Paint(colors, seed, shift)
+    return bounded(Cuboid(low, high, colors)), Paint(colors, seed, (shift, 0.0, 0.0))

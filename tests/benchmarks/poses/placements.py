@@ -9,11 +9,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.evaluation.poses import camera_extent
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, nearest_rotation
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 _MAX_ROUNDS = 10
 

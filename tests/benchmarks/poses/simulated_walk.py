@@ -19,14 +19,13 @@ from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.loop_closures import find_false_closures
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import similarity_from_points
 from pano_mvs.scene import TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from tests.algorithms.poses.synthetic_capture import features_from_bearings, noisy_bearings
 from tests.algorithms.poses.synthetic_path import PathCapture, window_matches
 from tests.benchmarks.poses.house_walk import walk_poses
-
-FloatArray = NDArray[np.float64]
 
 SIGHT, NEAREST, NOISE_DEG = 5.0, 0.6, 0.03
 WINDOW, CLOSURES, NEAR, FAR_IN_ORDER = 4, 4, 1.0, 10

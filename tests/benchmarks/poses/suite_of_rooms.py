@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.scene.image_file import write_png
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors, albedo_at
+from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE
 from pano_mvs.testing.room import Room, render
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Rod, Surface
+from pano_mvs.testing.surfaces import Ball, Cuboid, Rod
+from tests.benchmarks.poses.painted import Paint, Painted, bounded, write_views
 
 VIEWS_PER_ROOM = 10
 _LONG, _HALF_WIDE, _CEILING, _FLOOR = 6.0, 2.5, -1.3, 1.4
@@ -23,22 +21,6 @@ _HALF_DOOR, _LINTEL = 0.6, -0.7
 _DOOR_AT = 1.3
 _COLORS = (OAK, BRICK, LEAVES, STEEL, BLUE, RED)
 _NOISE = 1.0
-
-
-@dataclass(frozen=True)
-class _Fading:
-    """The texture "outdoor" with a seed of its own, which stays when other surfaces are left out."""
-
-    colors: Colors
-    seed: int
-
-    def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
-        """Return the colours (N, 3) of points (N, 3)."""
-        del normals
-        return albedo_at(points, self.colors, "outdoor", seed=self.seed, footprint=footprint)
-
-
-Painted = tuple[Surface, _Fading]
 
 
 def suite_poses(views: int, *, seed: int = 0) -> list[Rigid3]:
@@ -63,7 +45,7 @@ def suite_view(pose: Rigid3, size_hw: tuple[int, int], *, views: int, seed: int 
     rooms = -(-views // VIEWS_PER_ROOM)
     here = int(pose.center[0] // _LONG)
     shell = Cuboid((-0.01, _CEILING, -_HALF_WIDE), (rooms * _LONG + 0.01, _FLOOR, _HALF_WIDE), STONE)
-    painted: list[Painted] = [(shell, _Fading(STONE, seed))]
+    painted: list[Painted] = [(shell, Paint(STONE, seed))]
     for room in range(max(0, here - 2), min(rooms, here + 3)):
         painted += [*_partition(room, seed), *_furniture(room, seed)] if room else _furniture(room, seed)
     room_now = Room(
@@ -78,13 +60,8 @@ def suite_view(pose: Rigid3, size_hw: tuple[int, int], *, views: int, seed: int 
 
 def write_suite(folder: Path, views: int, *, width: int, seed: int = 0) -> dict[str, Rigid3]:
     """Render the pictures that a folder does not have yet, and return the true cam_from_world of all, by name."""
-    folder.mkdir(parents=True, exist_ok=True)
     truth = {f"{idx:03d}.png": pose for idx, pose in enumerate(suite_poses(views, seed=seed))}
-    for name, pose in truth.items():
-        if not (folder / name).is_file():
-            write_png(folder.with_suffix(".part"), suite_view(pose, (width // 2, width), views=views, seed=seed))
-            folder.with_suffix(".part").rename(folder / name)
-    return truth
+    return write_views(folder, truth, lambda _, pose: suite_view(pose, (width // 2, width), views=views, seed=seed))
 
 
 def _door_at(door: int) -> float:
@@ -101,8 +78,8 @@ def _partition(room: int, seed: int) -> Iterator[Painted]:
             (_CEILING, _LINTEL, low, high),
         )
     ):
-        paint = _Fading(_COLORS[room % len(_COLORS)], seed + 100 * room + 50 + part)
-        yield _bounded(Cuboid((x - 0.06, top, left), (x + 0.06, bottom, right), paint.colors)), paint
+        paint = Paint(_COLORS[room % len(_COLORS)], seed + 100 * room + 50 + part)
+        yield bounded(Cuboid((x - 0.06, top, left), (x + 0.06, bottom, right), paint.colors)), paint
 
 
 def _furniture(room: int, seed: int) -> Iterator[Painted]:
@@ -121,18 +98,4 @@ def _furniture(room: int, seed: int) -> Iterator[Painted]:
             Rod(*hung, 0.05, colors[2]),
         )
         for part, thing in enumerate(things):
-            yield _bounded(thing), _Fading(colors[part], seed + 100 * room + 3 * number + part + 1)
-
-
-def _bounded(surface: Ball | Cuboid | Rod) -> Bounded:
-    """Return a surface within the smallest sphere that is easily told."""
-    if isinstance(surface, Ball):
-        return Bounded(surface, surface.center, surface.radius)
-    ends = (surface.low, surface.high) if isinstance(surface, Cuboid) else (surface.foot, surface.head)
-    low, high = np.array(ends)
-    center = 0.5 * (low + high)
-    return Bounded(
-        surface,
-        (float(center[0]), float(center[1]), float(center[2])),
-        0.5 * float(np.linalg.norm(high - low)) + getattr(surface, "radius", 0.0),
-    )
+            yield bounded(thing), Paint(colors[part], seed + 100 * room + 3 * number + part + 1)

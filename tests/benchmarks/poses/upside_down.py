@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 import pano_mvs
 from pano_mvs.algorithms.poses.frame.upside_down import PRIOR_LOG_ODDS, differences_below
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
-
-FloatArray = NDArray[np.float64]
 
 
 def differences(images: Path, out: Path, cache: Path) -> FloatArray:

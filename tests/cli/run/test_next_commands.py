@@ -19,9 +19,7 @@ from pano_mvs.session.captures import run as run_workflow
 from pano_mvs.session.commands import reopen, run_command
 from pano_mvs.session.session import open_session
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 def commands_of(text: str) -> list[list[str]]:

@@ -15,7 +15,7 @@ import pytest
 
 from pano_mvs.cli.run.ending import notified
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy, toy  # noqa: F401 (toy is a fixture)
+from tests.engine.conftest import Toy
 
 
 @dataclass
@@ -49,7 +49,7 @@ def receiver() -> Iterator[Receiver]:
         thread.join()
 
 
-def test_message_about_a_run(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:  # noqa: F811
+def test_message_about_a_run(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:
     arguments = ("run", toy.folder / "wf.yaml", "--executor", "serial", "--out", "lobby", "--notify", receiver.url)
     assert pano_mvs(*arguments).code == 0
     (message,) = receiver.messages
@@ -59,7 +59,7 @@ def test_message_about_a_run(toy: Toy, receiver: Receiver, pano_mvs: Command) ->
     assert place == str(Path("lobby").absolute())
 
 
-def test_message_about_a_run_with_failures(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:  # noqa: F811
+def test_message_about_a_run_with_failures(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:
     toy.number("3.txt", "13")
     receiver.status = 500
     arguments = ("run", toy.folder / "wf.yaml", "--executor", "serial", "--out", "lobby", "--notify", receiver.url)
@@ -75,7 +75,7 @@ def test_message_about_an_interrupt(receiver: Receiver, tmp_path: Path) -> None:
     assert receiver.messages[0]["title"].endswith("interrupted")
 
 
-def test_message_about_an_error(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:  # noqa: F811
+def test_message_about_an_error(toy: Toy, receiver: Receiver, pano_mvs: Command) -> None:
     (toy.folder / "capture").rename(toy.folder / "elsewhere")
     (toy.folder / "capture").mkdir()
     assert pano_mvs("run", toy.folder / "wf.yaml", "--executor", "nothing", "--notify", receiver.url).code == 2
@@ -85,7 +85,7 @@ def test_message_about_an_error(toy: Toy, receiver: Receiver, pano_mvs: Command)
 
 
 @pytest.mark.parametrize("url", ["nonsense", "nothing://host", "json://"])
-def test_url_that_is_none_is_refused_before_the_run(url: str, toy: Toy, pano_mvs: Command) -> None:  # noqa: F811
+def test_url_that_is_none_is_refused_before_the_run(url: str, toy: Toy, pano_mvs: Command) -> None:
     done = pano_mvs("run", toy.folder / "wf.yaml", "--out", "lobby", "--notify", url)
     assert done.code == 2
     assert f"--notify {url}: must be a URL such as" in done.flat
@@ -93,7 +93,7 @@ def test_url_that_is_none_is_refused_before_the_run(url: str, toy: Toy, pano_mvs
 
 
 def test_missing_library_is_refused_with_the_remedy(
-    toy: Toy,  # noqa: F811
+    toy: Toy,
     pano_mvs: Command,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -33,7 +33,7 @@ from pano_mvs.session.progress import (
     ignore,
 )
 from tests.cli.conftest import Command
-from tests.engine.conftest import Toy, start, toy, wait_for_records  # noqa: F401 (toy is a fixture)
+from tests.engine.conftest import Toy, start, wait_for_records
 
 NAMES = ("images", "depth")
 FORECAST = Forecast((StageForecast("images", (), 0, 4, 1.0, 1e6), StageForecast("depth", ("images",), 0, 4, 10.0, 5e6)))
@@ -184,7 +184,7 @@ with output_lock(out):
 
 
 @pytest.mark.slow
-def test_watch_follows_a_run_from_another_process(toy: Toy) -> None:  # noqa: F811
+def test_watch_follows_a_run_from_another_process(toy: Toy) -> None:
     process = start(toy, "--executor", "processes", "--workers", "2", sleep_s=0.5)
     wait_for_records(toy, process, 1)
     watch = [sys.executable, "-m", "pano_mvs", "watch", str(toy.folder / "out")]
@@ -197,7 +197,7 @@ def test_watch_follows_a_run_from_another_process(toy: Toy) -> None:  # noqa: F8
     assert re.match(r"finished \(exit code 0\) after ", done.stdout.splitlines()[-1])
 
 
-def test_refused_run_leaves_the_events_of_the_first(toy: Toy, pano_mvs: Command) -> None:  # noqa: F811
+def test_refused_run_leaves_the_events_of_the_first(toy: Toy, pano_mvs: Command) -> None:
     arguments = ("run", toy.folder / "wf.yaml", "--executor", "serial", "--out", "lobby")
     assert pano_mvs(*arguments).code == 0
     before = Path("lobby/logs/events.jsonl").read_bytes()

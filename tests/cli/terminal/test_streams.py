@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from pano_mvs.cli.streams import CLOSED_PIPE, LenientStream, StreamState, apart
-from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.engine.conftest import Toy
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="descriptors as POSIX has them")
 FULL = Path("/dev/full")
@@ -135,7 +135,7 @@ def test_a_command_reports_that_its_output_is_full() -> None:
 @ON_POSIX
 @pytest.mark.slow
 @pytest.mark.parametrize(("option", "number", "code"), [("--json", "13", 3), ("--keep-going", "30", 0)])
-def test_a_run_whose_reader_left_goes_on_to_its_end(toy: Toy, option: str, number: str, code: int) -> None:  # noqa: F811
+def test_a_run_whose_reader_left_goes_on_to_its_end(toy: Toy, option: str, number: str, code: int) -> None:
     toy.number("3.txt", number)
     ended = command(
         "run", toy.folder / "wf.yaml", "--out", toy.folder / "out", "--executor", "serial", option, stdout=closed_pipe()
@@ -146,7 +146,7 @@ def test_a_run_whose_reader_left_goes_on_to_its_end(toy: Toy, option: str, numbe
 
 @ON_LINUX
 @pytest.mark.slow
-def test_a_run_whose_output_is_full_goes_on_to_its_end(toy: Toy) -> None:  # noqa: F811
+def test_a_run_whose_output_is_full_goes_on_to_its_end(toy: Toy) -> None:
     with FULL.open("w") as full:
         ended = command("run", toy.folder / "wf.yaml", "--out", toy.folder / "out", "--json", stdout=full)
     assert ended.returncode == 4
@@ -155,7 +155,7 @@ def test_a_run_whose_output_is_full_goes_on_to_its_end(toy: Toy) -> None:  # noq
 
 @ON_POSIX
 @pytest.mark.slow
-def test_closed_descriptors_are_not_given_to_other_files(toy: Toy) -> None:  # noqa: F811
+def test_closed_descriptors_are_not_given_to_other_files(toy: Toy) -> None:
     """Without an open descriptor 1, the first file that is opened would get what the stages print."""
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    os.write(1, b"noise")'))
     shell = f"{sys.executable} -m pano_mvs run wf.yaml --executor serial >&- 2>&- <&-"

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import ContractError, UsageError
+from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
@@ -105,18 +103,6 @@ def test_read_of_a_flipped_blob_is_refused_and_removes_it(tmp_path: Path) -> Non
     assert not path.exists()
 
 
-def test_what_killed_runs_left_long_ago_is_cleared(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    with store.scratch() as young:
-        old = young.parent / "old"
-        old.mkdir()
-        (old / "half").write_bytes(b"x")
-        os.utime(old, (0, 0))
-        Store(tmp_path)
-        assert young.is_dir()
-        assert not old.exists()
-
-
 def test_no_pickle_is_read(tmp_path: Path) -> None:
     ref = Store(tmp_path).put_value(Sample(np.ones((2, 2), np.float32), (), (), 1.0))
     store = Store(tmp_path)
@@ -139,12 +125,6 @@ def test_caches_are_marked_also_those_of_earlier_versions(tmp_path: Path) -> Non
     tmp_path.joinpath("a").chmod(0o700)
     Store(tmp_path / "a")
     assert mark.exists()
-
-
-def test_store_of_another_layout_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "layout.json").write_text(json.dumps({"layout": 99}))
-    with pytest.raises(UsageError, match="--cache"):
-        Store(tmp_path)
 
 
 @pytest.mark.slow

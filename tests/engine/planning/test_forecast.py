@@ -13,9 +13,7 @@ from pano_mvs.engine.planning.forecast import StageForecast, expected_memory, fo
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.workflows.workflow import Workflow
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 def forecast_of(toy: Toy, *overrides: str) -> dict[str, StageForecast]:

@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.process_state import has_plugins
 from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors import execute
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
@@ -50,8 +52,11 @@ def ended(pids: Path) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [SerialExecutor, one_process])
 @pytest.mark.parametrize("at_import", [False, True])
-def test_changed_libraries_do_not_reach_other_units(toy: Toy, make: Make, at_import: bool) -> None:
+def test_changed_libraries_do_not_reach_other_units(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, make: Make, at_import: bool
+) -> None:
     """A plugin that switched OpenCV's optimisation off changed 12 of 12 files of built-in stages, with exit 0."""
+    monkeypatch.setattr(execute, "has_plugins", has_plugins)
     clean = run_with(toy, SerialExecutor, name="clean")
     edit(
         toy,

@@ -15,9 +15,7 @@ from pano_mvs.engine.running.events import Failure, Observer, RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.scene import Axis
-from tests.engine.conftest import Toy, toy
-
-__all__ = ["toy"]
+from tests.engine.conftest import Toy
 
 
 def test_a_stage_takes_the_time_in_which_its_units_are_computed(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:

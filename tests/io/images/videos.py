@@ -10,11 +10,10 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 import pano_mvs.io.images.video  # noqa: F401 - it silences FFmpeg, which must happen before the first video
+from pano_mvs.core.arrays import Picture
 
-Picture = NDArray[np.uint8]
 _folders: list[TemporaryDirectory[str]] = []
 _BITS, _CELL = 8, 8
 

@@ -11,11 +11,10 @@ from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, camera_span, held
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import rotation_from_rotvec
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 Loss: TypeAlias = Literal["cauchy", "huber"]
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6

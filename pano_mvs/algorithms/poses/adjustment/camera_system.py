@@ -14,8 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
+from pano_mvs.core.arrays import FloatArray, IndexArray
 
 # A band wider than this share of the matrix is solved faster as a full matrix.
 _WIDE = 0.4

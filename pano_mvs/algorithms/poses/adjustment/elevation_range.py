@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss
 from pano_mvs.algorithms.poses.adjustment.offset_scale import ray_derivatives, unexplained
 from pano_mvs.algorithms.poses.adjustment.uncertainty import held_cameras
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 # Beyond the noise in the rays: on six captures of full spheres, real and rendered, the edges were at most 0.23° off.
 _SYSTEMATIC_STD_DEG = 0.25

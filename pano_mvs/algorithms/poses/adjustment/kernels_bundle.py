@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import angle_between
-
-FloatArray = NDArray[np.float64]
 
 
 @kernel

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_solver
 from pano_mvs.algorithms.poses.adjustment.uncertainty import HeldCameras, held_cameras
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pad_panorama, pixel_from_ray
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
-FloatArray = NDArray[np.float64]
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 SIZE, MARGIN = 13, 4

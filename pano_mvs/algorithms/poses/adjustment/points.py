@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
+from pano_mvs.core.arrays import FloatArray, IndexArray
 
 ROUNDS = 8
 

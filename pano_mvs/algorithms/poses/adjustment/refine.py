@@ -18,12 +18,11 @@ from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.uncertainty import camera_deviations
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import LensRig
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group, split_groups
-
-FloatArray = NDArray[np.float64]
 
 _ROUNDS = 3
 # Nine captures of full spheres are within 2.3 deviations; later rounds choose the observations that fit them.

@@ -12,12 +12,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
+from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import per_group
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int32]
 TwoViews = Mapping[tuple[str, str], TwoView]
 
 

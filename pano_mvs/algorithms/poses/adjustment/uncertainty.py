@@ -8,16 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import (
-    Bundle,
-    Loss,
-    ReducedCameras,
-    reduced_cameras,
-    with_camera_order,
-)
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, ReducedCameras, reduced_cameras, with_camera_order
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, held
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _COLUMNS_AT_ONCE = 64  # cameras
 _HELD_LENGTH = 1e6  # stiffness of the unit of length, relative to the stiffest camera

@@ -15,10 +15,9 @@ from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPa
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
 from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
 from pano_mvs.algorithms.poses.photograph_points import KnownPoints
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
-
-FloatArray = NDArray[np.float64]
 
 _SEED_LIMIT = 2**31 - 1
 # Without a focal length in the file, a picture is taken to be as wide as most phones' for the first guess.

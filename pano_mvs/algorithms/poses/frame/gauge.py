@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, similarity_from_points
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
-
-FloatArray = NDArray[np.float64]
 
 # A neighbour closer than this share of the median distance to the first camera gives no reliable unit of length.
 _MIN_NEIGHBOUR_SHARE = 0.1

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _UP = np.array([0.0, -1.0, 0.0])

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.algorithms.poses.frame.vertical_lines import directions_around
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
-
-FloatArray = NDArray[np.float64]
 
 # Search around a given up direction: half width and step in degrees, layer thickness relative to the typical range.
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))

@@ -7,18 +7,16 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 _UP = np.array([0.0, -1.0, 0.0])
 _MIN_HEADINGS = 2

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.horizontal_layers import Floor, floor_below
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 # Cameras closer than this share of the capture's extent are at the same place: their distance is noise.
 _COINCIDENT_SHARE = 1e-3

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
 from pano_mvs.scene import Poses
-
-FloatArray = NDArray[np.float64]
 
 _UP = np.array([0.0, -1.0, 0.0])
 _SIZE_HW = (256, 512)

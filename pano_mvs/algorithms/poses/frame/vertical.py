@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
 from pano_mvs.algorithms.poses.frame.upside_down import upside_down_probability
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, up_from_lines
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 
-FloatArray = NDArray[np.float64]
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 
 SURE = 0.8

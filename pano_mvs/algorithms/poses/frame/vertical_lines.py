@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.faces.render import face_image, face_mask
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors
 
-FloatArray = NDArray[np.float64]
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
 

@@ -8,12 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.joining.cross_matches import (
-    CrossMatches,
-    alignment_cost,
-    errors_and_residuals,
-    parts_of,
-)
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
 from pano_mvs.algorithms.poses.joining.proposals import (
     PairHypothesis,
@@ -22,9 +17,8 @@ from pano_mvs.algorithms.poses.joining.proposals import (
     pair_proposals,
     pivoted,
 )
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 _FINALISTS, _PIVOTED = 10, 6
 _MAX_EVALUATIONS = 12

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _WITHOUT_POINT = 0.2  # weight of a match without known point, which agrees more easily

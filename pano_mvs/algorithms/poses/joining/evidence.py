@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, parts_of
 from pano_mvs.algorithms.two_view.significance import log10_false_alarms
-
-FloatArray = NDArray[np.float64]
+from pano_mvs.core.arrays import FloatArray
 
 _SAMPLE, _MODELS = 4, 4  # seven degrees of freedom, two from each match with a known point
 _CELL_RAD = 0.025

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.algorithms.poses.frame.vertical_lines import up_of_panorama
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray
 
-FloatArray = NDArray[np.float64]
 Plane = NDArray[np.float32]
 
 LENGTHS = np.geomspace(0.2, 5.0, 60)

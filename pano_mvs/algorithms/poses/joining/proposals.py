@@ -6,18 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.joining.cross_matches import (
-    CrossMatches,
-    alignment_cost,
-    errors_and_residuals,
-    parts_of,
-)
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.three_points import candidate_poses
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-
-FloatArray = NDArray[np.float64]
 
 _SCALES = np.geomspace(0.02, 50.0, 80)
 _LENGTHS = np.geomspace(0.1, 30.0, 80)

@@ -7,12 +7,10 @@ matches are more than chance. This is what joins rooms through a door, where two
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle
-
-FloatArray = NDArray[np.float64]
 
 _SAMPLE = 3
 _BATCH, _BATCHES = 500, 16

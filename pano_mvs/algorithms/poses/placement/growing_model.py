@@ -14,11 +14,10 @@ from pano_mvs.algorithms.poses.adjustment.tracks import Tracks
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, relative_pose
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
-
-FloatArray = NDArray[np.float64]
 
 _MAX_ERROR_RAD = float(np.deg2rad(0.5))
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))

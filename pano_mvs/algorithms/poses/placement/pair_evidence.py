@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import log10_false_alarms
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
-
-FloatArray = NDArray[np.float64]
 
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 MIN_RATIOS = 6

@@ -20,17 +20,11 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
-from pano_mvs.algorithms.poses.placement.view_graph import (
-    Edge,
-    connected_groups,
-    consistent_edges,
-    views_by_position,
-)
+from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
 from pano_mvs.algorithms.two_view.verification import verify_pose
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
-
-FloatArray = NDArray[np.float64]
 
 _MAX_ERROR_RAD = float(np.deg2rad(0.5))
 _FIRST_GUESS_RAD = float(np.deg2rad(2.0))

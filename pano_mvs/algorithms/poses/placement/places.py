@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence, best_by_partner
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, nearest_rotation
-
-FloatArray = NDArray[np.float64]
 
 _MAX_TURN_RAD = float(np.deg2rad(2.0))
 _MAX_LENGTH_FACTOR = 1.25

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
-
-FloatArray = NDArray[np.float64]
 
 
 def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 
-FloatArray = NDArray[np.float64]
 ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
 
 _CAUCHY_STEPS, _CONVERGED = 20, 1e-7

@@ -5,14 +5,12 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, TwoView
-
-FloatArray = NDArray[np.float64]
 
 CENTERS = {
     "a1": (-2.4, 0.0, 0.3),

@@ -13,10 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from tests.benchmarks.poses.tours.materials import LAMP, MIRROR, PANE, SCREEN, albedo, outdoors
-
-FloatArray = NDArray[np.float64]
 
 _TEXEL = 0.15
 _CELL = 0.5
