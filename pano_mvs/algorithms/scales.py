@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.panoramas import filtered, reduced_mask, reduced_panorama
 from pano_mvs.core.arrays import FloatImage, Mask, Picture
@@ -88,6 +89,50 @@ def enlarged_range_map(range_map: RangeMap, size_hw: tuple[int, int]) -> RangeMa
         on_surface = np.abs(smooth / nearest - 1) < _SURFACE_STEP
     ranges = np.where(on_surface, smooth, nearest).astype(np.float32)
     return RangeMap(ranges, range_map.confidence.repeat(factor, axis=0).repeat(factor, axis=1))
+
+
+class EnlargedRangeMap:
+    """A range map at a larger size, not only a multiple of its own, some rows at a time; as `enlarged_range_map`.
+
+    Uncertainties and the sky are those of the nearest pixels.
+    """
+
+    def __init__(self, range_map: RangeMap, size_hw: tuple[int, int]) -> None:
+        self._map, self._size_hw = range_map, size_hw
+        self._inverse = pad_panorama((1 / range_map.range).astype(np.float32), 1)
+
+    def rows(self, rows: slice) -> RangeMap:
+        """Return some rows."""
+        places = np.arange(rows.start, rows.stop), np.arange(self._size_hw[1])
+        shares = [small / large for small, large in zip(self._map.range.shape, self._size_hw, strict=True)]
+        at = np.ix_(
+            *(
+                (2 * place + 1) * small // (2 * large)
+                for place, small, large in zip(places, self._map.range.shape, self._size_hw, strict=True)
+            )
+        )
+        (above, down), (left, across) = (_between(place, share) for place, share in zip(places, shares, strict=True))
+        upper, lower = self._inverse[above], self._inverse[above + 1]
+        column = upper + (lower - upper) * down[:, None]
+        between = column[:, left] + (column[:, left + 1] - column[:, left]) * across
+        nearest = self._map.range[at]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            smooth = 1 / between
+            on_surface = np.abs(smooth / nearest - 1) < _SURFACE_STEP
+        uncertainty, sky = self._map.uncertainty, self._map.sky
+        return RangeMap(
+            np.where(on_surface, smooth, nearest).astype(np.float32),
+            self._map.confidence[at],
+            uncertainty=None if uncertainty is None else uncertainty[at],
+            sky=None if sky is None else sky[at],
+        )
+
+
+def _between(places: NDArray[np.int64], share: float) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the pixel before each place in an array with one pixel more at the front, and the part to the next."""
+    exact = (places + 0.5) * share + 0.5
+    before = np.floor(exact)
+    return before.astype(np.int64), (exact - before).astype(np.float32)
 
 
 def reduced_range_map(range_map: RangeMap, *, halvings: int) -> RangeMap:
@@ -175,13 +220,22 @@ def without_detail(picture: Picture) -> Mask:
     height = picture.shape[0]
     if min(picture.shape[:2]) <= 2 * _RADIUS_PX:
         return np.zeros(picture.shape[:2], np.bool_)
+    energy = detail_energy(picture)
+    return np.asarray(energy < least_detail(energy[height // 4 : height - height // 4]))
+
+
+def detail_energy(picture: Picture) -> FloatImage:
+    """Return the mean square of the finest detail around each pixel, (H, W), of a panorama or rows of it (H, W, 3)."""
     detail = finest_detail(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32))
     side = 2 * _RADIUS_PX + 1
-    energy = filtered(detail * detail, _RADIUS_PX, lambda padded: cv2.blur(padded, (side, side)))
-    around_equator = energy[height // 4 : height - height // 4]
+    return filtered(detail * detail, _RADIUS_PX, lambda padded: cv2.blur(padded, (side, side)))
+
+
+def least_detail(around_equator: FloatImage) -> float:
+    """Return the `detail_energy` that is above the noise, from that of pixels below 45° of elevation."""
     noisy = around_equator[around_equator >= _LEAST_NOISE**2]
     noise = float(np.quantile(noisy, _PLAIN_PIXELS_SHARE)) if noisy.size else _LEAST_NOISE**2
-    return np.asarray(energy < _DETAIL_OVER_NOISE**2 * noise)
+    return _DETAIL_OVER_NOISE**2 * noise
 
 
 def with_coarser(fine: RangeMap, coarse: RangeMap, picture: Picture) -> RangeMap:

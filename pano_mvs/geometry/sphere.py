@@ -53,16 +53,16 @@ def pixel_from_ray(rays: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:
     return np.stack([(azimuth / (2 * np.pi) + 0.5) * width, (0.5 - elevation / np.pi) * height], axis=-1)
 
 
-def ray_grid(size_hw: tuple[int, int]) -> FloatArray:
-    """Return the unit rays through all pixel centres, (height, width, 3), in the camera frame.
+def ray_grid(size_hw: tuple[int, int], rows: slice = slice(None)) -> FloatArray:
+    """Return the unit rays through all pixel centres, (height, width, 3), in the camera frame; of some rows if given.
 
     >>> ray_grid((512, 1024)).shape
     (512, 1024, 3)
     """
-    height, width = _checked_size(size_hw)
     # One row and one column are enough: nothing as large as the result is made beside it.
     turns, elevations = sines_of_grid(size_hw)
-    rays = np.empty((height, width, 3))
+    elevations = elevations[:, rows]
+    rays = np.empty((elevations.shape[1], turns.shape[1], 3))
     rays[..., 0] = elevations[1][:, None] * turns[0]
     rays[..., 1] = -elevations[0][:, None]
     rays[..., 2] = elevations[1][:, None] * turns[1]

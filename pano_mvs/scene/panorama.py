@@ -124,6 +124,11 @@ class Panorama(Record):
         height, width = self.size_hw
         require(width == 2 * height and height > 0, self, f"size_hw {self.size_hw} is not that of a full sphere")
 
+    def at_width(self, width: int) -> Panorama:
+        """Return the panorama at another working resolution: at most that of its file, and a multiple of four."""
+        width = min(width, self.source_size_hw[1]) // 4 * 4
+        return self if width == self.size_hw[1] else replace(self, size_hw=(width // 2, width))
+
     def loading_bytes(self) -> int:
         """Return the peak memory of `load` and `load_mask`, which decode the files at their own resolution."""
         _, _, width, height = self.covers_ltwh

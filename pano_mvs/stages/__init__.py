@@ -31,6 +31,7 @@ from pano_mvs.stages.filters import (
     structure,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
+from pano_mvs.stages.full_size import full_size
 from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge, weak

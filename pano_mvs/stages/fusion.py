@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.fusion.fuse import fuse_stream
+from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.points.tracking import sample_surface, track_points
@@ -30,6 +32,7 @@ from pano_mvs.api import (
     settings_from,
     stage,
 )
+from pano_mvs.io.growing_arrays import GrowingArrays
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
@@ -53,7 +56,9 @@ def vote(
     clouds = []
     for number in range(max(groups.values(), default=0) + 1):
         names = [name for name in ranges if groups.get(name) == number and name in images]
-        clouds.append(_fused(names, ranges, poses, images=images, settings=settings, threads=ctx.threads))
+        join = partial(_joined_in_files, folder=ctx.scratch / f"group_{number}")
+        fused = _fused(names, ranges, poses, images=images, settings=settings, join=join, threads=ctx.threads)
+        clouds.append(fused)
         if not len(clouds[-1]):
             which = f"group {number}: " if len(set(groups.values())) > 1 else ""
             ctx.note(
@@ -134,6 +139,7 @@ def _fused(
     *,
     images: All[Panorama],
     settings: FusionSettings,
+    join: Callable[[Iterable[PointCloud]], PointCloud],
     threads: int,
 ) -> PointCloud:
     """Return the cloud of the views of one group."""
@@ -144,7 +150,21 @@ def _fused(
         return FusionView(ranges[name], poses[name].cam_from_world, image.load(), image.load_mask())
 
     cams = [poses[name].cam_from_world for name in names]
-    return fuse_stream(cams, load, settings, threads=threads)
+    return fuse_stream(cams, load, settings, join=join, threads=threads)
+
+
+_ARRAYS = tuple(field.name for field in fields(PointCloud) if field.name != "group_sizes")
+
+
+def _joined_in_files(clouds: Iterable[PointCloud], *, folder: Path) -> PointCloud:
+    """Return one cloud of the points of several, as `join_clouds` does, whose arrays are memory-mapped files."""
+    points = 0
+    with GrowingArrays(folder) as grown:
+        for cloud in clouds:
+            points += len(cloud)
+            grown.append({name: getattr(cloud, name) for name in _ARRAYS})
+        whole = {name: array for name, array in grown.arrays().items() if len(array) == points}
+    return PointCloud(**whole) if whole else join_clouds([])
 
 
 def _min_views(settings: FusionSettings, views: int) -> int:

@@ -17,6 +17,7 @@ from pano_mvs.algorithms.patchmatch.refine import (
     reference_arrays,
     refine_range,
     source_arrays,
+    swept_limits,
 )
 from pano_mvs.algorithms.patchmatch.second_round import plain_and_changed, refine_plain_surfaces
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
@@ -97,6 +98,24 @@ def test_packed_patches_hold_four_grey_levels_over_the_seam_and_the_poles() -> N
         np.testing.assert_array_equal(packed >> np.uint64(shift) & np.uint64(65535), part)
 
 
+@pytest.mark.kernel("patchmatch.kernels_match")
+def test_padded_pictures_hold_the_same_patches_and_votes() -> None:
+    rng = np.random.default_rng(8)
+    picture, votes = rng.integers(0, 256, (6, 12, 3)).astype(np.uint8), rng.random((6, 12)) < 0.7
+    padded = np.empty((8, 14), np.uint16)
+    kernels_match.pad_grey(picture, votes, padded)
+    places = [(row, column) for row in range(7) for column in range(13)]
+    index, patches = np.array([14 * row + column for row, column in places], np.int32), np.empty(91, np.uint64)
+    kernels_match.gather_grey(padded.ravel(), 0, 14, index, patches)
+    packed, around = kernels_match.pack_grey(picture), pad_panorama(votes, 1)
+    for (row, column), place, patch in zip(places, index, patches, strict=True):
+        four = [(int(which[row, column]) >> shift) & 65535 for which in (packed,) for shift in (0, 16, 32, 48)]
+        mine = [(int(patch) >> shift) & 65535 for shift in (0, 16, 32, 48)]
+        np.testing.assert_allclose(mine, four, atol=1)
+        agreed = bool(around[row : row + 2, column : column + 2].all())
+        assert kernels_match.may_vote(padded.ravel(), int(place), 14) == agreed
+
+
 @pytest.mark.kernel("patchmatch.kernels_refine")
 def test_compiled_planes_equal_least_squares() -> None:
     rng = np.random.default_rng(0)
@@ -106,8 +125,8 @@ def test_compiled_planes_equal_least_squares() -> None:
     inverse[rng.random(size) < 0.1] = np.nan
     offsets, stretches = column_offsets(size, radius, spherical=True), column_stretch(size[0], spherical=True)
     planes = np.full((3, *size), 9, np.float32)
-    kernels_refine.fit_planes(inverse, 0, 5, offsets, stretches, max_step, planes)
-    kernels_refine.fit_planes(inverse, 5, 7, offsets, stretches, max_step, planes)
+    kernels_refine.fit_planes(inverse, 0, 5, offsets, stretches, max_step, planes, (0, 12))
+    kernels_refine.fit_planes(inverse, 5, 7, offsets, stretches, max_step, planes, (0, 12))
     for row, column in np.ndindex(size):
         expected = np.zeros(3)
         if np.isfinite(inverse[row, column]):
@@ -131,12 +150,13 @@ def test_compiled_steps_equal_normal_equations(weighted: bool) -> None:
     offsets, stretches = column_offsets(size, 4, spherical=True)[:, ::2].copy(), column_stretch(size[0], spherical=True)
     inverse = rng.uniform(0.3, 0.6, size).astype(np.float32)
     planes = np.empty((3, *size), np.float32)
-    kernels_refine.fit_planes(inverse, 0, 16, column_offsets(size, 3, spherical=True), stretches, 0.2, planes)
+    near_offsets = column_offsets(size, 3, spherical=True)
+    kernels_refine.fit_planes(inverse, 0, 16, near_offsets, stretches, 0.2, planes, (0, 16))
     found = np.empty(size, np.float32)
     numbers = (np.float32(1 / 25), np.float32(SETTINGS[0]), *SETTINGS[1:4], np.float32(SETTINGS[4]))
     arrays = (reference_arrays(reference, offsets, stretches), source_arrays(sources, poses, [None, mask], reach=0.0))
     shares = rng.uniform(0.1, 1, (2, *size)).astype(np.float32)
-    kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, weighted, found, correlations := shares.copy())
+    kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, weighted, found, correlations := shares.copy(), (0, 16))
     grey = [np.rint(256 * (picture @ LUMA)) / 256 for picture in sources]
     rows, off = (-4, -2, 0, 2, 4), []
     for row, column in np.ndindex(size):
@@ -298,7 +318,8 @@ def test_planes_that_meet_their_rays_far_beyond_what_was_swept_are_not_believed(
     planes = np.moveaxis(rays / 2.2, -1, 0).astype(np.float32)
     planes[:, 3, 4] /= 20
     planes[:, 5, 6] *= 20
-    found = _range_map_from_planes(planes, swept, np.ones((16, 32), np.bool_))
+    limits, rays = swept_limits(swept), ray_grid((16, 32))
+    found = _range_map_from_planes(planes, swept, np.ones((16, 32), np.bool_), limits=limits, rays=rays)
     assert found.range[3, 4] == found.range[5, 6] == 2
     assert np.isnan(known(found.normals_in_cam)[[3, 5], [4, 6]].astype(float)).all()
     assert np.sum(np.isclose(found.range, 2.2)) == 16 * 32 - 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -102,8 +103,9 @@ def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> Po
     poses = {name: Pose(rooms.pose_items[name].cam_from_world, rooms.pose_items[name].group) for name in names}
     if set(names) == set(_SMALL):
         poses = {name: Pose(pose.cam_from_world) for name, pose in poses.items()}
-    ctx = Context(np.random.default_rng(0), Path())
-    return vote(ranges=chosen, poses=poses, images=rooms.images, params=FusionParams(**settings), ctx=ctx)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        ctx = Context(np.random.default_rng(0), Path(folder))
+        return vote(ranges=chosen, poses=poses, images=rooms.images, params=FusionParams(**settings), ctx=ctx)
 
 
 def test_each_image_knows_its_group(rooms: Rooms) -> None:

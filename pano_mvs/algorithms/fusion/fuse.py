@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,15 +57,17 @@ def fuse_stream(
     settings: FusionSettings | None = None,
     *,
     threads: int = 1,
+    join: Callable[[Iterable[PointCloud]], PointCloud] | None = None,
 ) -> PointCloud:
-    """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory.
+    """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory, and the cloud.
 
     Each view in turn is the reference of `fuse_reference`, with its neighbours as sources. The clouds are joined in the
     order of the views, merged by voxels if `voxel_size` is set, and smoothed (`smooth_surfaces`). The result does not
     depend on what is cached.
 
     `poses`: cam_from_world of all views. `load`: position of a view to the view; called again if it was dropped from
-    the cache. `settings`: as in `fuse_views`. `threads`: as in `fuse_views`.
+    the cache. `settings`: as in `fuse_views`. `threads`: as in `fuse_views`. `join`: joins the clouds of all views,
+    such as into files; None: `join_clouds`.
 
     Raises:
         UsageError: as `fuse_views`.
@@ -73,15 +75,18 @@ def fuse_stream(
     chosen = settings or FusionSettings()
     window = ViewWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
     grid = None if chosen.voxel_size is None else VoxelGrid(chosen.voxel_size)
-    clouds: list[PointCloud] = []
-    for idx, neighbours in enumerate(nearest_views(poses, chosen.neighbours)):
-        sources = [(window, other, _tie(is_earlier=other < idx)) for other in neighbours]
-        cloud = _points_of(window[idx], sources, chosen, threads=threads)
-        if grid is None:
-            clouds.append(cloud)
-        else:
-            grid.add(cloud)
-    cloud = join_clouds(clouds) if grid is None else grid.cloud()
+
+    def clouds() -> Iterator[PointCloud]:
+        for idx, neighbours in enumerate(nearest_views(poses, chosen.neighbours)):
+            sources = [(window, other, _tie(is_earlier=other < idx)) for other in neighbours]
+            yield _points_of(window[idx], sources, chosen, threads=threads)
+
+    if grid is None:
+        cloud = (join or join_clouds)(clouds())
+    else:
+        for part in clouds():
+            grid.add(part)
+        cloud = grid.cloud()
     if not chosen.smooth:
         return cloud
     return smooth_surfaces(cloud, np.array([pose.center for pose in poses]), threads=threads)
@@ -123,9 +128,9 @@ def fuse_reference(
     return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads=threads)
 
 
-def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
+def join_clouds(clouds: Iterable[PointCloud]) -> PointCloud:
     """Return one cloud of the points of several, in order; confidences are kept if all clouds have them."""
-    empty = np.zeros((0, 3), np.float32)
+    clouds, empty = list(clouds), np.zeros((0, 3), np.float32)
     confidences = [cloud.confidence for cloud in clouds if cloud.confidence is not None]
     return PointCloud(
         np.concatenate([empty, *(cloud.points_in_world for cloud in clouds)]),

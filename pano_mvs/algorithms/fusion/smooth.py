@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
@@ -22,6 +23,8 @@ _REACH = 2.0
 _MOST_UNCERTAIN = 0.03
 _POINTS_PER_COLUMN = 12
 _POINTS_AT_ONCE = 1 << 14
+# Points that are sorted into cells together, and those that are moved together: they bound the memory.
+_POINTS_OF_SLAB, _POINTS_OF_PART = 2_000_000, 1_000_000
 # Points with a smaller standard deviation, relative to the same distance, stay where they are.
 _LEAST_UNCERTAIN = 0.005
 _MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
@@ -42,13 +45,20 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     if cloud.uncertainty is None or len(cloud) == 0:
         return cloud
     points, normals = np.ascontiguousarray(cloud.points_in_world), np.ascontiguousarray(cloud.normals_in_world)
-    distances = np.asarray(cKDTree(centers).query(points)[0], np.float32)
+    tree, distances = cKDTree(centers), np.empty(len(points), np.float32)
+    for part in _parts(len(points)):
+        distances[part] = tree.query(points[part])[0]
     sigmas = np.maximum(np.minimum(cloud.uncertainty, _MOST_UNCERTAIN * distances), np.float32(1e-12))
-    chosen = np.flatnonzero(sigmas >= _LEAST_UNCERTAIN * distances)
-    most = sigmas / _PASSES
+    chosen = sigmas >= _LEAST_UNCERTAIN * distances
+    del distances
     for _ in range(_PASSES):
         heights = surface_heights(points, normals, sigmas, chosen=chosen, threads=threads)
-        points = (points + np.clip(heights, -most, most)[:, None] * normals).astype(np.float32)
+        moved = np.empty_like(points)
+        for part in _parts(len(points)):
+            most = sigmas[part] / _PASSES
+            step = np.clip(heights[part], -most, most)
+            moved[part] = points[part] + step[:, None] * normals[part]
+        points = moved
     return replace(cloud, points_in_world=points)
 
 
@@ -57,55 +67,113 @@ def surface_heights(
     normals: NDArray[np.float32],
     sigmas: NDArray[np.float32],
     *,
-    chosen: IntArray | None = None,
+    chosen: NDArray[np.bool_] | None = None,
     per_column: int = _POINTS_PER_COLUMN,
+    points_of_slab: int = _POINTS_OF_SLAB,
     threads: int = 1,
 ) -> FloatArray:
     """Return the heights (N,) along their normals of the planes of their neighbours above points; 0 if undefined.
 
     `points`: (N, 3), N ≥ 1. `normals`: (N, 3) unit vectors. `sigmas`: (N,) standard deviations, positive. `chosen`:
-    indices of the points whose heights are wanted; those of others are 0. None: all. `per_column`: of each of the 9
+    (N,) the points whose heights are wanted; those of others are 0. None: all. `per_column`: of each of the 9
     columns of three cells around a point, this many points count; the edge of a cell is at least the reach of the
-    point. `threads`: as in `smooth_surfaces`.
+    point. `points_of_slab`: number of points that are sorted together, or those around a layer of cells; the result
+    does not depend on it. `threads`: as in `smooth_surfaces`.
     """
     from pano_mvs.algorithms.fusion.kernels_smooth import find_heights  # compiles on import
 
-    radii = _REACH * sigmas.astype(np.float64)
     heights = np.zeros(len(points))
-    wanted = np.arange(len(points)) if chosen is None else chosen
-    cloud = points, normals, sigmas
-    marked = np.zeros(len(points), np.bool_)
-    for some, edge in _levels(points, radii, wanted):
-        cells = _cells(points, float(edge))
-        marked[some] = True
-        targets = np.flatnonzero(marked[cells[-1]])
-        marked[some] = False
+    grid = _extent(points)
+    edges, levels = _levels(grid, sigmas, np.ones(len(points), np.bool_) if chosen is None else chosen)
+    for level, edge in edges.items():
+        for own, around in _slabs(points, float(grid[0][0]), edge, points_of_slab):
+            cloud = points[around], normals[around], sigmas[around]
+            radii, found = _REACH * cloud[2].astype(np.float64), np.zeros(len(cloud[0]))
+            cells = _cells(cloud[0], grid, edge)
+            own = own & (levels[around] == level)
+            targets = np.flatnonzero(own[cells[-1]])
 
-        def find(first: int, count: int, *, targets: IntArray = targets, cells: tuple[IntArray, ...] = cells) -> None:
-            find_heights(cloud, radii, targets, cells, per_column, heights, (first, first + count))
+            def find(
+                first: int,
+                count: int,
+                *,
+                targets: IntArray = targets,
+                cells: tuple[IntArray, ...] = cells,
+                cloud: tuple[NDArray[np.float32], ...] = cloud,
+                arrays: tuple[FloatArray, FloatArray] = (radii, found),
+            ) -> None:
+                find_heights(cloud, arrays[0], targets, cells, per_column, arrays[1], (first, first + count))
 
-        for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
+            for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
+            heights[around] = np.where(own, found, heights[around])
     return heights
 
 
-def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) -> list[tuple[IntArray, float]]:
-    """Return the wanted points of each level, and the edge of its cells, which is not smaller than their radii."""
-    if not len(wanted):
-        return []
-    extent = float((points.max(axis=0) - points.min(axis=0)).max())
-    most = float(radii[wanted].max()) / 2 ** (_MAX_LEVELS - 1)
-    least = max(float(np.quantile(radii[wanted], 0.3)), most, extent / _MAX_CELLS_PER_AXIS)
-    level = np.ceil(np.log2(np.maximum(radii[wanted] / least, 1))).astype(np.int64)
-    return [(wanted[level == number], least * 2.0**number) for number in np.unique(level)]
+def _slabs(
+    points: NDArray[np.float32], least: float, edge: float, most: int
+) -> Iterator[tuple[NDArray[np.bool_], IntArray | slice]]:
+    """Yield the points of slabs of cells and the next cells on either side, and which of them are in the slab."""
+    if len(points) <= most:
+        yield np.ones(len(points), np.bool_), slice(None)
+        return
+    layers = np.empty(len(points), np.int32)
+    for part in _parts(len(points)):
+        layers[part] = np.floor((points[part, 0] - np.float32(least)) / edge)  # as in `find_cells`
+    counts = np.bincount(layers)
+    first, before = 0, np.concatenate([[0], np.cumsum(counts)])
+    while first < len(counts):
+        end = first + 1
+        while end < len(counts) and before[min(end + 2, len(counts))] - before[max(first - 1, 0)] <= most:
+            end += 1
+        around = np.flatnonzero((layers >= first - 1) & (layers <= end))
+        here = layers[around]
+        yield (here >= first) & (here < end), around
+        first = end
 
 
-def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, ...]:
+Extent = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+def _extent(points: NDArray[np.float32]) -> Extent:
+    """Return the least and the largest coordinates, (3,) each."""
+    # One axis at a time: columns of a large (N, 3) array are slow to reduce.
+    columns = (np.ascontiguousarray(points[:, axis]) for axis in range(3))
+    least, most = np.array([(column.min(), column.max()) for column in columns], np.float32).T
+    return least, most
+
+
+def _levels(
+    grid: Extent, sigmas: NDArray[np.float32], wanted: NDArray[np.bool_]
+) -> tuple[dict[int, float], NDArray[np.int8]]:
+    """Return the edge of the cells of each level, at least the radii of its points, and the level of each point.
+
+    Points that are not wanted, (N,), have level −1.
+    """
+    levels = np.full(len(sigmas), -1, np.int8)
+    if not wanted.any():
+        return {}, levels
+    radii = _REACH * sigmas[wanted].astype(np.float64)
+    extent = float((grid[1] - grid[0]).max())
+    most = float(radii.max()) / 2 ** (_MAX_LEVELS - 1)
+    least = max(float(np.quantile(radii, 0.3)), most, extent / _MAX_CELLS_PER_AXIS)
+    del radii
+    for part in _parts(len(sigmas)):
+        level = np.ceil(np.log2(np.maximum(_REACH * sigmas[part].astype(np.float64) / least, 1))).astype(np.int8)
+        levels[part] = np.where(wanted[part], level, np.int8(-1))
+    return {int(level): least * 2.0 ** int(level) for level in np.unique(levels) if level >= 0}, levels
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Yield parts of an array of this many points."""
+    for first in range(0, count, _POINTS_OF_PART):
+        yield slice(first, first + _POINTS_OF_PART)
+
+
+def _cells(points: NDArray[np.float32], grid: Extent, edge: float) -> tuple[IntArray, ...]:
     """Return the cells of this edge, as `find_heights` needs them; the last array is the order of the points."""
     from pano_mvs.algorithms.fusion.kernels_smooth import find_cells, find_starts, sort_keys  # compile on import
 
-    # One axis at a time: columns of a large (N, 3) array are slow to reduce.
-    extents = [(axis.min(), axis.max()) for axis in np.ascontiguousarray(points.T)]
-    least, most = np.array(extents, np.float32).T
+    least, most = grid
     shape = np.floor((most - least).astype(np.float64) / edge).astype(np.int64) + 3
     own, order = sort_keys(find_cells(points, least, edge, shape), int(np.prod(shape)))
     keys, starts = find_starts(own)

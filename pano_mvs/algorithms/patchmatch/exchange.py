@@ -101,6 +101,8 @@ def exchange_ranges(
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     own = compare_with_sources(np.where(seen, range_map.range, np.float32(np.nan)), *views, **limits)
     unsure = seen & ((own.agreeing < 1) | (own.support < min_support))
+    own_agreeing = np.minimum(own.agreeing, _MOST_AGREEING).astype(np.uint8).ravel()
+    del own  # large
     least = min(min_agreeing, max(len(sources), 2))
     farthest = np.where(unsure, range_map.range * (1 - max_relative_error), np.float32(0)).astype(np.float32)
     known = [seen_ranges(view, min_confidence=WEAK_CONFIDENCE[0]) for view in views[0]]
@@ -117,7 +119,7 @@ def exchange_ranges(
     wanted = np.unique(offers.pixels)
     own_scores = np.zeros(seen.size)
     own_scores[wanted] = match.correlation(Offers.of(range_map, wanted))
-    own_scores[wanted] += agreement * np.minimum(own.agreeing.ravel()[wanted], _MOST_AGREEING)
+    own_scores[wanted] += agreement * own_agreeing[wanted]
     better = np.flatnonzero(scores > own_scores[offers.pixels])
     # The last of a pixel counts: the best one, and of equals that of the first source.
     better = better[::-1][np.argsort(scores[better[::-1]], kind="stable")]

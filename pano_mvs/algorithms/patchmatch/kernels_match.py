@@ -16,6 +16,8 @@ from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fas
 
 # Parts of red, green and blue in 10,000; levels are in 1/256.
 _RED, _GREEN, _BLUE, _WHOLE, _FINE = 2126, 7152, 722, 10000, 256
+# Levels of `pad_grey` are in 1/128; the highest bit marks pixels that do not vote.
+_COARSE, _NO_VOTE, _LEVEL = 128, 32768, 32767
 
 
 @kernel
@@ -45,6 +47,24 @@ def pack_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint64]:
             right = grey[upper, upper_right] | grey[lower, lower_right] << np.uint64(16)
             packed[j, i] = left | right << np.uint64(32)
     return packed
+
+
+@kernel
+def pad_grey(picture: NDArray[np.uint8], votes: NDArray[np.bool_], padded: NDArray[np.uint16]) -> None:
+    """Write the grey levels of a picture, (H, W, 3) to (H + 2, W + 2), one pixel over the seam and the poles.
+
+    It holds the patches of `pack_grey` in a quarter of the memory, in 1/128 grey levels: (j, i) to (j + 1, i + 1) are
+    those of patch (j, i). Pixels that do not vote, (H, W), are marked.
+    """
+    height, width, _ = picture.shape
+    for j in range(height + 2):
+        row = wrapped_row(j - 1, height)
+        for i in range(width + 2):
+            column = wrapped_column(j - 1, i - 1, height, width)
+            red, green, blue = picture[row, column, 0], picture[row, column, 1], picture[row, column, 2]
+            level = np.int32(_RED) * red + np.int32(_GREEN) * green + np.int32(_BLUE) * blue
+            rounded = (np.uint32(level) * np.uint32(_COARSE) + np.uint32(_WHOLE // 2)) // np.uint32(_WHOLE)
+            padded[j, i] = rounded | np.uint32(0 if votes[row, column] else _NO_VOTE)
 
 
 Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
@@ -139,16 +159,16 @@ def project_samples(
     """Project rays of one row, at inverse ranges q, into a packed source, with the derivative by q.
 
     `azimuth`: (2, ·) float32 sin θ and cos θ of the columns. `first`: the first column. `inverse`: (n,) float32 q.
-    `matrix`: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q). `shape`: (2,) int64 rows and columns of the
-    source. `index`: (n,) int32, written: position in the packed source. `placed`: (4 · STRETCH,) float32, written:
-    weights of the right and of the lower neighbours, dx/dq and dy/dq in pixels.
+    `matrix`: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q). `shape`: (3,) int64 rows and columns of the
+    source, and columns of its array. `index`: (n,) int32, written: position in the packed source. `placed`: (4 ·
+    STRETCH,) float32, written: weights of the right and of the lower neighbours, dx/dq and dy/dq in pixels.
     """
     m00, m01, o0, t0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
     m10, m11, o1, t1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
     m20, m21, o2, t2 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
     x_scale, y_scale = _F(shape[1] / (2 * np.pi)), _F(shape[0] / np.pi)
     x_middle, y_middle = _F(shape[1] / 2 + 0.5), _F(shape[0] / 2 + 0.5)
-    stride = np.int32(shape[1] + 1)
+    stride = np.int32(shape[2])
     last_row, last_column = np.int32(shape[0]), np.int32(shape[1])
     start = _U(first)
     for i in range(_U(inverse.shape[0])):
@@ -178,6 +198,27 @@ def gather_samples(
     base = _U(start)
     for i in range(_U(index.shape[0])):
         patches[i] = packed[base + _U(index[i])]
+
+
+@kernel
+def gather_grey(
+    grey: NDArray[np.uint16], start: int, stride: int, index: NDArray[np.int32], patches: NDArray[np.uint64]
+) -> None:
+    """Fetch the patches of `gather_samples`, doubled, from pictures of `pad_grey`, whose rows are `stride` apart."""
+    upper, lower, level, next_column = _U(start), _U(start + stride), _U(_LEVEL), _U(1)
+    for i in range(_U(index.shape[0])):
+        above, below = upper + _U(index[i]), lower + _U(index[i])
+        left = (_U(grey[above]) & level) | (_U(grey[below]) & level) << _U(16)
+        right = (_U(grey[above + next_column]) & level) | (_U(grey[below + next_column]) & level) << _U(16)
+        patches[i] = (left | right << _U(32)) << _U(1)
+
+
+@inlined
+def may_vote(grey: NDArray[np.uint16], start: int, stride: int) -> bool:
+    """Return whether no pixel of the patch that begins at `start` of a picture of `pad_grey` is marked."""
+    upper, lower = _U(start), _U(start + stride)
+    marks = (_U(grey[upper]) | _U(grey[upper + _U(1)])) | (_U(grey[lower]) | _U(grey[lower + _U(1)]))
+    return marks < _U(_NO_VOTE)
 
 
 @kernel
@@ -261,10 +302,10 @@ def sum_windows(
 
     `planes`: (3, n) float32. `place`: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of
     the window. `azimuth`: (2, W + 2 pad) float32 sin θ and cos θ of the columns. `window`: weights and centred samples,
-    (side², n) float32, and means (n,), of the reference. `sources`: (·,) uint64 packed pictures, (S,) where each
-    begins, (S, 2) their sizes, (S, 3, 4) float64 source_from_reference, (·,) uint8 which patches count, empty if all
-    do, and (S,) where each begins. `sums`: (S, SUMS, STRETCH) float32, written. `votes`: (S, n) bool, written: True
-    where the source counts for the pixel.
+    (side², n) float32, and means (n,), of the reference. `sources`: (·,) pictures of `pack_grey` or of `pad_grey`, (S,)
+    where each begins, (S, 3) their sizes and the columns of their arrays, (S, 3, 4) float64 source_from_reference, (·,)
+    uint8 which patches of `pack_grey` count, empty if all do, and (S,) where each begins. `sums`: (S, SUMS, STRETCH)
+    float32, written. `votes`: (S, n) bool, written: True where the source counts for the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
     weights, centred, means = window
@@ -283,10 +324,17 @@ def sum_windows(
             v, column = rows[k // side], columns[k % side]
             row_matrix(poses[s], elevation_from_y(row + v + 0.5, height), matrix)
             project_samples(azimuth, pad + first + column, inverse[k], matrix, shapes[s], index, placed)
-            gather_samples(packed, starts[s], index, patches)
+            is_packed = shapes[s, 2] == shapes[s, 1] + 1
+            if is_packed:
+                gather_samples(packed, starts[s], index, patches)
+            else:
+                gather_grey(packed, starts[s], shapes[s, 2], index, patches)
             add_samples(
                 patches, placed, (weights[k], centred[k], means), (_F(column / stretch), _F(v)), sums[s].reshape(-1)
             )
             if v == 0 and column == 0:
                 for i in range(n):
-                    votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0
+                    if is_packed:
+                        votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0
+                    else:
+                        votes[s, i] = may_vote(packed, starts[s] + index[i], shapes[s, 2])

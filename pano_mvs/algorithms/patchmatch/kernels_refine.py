@@ -179,19 +179,21 @@ def fit_planes(
     stretches: FloatArray,
     max_step: float,
     planes: NDArray[np.float32],
+    part: tuple[int, int],
 ) -> None:
     """Write the planes of some rows, (3, H, W) float32; 0, the plane at infinity, where the range is unknown.
 
     `inverse`: (H, W) float32 1 / range, NaN where unknown. `first`: the first row. `rows`: number of rows. `offsets`:
     (H, side) int64 columns of the window. `stretches`: (H,) float64 columns per step in u. `max_step`: see
-    `fit_slopes`. `planes`: (3, H, W) float32, written.
+    `fit_slopes`. `planes`: (3, H, W) float32, written. `part`: the row of the panorama with which the arrays begin, and
+    the number of its rows; (0, H) if the arrays are whole.
     """
-    height, width = inverse.shape
+    width, (top, height) = inverse.shape[1], part
     radius, pad = offsets.shape[1] // 2, offsets[first : first + rows].max()
     padded = _padded_rows(inverse, first - radius, rows + 2 * radius, pad)
     turned = sines_of_columns(width)
     for row in range(first, first + rows):
-        elevation = elevation_from_y(row + 0.5, height)
+        elevation = elevation_from_y(top + row + 0.5, height)
         level, dip, stretch = np.cos(elevation), np.sin(elevation), stretches[row]
         # The lengths of the ray's derivatives by u and v: (cos θ, 0, −sin θ) and (sin φ sin θ, cos φ, sin φ cos θ).
         across, down = 2 * np.pi / width * level * stretch, np.pi / height
@@ -341,6 +343,7 @@ def refine_rows(
     weighted: bool,
     inverse: NDArray[np.float32],
     views: NDArray[np.float32],
+    part: tuple[int, int],
 ) -> None:
     """Write the refined inverse ranges of some rows.
 
@@ -350,30 +353,31 @@ def refine_rows(
     of the window. `sources`: see `sum_windows`. `numbers`: 1 / width in grey levels of the window's weights, noise,
     information of the prior on α, the same on β and γ, samples, maximum step in q. `weighted`: whether `views` holds
     weights; otherwise the better half of the sources counts. `inverse`: (H, W) float32, written. `views`: (S, H, W)
-    float32 weights of the sources, replaced by their correlations; −2 where one does not count.
+    float32 weights of the sources, replaced by their correlations; −2 where one does not count. `part`: as of
+    `fit_planes`.
     """
     grey, azimuth, pad, stretches, window_rows, window_columns = reference
     color_scale, noise, prior_q, prior_slope, samples, largest = numbers
-    _, height, width = planes.shape
+    width, (top, height) = planes.shape[2], part
     count, side = len(sources[1]), len(window_rows)
     prior, turned = (prior_q, prior_slope), sines_of_columns(width)
     for row in range(first_row, first_row + rows):
-        elevation = elevation_from_y(row + 0.5, height)
+        elevation = elevation_from_y(top + row + 0.5, height)
         level, dip = np.cos(elevation), np.sin(elevation)
         for first in range(0, width, STRETCH):
             n = min(STRETCH, width - first)
             weights, centred = np.empty((side * side, n), np.float32), np.empty((side * side, n), np.float32)
             moments, sums = np.empty((2, n), np.float32), np.empty((count, SUMS, STRETCH), np.float32)
             votes, correlations = np.empty((count, n), np.bool_), np.empty((count, n), np.float32)
-            steps, part = np.empty(n, np.float32), planes[:, row, first : first + n].copy()
-            place = row, first, height, stretches[row], pad, window_rows, window_columns[row]
-            weigh_window(grey, place, color_scale, weights, centred, moments)
-            sum_windows(part, place, azimuth, (weights, centred, moments[0]), sources, sums, votes)
+            steps, own = np.empty(n, np.float32), planes[:, row, first : first + n].copy()
+            shared = first, height, stretches[row], pad, window_rows, window_columns[row]
+            weigh_window(grey, (row, *shared), color_scale, weights, centred, moments)
+            sum_windows(own, (top + row, *shared), azimuth, (weights, centred, moments[0]), sources, sums, votes)
             correlate_sources(sums, votes, moments[1], noise, correlations)
             given = views[:, row, first : first + n].copy()
             most_likely_steps(sums, correlations, moments[1], noise, prior, samples, given, weighted, steps)
             views[:, row, first : first + n] = correlations
             for i in range(_U(n)):
                 x = _U(first) + i
-                q = part[0, i] * (level * turned[0, x]) + part[1, i] * -dip + part[2, i] * (level * turned[1, x])
+                q = own[0, i] * (level * turned[0, x]) + own[1, i] * -dip + own[2, i] * (level * turned[1, x])
                 inverse[row, x] = max(q + min(max(steps[i], -largest), largest), q / 2)

@@ -18,21 +18,26 @@ planes of neighbours by correlation alone extends the nearer surface across edge
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import ceil
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
-from pano_mvs.core.arrays import FloatImage, Mask, Picture
+from pano_mvs.core.arrays import FloatArray, FloatImage, Mask, Picture
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
+
+if TYPE_CHECKING:  # kernels compile on import
+    from pano_mvs.algorithms.patchmatch.kernels_match import Sources
+    from pano_mvs.algorithms.patchmatch.kernels_refine import Numbers
 
 # Standard deviation of the correlation, from 1, of a source that sees the surface.
 _SIGMA = 0.3
@@ -143,60 +148,128 @@ def refine_range(
         UsageError: if shapes do not match or a parameter is out of bounds.
     """
     _check(range_map, reference, sources, poses=source_from_reference, masks=source_masks)
+    height, width = range_map.range.shape
+    settings = WindowSettings(window, prior_px, prior_slope, noise, sigma_color)
+    return refine_part(
+        range_map,
+        reference,
+        source_arrays(sources, source_from_reference, source_masks, reach=settings.reach / height),
+        numbers=settings.numbers(width, source_from_reference),
+        window=window,
+        rounds=rounds,
+        view_weights=view_weights,
+        limits=swept_limits(range_map),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSettings:
+    """The settings of `refine_range` that say how windows are matched."""
+
+    window: int
+    prior_px: float
+    prior_slope: float
+    noise: float
+    sigma_color: float
+
+    @property
+    def reach(self) -> float:
+        """The largest distance of a sample from a window's centre in a source, in pixels of the reference."""
+        return SOURCE_REACH * (self.window // 2)
+
+    def numbers(self, width: int, source_from_reference: Sequence[Rigid3]) -> Numbers:
+        """Return the kernel's numbers, see `refine_rows`, for a reference of this width."""
+        # The change of inverse range that moves a point by one pixel at the widest baseline.
+        pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
+        return (
+            np.float32(1 / self.sigma_color),
+            np.float32(self.noise**2),
+            (self.prior_px * pixel_q) ** -2,
+            (self.prior_slope * pixel_q) ** -2,
+            _SAMPLES,
+            np.float32(_MAX_STEP_PX * pixel_q),
+        )
+
+
+def swept_limits(range_map: RangeMap) -> tuple[float, float]:
+    """Return the farthest and the nearest range that a refined pixel may have."""
+    swept = range_map.range[range_map.confidence >= WEAK_CONFIDENCE[0]]
+    return (_BEYOND * float(swept.max()), float(swept.min()) / _BEYOND) if len(swept) else (1.0, 1.0)
+
+
+def refine_part(
+    range_map: RangeMap,
+    reference: Picture,
+    sources: Sources,
+    *,
+    numbers: Numbers,
+    window: int,
+    rounds: int,
+    view_weights: bool,
+    limits: tuple[float, float],
+    part: tuple[int, int] | None = None,
+) -> RangeMap:
+    """Refine the ranges of some rows of a panorama, all columns of them.
+
+    Rows within `margin_of_part` of an edge that is no pole differ from what the whole panorama would give.
+
+    `range_map`, `reference`: (h, W), as of `refine_range`. `sources`: see `source_arrays`. `numbers`: see
+    `WindowSettings`. `window`, `rounds`, `view_weights`: as of `refine_range`. `limits`: see `swept_limits`. `part`:
+    the first row, and the number of rows of the panorama; None: the rows are all of them.
+    """
     import numba  # slow to import
 
     from pano_mvs.algorithms.patchmatch import kernels_refine  # compiles on import
 
-    height, width = range_map.range.shape
-    # The change of inverse range that moves a point by one pixel at the widest baseline.
-    pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
-    numbers = (
-        np.float32(1 / sigma_color),
-        np.float32(noise**2),
-        (prior_px * pixel_q) ** -2,
-        (prior_slope * pixel_q) ** -2,
-        _SAMPLES,
-        np.float32(_MAX_STEP_PX * pixel_q),
-    )
-    offsets = column_offsets((height, width), 2 * (window // 2), spherical=True)[:, ::2].copy()
-    stretches = column_stretch(height, spherical=True)
-    near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)
-    views = (
-        reference_arrays(reference, offsets, stretches),
-        source_arrays(sources, source_from_reference, source_masks, reach=SOURCE_REACH * (window // 2) / height),
-    )
+    rows_here, width = range_map.range.shape
+    top, height = part = part or (0, rows_here)
+    here = slice(top, top + rows_here)
+    offsets = column_offsets((height, width), 2 * (window // 2), spherical=True)[here, ::2].copy()
+    stretches = column_stretch(height, spherical=True)[here].copy()
+    near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)[here].copy()
+    views = reference_arrays(reference, offsets, stretches), sources
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
-    planes = np.empty((3, height, width), np.float32)
+    planes = np.empty((3, rows_here, width), np.float32)
     max_step = _MAX_SLOPE * 2 * np.pi / width
 
     def lay(first: int, rows: int) -> None:
-        kernels_refine.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes)
+        kernels_refine.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes, part)
 
     def match(first: int, rows: int) -> None:
-        kernels_refine.refine_rows(first, rows, planes, *views, numbers, weights.known, inverse, weights.views)
+        kernels_refine.refine_rows(first, rows, planes, *views, numbers, weights.known, inverse, weights.views, part)
 
     threads = numba.get_num_threads()
-    weights = ViewWeights(len(sources), (height, width))
+    weights = ViewWeights(len(sources[1]), (rows_here, width))
     for left in reversed(range(rounds)):
-        for_bands(lay, height, threads=threads)
-        for_bands(match, height, threads=threads)
+        for_bands(lay, rows_here, threads=threads)
+        for_bands(match, rows_here, threads=threads)
         inverse[~seen] = np.nan
         if view_weights and left:
             weights.update()
-    for_bands(lay, height, threads=threads)
-    return _range_map_from_planes(planes, range_map, seen)
+    for_bands(lay, rows_here, threads=threads)
+    return _range_map_from_planes(planes, range_map, seen, limits=limits, rays=ray_grid((height, width), here))
 
 
-def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> RangeMap:
+def margin_of_part(rounds: int, window: int) -> int:
+    """Return the number of rows at an edge that `refine_part` does not refine as it would in the whole panorama.
+
+    A window lacks its pixels beyond the edge; a round looks at planes and weights around a pixel; the last planes are
+    fitted once more.
+    """
+    return 2 * (window // 2) + rounds * (_FIT_RADIUS + _RADIUS) + _FIT_RADIUS
+
+
+def _range_map_from_planes(
+    planes: FloatImage, before: RangeMap, seen: Mask, *, limits: tuple[float, float], rays: FloatArray
+) -> RangeMap:
     """Return the ranges along the rays and the normals of planes (3, H, W) where they are meaningful.
 
     A plane that intersects its ray far outside of the swept ranges is an accident: the swept range is kept.
     """
     height, width = before.range.shape
-    inverse = np.einsum("ahw,hwa->hw", planes.astype(np.float64), ray_grid((height, width)))
-    swept = before.range[seen]
-    farthest, nearest = (_BEYOND * float(swept.max()), float(swept.min()) / _BEYOND) if len(swept) else (1.0, 1.0)
+    inverse = np.einsum("ahw,hwa->hw", planes.astype(np.float64), rays)
+    farthest, nearest = limits
     met = seen & (inverse * farthest > 1) & (inverse * nearest < 1)
     ranges = np.divide(1.0, inverse, out=before.range.astype(np.float64), where=met)
     length = np.linalg.norm(planes, axis=0)
@@ -211,7 +284,8 @@ def reference_arrays(
 ) -> tuple[object, ...]:
     """Return the kernels' arguments for the reference image, see `refine_rows`."""
     width = reference.shape[1]
-    rows = offsets[len(offsets) // 2]
+    side = offsets.shape[1]
+    rows = np.arange(1 - side, side, 2)  # two pixels apart, as the columns at the equator
     pad = max(int(offsets.max()), int(rows[-1]))
     azimuth = 2 * np.pi * ((np.arange(-pad, width + pad) + 0.5) / width - 0.5)
     grey = pad_panorama((reference @ _LUMA).astype(np.float32), pad)
@@ -220,7 +294,7 @@ def reference_arrays(
 
 def source_arrays(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
-) -> tuple[object, ...]:
+) -> Sources:
     """Return the kernels' arguments for the sources, see `sum_windows`; `reach`: window size in image heights."""
     from pano_mvs.algorithms.patchmatch.kernels_match import pack_grey  # compiles on import
 
@@ -232,7 +306,7 @@ def source_arrays(
         voting = [pixels_with_valid_window(mask, ceil(reach * mask.shape[0])) for mask in given]
         valid = np.concatenate([_whole_patches(mask).ravel() for mask in voting])
     matrices = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in poses])
-    shapes = np.array([source.shape[:2] for source in sources])
+    shapes = np.array([(*source.shape[:2], source.shape[1] + 1) for source in sources])
     return np.concatenate(pictures), starts, shapes, matrices, valid, starts
 
 

@@ -79,16 +79,18 @@ def compare_with_sources(
     # Copied, since the kernel is compiled once more for arrays that are read-only.
     ranges, grid = np.array(ranges, np.float32), sines_of_grid((shape[0], shape[1]))
     limits = max_relative_error, max_angle, MAX_SURFACE_STEP
-    views = [
-        (_arrays_of(moved), seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0]))
-        for source, moved in zip(sources, source_from_reference, strict=True)
-    ]
+    for source, moved in zip(sources, source_from_reference, strict=True):  # one after the other, to save memory
+        view, known = _arrays_of(moved), seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
 
-    def compare(first: int, rows: int) -> None:
-        for view, known in views:
+        def compare(
+            first: int,
+            rows: int,
+            view: tuple[FloatArray, FloatArray] = view,
+            known: NDArray[np.float32] = known,
+        ) -> None:
             compare_rows((first, first + rows), ranges, grid, view, known, limits, counts, sums)
 
-    for_bands(compare, shape[0], threads=numba.get_num_threads())
+        for_bands(compare, shape[0], threads=numba.get_num_threads())
     return comparison
 
 

@@ -213,7 +213,9 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
     If the uncertainty is known, uncertainty/<image>.tiff has the standard deviation divided by the range (float32).
     Other formats, and normals/<image>, are optional. The unit of a 16-bit PNG is in range/<image>.json.
     """
-    valid = range_map.valid if image is None else range_map.valid & image.load_mask()
+    valid = range_map.valid
+    if image is not None:
+        valid &= image.at_width(valid.shape[1]).load_mask()
     values = np.where(valid, range_map.range, np.float32(np.nan))
     files = {f"range/{{item}}.{name}": _write_range(values, name, params, ctx=ctx) for name in params.formats}
     if "png" in params.formats:

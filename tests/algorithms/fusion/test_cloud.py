@@ -523,6 +523,20 @@ def test_heights_equal_the_plain_fit() -> None:
     assert 0.1 < (expected != 0).mean() < 0.95
 
 
+@pytest.mark.kernel("fusion.kernels_smooth")
+@pytest.mark.parametrize("points_of_slab", [1, 700, 2500])
+def test_slabs_change_no_height(points_of_slab: int) -> None:
+    rng = np.random.default_rng(7)
+    wall = noisy_wall(rng, noise=0.03, sigma=0.06)
+    sigmas = rng.uniform(0.01, 0.2, len(wall)).astype(np.float32)
+    arrays = wall.points_in_world, wall.normals_in_world, sigmas
+    chosen = rng.random(len(wall)) < 0.8
+    whole = surface_heights(*arrays, chosen=chosen)
+    found = surface_heights(*arrays, chosen=chosen, points_of_slab=points_of_slab)
+    assert (whole != 0).mean() > 0.2
+    np.testing.assert_array_equal(found, whole)
+
+
 def test_a_noisy_wall_becomes_thin() -> None:
     before = noisy_wall(np.random.default_rng(0), noise=0.03, sigma=0.06)
     after = smooth_surfaces(before, CENTERS)
