@@ -18,7 +18,7 @@ from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
-from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks, with_joint_doubts
+from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_camera_checks
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
@@ -69,7 +69,7 @@ def solve_scaled_translation(
         pairs = weighed_by_images(pairs, confirmation)
     floors = None if load is None else Floors(lambda image: load(names[image]))
     models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation, floors=floors)
-    groups = [_finished(grown, adjust=adjust, confirmation=confirmation) for grown in models]
+    groups = [_finished(grown, adjust=adjust) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
@@ -113,7 +113,7 @@ def _grown_and_joined(
     return sorted(found, key=lambda one: (-len(one.model.cameras), min(one.model.cameras))), reasons
 
 
-def _finished(grown: GrownModel, *, adjust: bool, confirmation: Confirmation | None) -> Poses:
+def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
     """Return a finished model as poses of one group, with points."""
     model = grown.model
     if adjust:
@@ -121,4 +121,4 @@ def _finished(grown: GrownModel, *, adjust: bool, confirmation: Confirmation | N
     poses = normalised_poses(poses_of(model))
     if grown.checks is not None:
         poses = with_camera_checks(poses, model.pairs, grown.checks)
-    return poses if confirmation is None else with_joint_doubts(poses, model, confirmation)
+    return poses

@@ -50,6 +50,7 @@ def view_of(second_from_first: Rigid3, matches_idx: NDArray[np.int32]) -> TwoVie
         residuals_rad=np.zeros(len(matches_idx), np.float32),
         geometry="general",
         candidates=len(matches_idx),
+        log10_false_alarms=-float(len(matches_idx)),
         direction_std_deg=0.1,
     )
 

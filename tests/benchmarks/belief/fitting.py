@@ -1,10 +1,10 @@
-"""Fit the model of `pano_mvs.algorithms.poses.belief` to measured cameras, and see how well it is calibrated."""
+"""Fit the model of belief of `poses.verify` to measured cameras, and see how well it is calibrated."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,32 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from tests.benchmarks.belief.model import Model, Term, steps_behind
+from pano_mvs.algorithms.poses.verification.belief.model import Model, Term, steps_behind
 
 FloatArray = NDArray[np.float64]
 
 SIGNS = {
     "ratio": 1,
     "share": 1,
-    "explained": 1,
     "agreeing": 1,
-    "alarms_best": 1,
-    "residual_deg": -1,
     "scale_worst": -1,
-    "parallax_deg": 1,
-    "rival_weight": -1,
     "place_rival": -1,
-    "place_gain": -1,
-    "alias_gain": -1,
-    "alias_gain_elsewhere": -1,
-    "learned_share": -1,
-    "bridge_matches": 1,
-    "joint_matches": 1,
+    "repeats": -1,
     "joint_contradicting": -1,
-    "height": -1,
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 
+OF_IMAGES, OF_PAIRS = {"ratio", "share", "joint_contradicting"}, {*SIGNS} - {"ratio", "share", "joint_contradicting"}
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
 PENALTY = 3.0
 
@@ -109,8 +99,10 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
     """Return the model with the largest likelihood less a penalty on the squared losses.
 
     Knots are quantiles of each measurement. All losses are at least 0, so that each measurement only ever counts the
-    way of its sign, and a missing one is never better than the best.
+    way of its sign, and a missing one is never better than the best. Each camera counts three times: with all that was
+    measured, with the measurements of images alone and with those of pairs alone, since users may lack either.
     """
+    cameras = _joined([cameras, _only(cameras, OF_IMAGES), _only(cameras, OF_PAIRS)])
     knots = {name: _knots(cameras.columns[name], sign) for name, sign in signs.items()}
     behind = np.hstack([steps_behind(cameras.columns[name], knots[name]) for name in signs])
     target = cameras.right.astype(np.float64)
@@ -139,6 +131,23 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
         at += count
     return Model(
         round(float(found.x[0]), 4), {name: term for name, term in terms.items() if any(term.losses) or term.missing}
+    )
+
+
+def _only(cameras: Cameras, names: Set[str]) -> Cameras:
+    missing = np.full(len(cameras.right), np.nan)
+    columns = {name: values if name in names else missing for name, values in cameras.columns.items()}
+    return replace(cameras, columns=columns)
+
+
+def _joined(parts: Sequence[Cameras]) -> Cameras:
+    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+    return Cameras(
+        columns,
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("right", "doubted", "family", "capture")
+        ),
     )
 
 

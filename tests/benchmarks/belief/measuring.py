@@ -14,13 +14,14 @@ from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.lightglue import match_learned
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
+from pano_mvs.algorithms.poses.verification.joints import measured_joints
 from pano_mvs.algorithms.poses.verification.verify_poses import VerifiedGroup, verified_group
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups
-from tests.benchmarks.belief.evidence import camera_evidence
 from tests.benchmarks.belief.families import Capture
 from tests.benchmarks.poses.placements import judge_placements
 
@@ -137,7 +138,15 @@ def _displaced(poses: Poses, rng: np.random.Generator) -> Poses:
 
 
 def _rows(capture: Capture, variant: str, found: VerifiedGroup, *, group: int, learned: bool) -> list[dict[str, Any]]:
-    placed, evidence = judge_placements(found.poses, capture.truth), camera_evidence(found)
+    placed, evidence = (
+        judge_placements(found.poses, capture.truth),
+        camera_evidence(
+            found.model,
+            found.checks.shares,
+            found.checks.expected,
+            joints=measured_joints(found.model, found.confirmation),
+        ),
+    )
     return [
         asdict(
             Measured(
@@ -152,7 +161,10 @@ def _rows(capture: Capture, variant: str, found: VerifiedGroup, *, group: int, l
                 float(placed.rotation_deg[idx]),
                 float(placed.center_shares[idx]),
                 bool(placed.doubted[idx]),
-                {key: float(value) if np.isfinite(value) else None for key, value in evidence[name].items()},
+                {
+                    key: float(value) if np.isfinite(value) else None
+                    for key, value in evidence[found.model.pairs.names.index(name)].items()
+                },
             )
         )
         for idx, name in enumerate(placed.names)

@@ -3,10 +3,11 @@
 Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
 
 FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds; FIT may also be `evidence.csv`, the
-table of the captures that docs/benchmarks.md is about. The script prints, for all families
-and for each, how many right cameras are doubted and how many wrong ones are not, by the rules of `poses.verify` and by
-the model; cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. A
-camera is doubted if p is below `MISS_COST` / (1 + `MISS_COST`). `--picture FILE` draws the reliability diagram.
+table of the captures that docs/benchmarks.md is about. The script prints, for all families and for each, how many right
+cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model.
+Cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. With
+`--coefficients pano_mvs/algorithms/poses/verification/belief/coefficients.py`, the model replaces the one in use;
+`--picture FILE` draws the reliability diagram.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.poses.verification.belief.model import Model
+from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful
 from tests.benchmarks.belief.fitting import (
     PENALTY,
     SIGNS,
@@ -36,9 +39,11 @@ from tests.benchmarks.belief.fitting import (
 
 FloatArray = NDArray[np.float64]
 
-MISS_COST = 5.0
-"""Cost of a wrong camera that is not doubted, relative to that of a right one that is."""
 BINS = 10
+
+
+UNDECIDABLE = "twin_house"
+"""Rooms that are equal in everything: nothing measured can be for or against their cameras, so they are not fitted."""
 
 
 def read(files: Sequence[Path]) -> Cameras:
@@ -48,9 +53,14 @@ def read(files: Sequence[Path]) -> Cameras:
     return cameras_of([json.loads(line) for file in files for line in file.read_text().splitlines()])
 
 
+def decidable(cameras: Cameras) -> Cameras:
+    """Return the cameras without those of `UNDECIDABLE`."""
+    return cameras[cameras.family != UNDECIDABLE]
+
+
 def doubted(probability: FloatArray) -> NDArray[np.bool_]:
     """Return which cameras are doubted."""
-    return np.asarray(probability < MISS_COST / (1 + MISS_COST))
+    return np.array([is_doubtful(one) for one in probability], np.bool_)
 
 
 def show(title: str, cameras: Cameras, probability: FloatArray) -> None:
@@ -86,6 +96,18 @@ def draw(path: Path, probability: FloatArray, right: NDArray[np.bool_]) -> None:
     pyplot.close(figure)
 
 
+def source_of(model: Model) -> str:
+    """Return the model as a Python module: a change of its coefficients is a change of the code of `poses.verify`."""
+    terms = "".join(
+        f'        "{name}": Term({term.knots}, {term.losses}, {term.missing}),\n' for name, term in model.terms.items()
+    )
+    return (
+        '"""The coefficients that `python -m tests.benchmarks.belief.refit` has fitted."""\n\n'
+        "from pano_mvs.algorithms.poses.verification.belief.model import Model, Term\n\n"
+        f"FITTED = Model(\n    {model.intercept},\n    {{\n{terms}    }},\n)\n"
+    )
+
+
 def main() -> None:
     """Fit, compare and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -99,6 +121,7 @@ def main() -> None:
     cameras = read(options.fit)
     if options.table:
         write_table(options.table, cameras)
+    cameras = decidable(cameras)
     probability = left_out(cameras, penalty=options.penalty)
     show("Families left out of the fit", cameras, probability)
     model = fit(cameras, penalty=options.penalty)
@@ -106,12 +129,12 @@ def main() -> None:
     for name, term in model.terms.items():
         print(f"  {name:22s} {term.knots} {term.losses} missing {term.missing}")
     if options.fresh:
-        fresh = read(options.fresh)
+        fresh = decidable(read(options.fresh))
         probability = probabilities(model, fresh)
         show("Fresh draws", fresh, probability)
         cameras = fresh
     if options.coefficients:
-        options.coefficients.write_text(json.dumps(model.to_json(), indent=1) + "\n")
+        options.coefficients.write_text(source_of(model), encoding="utf-8")
     if options.picture:
         draw(options.picture, probability, cameras.right)
 

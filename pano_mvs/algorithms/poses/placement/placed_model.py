@@ -313,18 +313,11 @@ class PlacedModel:
         for edge in sorted(self.chosen):
             self._learn_ranges(edge)
 
-    def explained_share(self, *, without: Collection[int] = ()) -> float:
-        """Return the share of all pairs of registered images, by weight, that have a geometry that agrees.
-
-        Args:
-            without: images whose pairs are ignored.
-        """
-        images = set(self.cameras) - set(without)
-        total = sum(found[0].weight for edge, found in self.pairs.geometries.items() if images.issuperset(edge))
-        kept = sum(
-            self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items() if images.issuperset(edge)
-        )
-        return kept / total if total else 1.0
+    def explained_share(self) -> float:
+        """Return the share of all pairs of registered images, by weight, that have a geometry that agrees."""
+        pairs = self.pairs.geometries
+        total = sum(found[0].weight for edge, found in pairs.items() if self.cameras.keys() >= {*edge})
+        return self.explained_weight() / total if total else 1.0
 
     def explained_weight(self) -> float:
         """Return the total weight of the geometries that agree with the cameras."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,34 +10,20 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, enough_points
 from pano_mvs.algorithms.poses.verification.aliases import Alias, find_aliases, labellings, moved_cameras
+from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
+from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
+from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST, is_doubtful, reason
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
-from pano_mvs.algorithms.poses.verification.pair_weights import pair_shares
+from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
-# A camera is examined again if its images confirm less than this share of what its neighbours suggest …
+# A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
 _SUSPICIOUS = 0.75
-# … is doubtful if no other pose is better, its pairs do not support it, and the confirmed share stays below this …
-_DOUBTFUL = 0.55
-# … which pairs do that determine its place, because two or more agree with it. Of 1,818 cameras of generated captures,
-# 75 confirmed so little; the pairs of the 66 wrong ones contradicted them, those of the 9 right ones agreed.
-_SUPPORTING = 2
-# … and is left out if its pairs do not support it either.
-_HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
-# Share of all pairs of a group; below this, a camera that looks right may still be the wrong one …
-_MIN_EXPLAINED_IN_ALL = 0.7
-# … unless the pairs of all reliable cameras are explained to this share.
-_MIN_EXPLAINED_BY_OTHERS = 0.85
-# A camera that confirms this share of what is expected is never doubtful, whatever its pairs suggest.
-_CONFIRMED = 0.9
+_HOPELESS, _MIN_EXPLAINED = 0.3, 0.5  # it is left out below these shares of what is expected and of its pairs
 # Where the images confirm more than this share of the texture, matches that contradict a part come from what repeats.
 _MOSTLY_CONFIRMED = 0.5
-# A geometry is likely if two images confirm under it at least this share of what they confirm under their best one.
-_LIKELY = 0.9
-_PERIODIC_SHARE = 0.75
-# A second geometry with this share of the best one's weight is a rival.
-_RIVAL = 0.4
-# Another pose is used if it is better by this factor and by this difference; within the factor it is a rival.
+# Another pose is used if it is better by this factor and by this difference.
 _BETTER, _MARGIN = 1.15, 0.03
 # If no more than this can be expected to be confirmed, nothing can be concluded.
 _MIN_EXPECTED = 0.1
@@ -71,6 +57,7 @@ class CameraChecks:
         shares: image position to the confirmed share of its textured pixels; NaN if too little can be judged.
         expected: image position to the share that its neighbours suggest; NaN likewise.
         moved: images that were moved to another pose.
+        p_right: image position to the probability that its pose is right.
         doubts: images with a doubtful pose, with the reason.
         removed: images that were removed from the model, with the reason.
         asked: whether the images were consulted.
@@ -79,13 +66,14 @@ class CameraChecks:
     shares: dict[int, float] = field(default_factory=dict)
     expected: dict[int, float] = field(default_factory=dict)
     moved: set[int] = field(default_factory=set)
+    p_right: dict[int, float] = field(default_factory=dict)
     doubts: dict[int, str] = field(default_factory=dict)
     removed: dict[int, str] = field(default_factory=dict)
     asked: bool = True
 
 
 def correct_cameras(
-    model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
+    model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), miss_cost: float = MISS_COST
 ) -> CameraChecks:
     """Check all cameras of a model by the images, and correct those for which another pose explains more.
 
@@ -96,7 +84,7 @@ def correct_cameras(
         model: a model with two or more cameras.
         confirmation: of the same capture.
         fixed: images that are never moved or removed, only reported as doubtful.
-        remove: whether a camera that nothing explains is removed from the model.
+        miss_cost: see `is_doubtful`.
     """
     found = CameraChecks()
     ambiguity = ""
@@ -121,23 +109,10 @@ def correct_cameras(
         if not moved:
             break
     _judge(model, confirmation, found)
-    _conclude(model, confirmation, found, fixed=fixed, remove=remove)
-    for doubt in filter(None, (ambiguity, _contradiction(model, found.doubts))):
-        for image in model.cameras:
-            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), doubt)))
+    _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
+    if _leave_out(model, found, fixed=fixed):
+        _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
     return found
-
-
-def _contradiction(model: PlacedModel, doubted: Collection[int]) -> str:
-    """Return a warning if the pairs contradict one another too much for any reliable arrangement; "" otherwise.
-
-    A single wrong camera contradicts all of its pairs. So there is no warning if the pairs agree well without the
-    cameras that are already doubtful.
-    """
-    explained, by_others = model.explained_share(), model.explained_share(without=doubted)
-    if len(model.cameras) < 3 or explained >= _MIN_EXPLAINED_IN_ALL or by_others >= _MIN_EXPLAINED_BY_OTHERS:
-        return ""
-    return f"only {100 * explained:.0f} % of all pairs, by weight, agree with a common arrangement of the cameras"
 
 
 def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
@@ -285,7 +260,7 @@ def check_cameras(model: PlacedModel, confirmation: Confirmation | None) -> Came
         found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
     else:
         _judge(model, confirmation, found)
-    _conclude(model, confirmation, found, fixed=range(len(model.pairs.names)), remove=False)
+    _believe(model, found)
     return found
 
 
@@ -358,44 +333,22 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
     return poses
 
 
-def _conclude(
+def _believe(
     model: PlacedModel,
-    confirmation: Confirmation | None,
     found: CameraChecks,
     *,
-    fixed: Collection[int],
-    remove: bool,
+    joints: Sequence[Joint] = (),
+    miss_cost: float = MISS_COST,
+    ambiguity: str = "",
 ) -> None:
-    """Report or remove cameras that are still confirmed much less than expected or contradicted by their own pairs."""
-    for image, share in found.shares.items():
-        expected, explained = found.expected[image], model.explained_share_of(image)
-        ratio = share / expected if expected > _MIN_EXPECTED else float("nan")
-        reasons = []
-        # Images alone are not enough to doubt a camera with pairs, since what they confirm in a wide tour varies much.
-        agreeing = sum(image in edge for edge in model.chosen)
-        supported = explained >= _MIN_EXPLAINED_IN_ALL and agreeing >= _SUPPORTING
-        if not supported and ratio < (_SUSPICIOUS if explained < _MIN_EXPLAINED_IN_ALL else _DOUBTFUL):
-            reasons.append(
-                f"other images confirm {100 * share:.0f} % of its texture, but its neighbours suggest "
-                f"{100 * expected:.0f} %"
-            )
-        contradicted = explained < _MIN_EXPLAINED and not ratio > _CONFIRMED
-        if contradicted and not _confirmed_by_pairs(model, image, confirmation):
-            reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its pose")
-        if not reasons:
-            continue
-        removable = remove and image not in fixed and len(model.cameras) - len(found.removed) > 2
-        if removable and ratio < _HOPELESS and explained < _MIN_EXPLAINED:
-            found.removed[image] = "; ".join(reasons)
-        else:
-            found.doubts[image] = "; ".join(reasons)
-    _doubt_pairs_alone(model, found)
-    for image in model.held_by(found.removed):
-        found.removed[image] = "its pairs are all with images that were left out"
-        found.doubts.pop(image, None)
-    for image in found.removed:
-        model.remove(image)
-        del found.shares[image], found.expected[image]
+    """Find the probability that each camera is right, and the doubts that follow from it."""
+    rows = camera_evidence(model, found.shares, found.expected, joints=joints)
+    found.p_right = {image: FITTED.probability(row) for image, row in rows.items()}
+    found.doubts = {
+        image: reason(FITTED, row, ambiguity=ambiguity)
+        for image, row in rows.items()
+        if is_doubtful(found.p_right[image], miss_cost=miss_cost)
+    }
     _doubt_contradicted_parts(model, found)
 
 
@@ -405,43 +358,24 @@ def _doubt_contradicted_parts(model: PlacedModel, found: CameraChecks) -> None:
         if np.nan_to_num([found.shares[image] for image in part.images]).mean() > _MOSTLY_CONFIRMED:
             continue
         one, other = (model.pairs.names[image] for image in part.pair)
-        reason = (
+        why = (
             f"{100 * part.share:.0f} % of the evidence of pairs between its part of the capture and the rest "
             f"contradicts their places, most of all that of {one} and {other}: take panoramas in between"
         )
         for image in part.images:
-            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), reason)))
+            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), why)))
 
 
-def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmation | None) -> bool:
-    """Return whether most pairs of a camera have a geometry that agrees with it and is confirmed by the images.
-
-    Repeated structure may give false geometries more matches than the true ones.
-    """
-    if confirmation is None:
-        return False
-    partners = [idx for idx in model.pairs.partners[image] if idx in model.cameras]
-    agreeing = sum((min(image, idx), max(image, idx)) in model.chosen for idx in partners)
-    if agreeing < _PERIODIC_SHARE * len(partners):
-        return False
-    asked = confirmed = 0
-    for partner in partners[:_NEIGHBOURS]:
-        edge = min(image, partner), max(image, partner)
-        shares = pair_shares(edge, model.pairs.geometries[edge], confirmation)
-        asked += 1
-        confirmed += edge in model.chosen and shares[model.chosen[edge]] >= _LIKELY * max(shares)
-    return 2 * confirmed > asked
-
-
-def _doubt_pairs_alone(model: PlacedModel, found: CameraChecks) -> None:
-    """Report two isolated cameras with several geometries as doubtful, since nothing else can decide between these."""
-    if len(model.cameras) != 2:
-        return
-    first, second = sorted(model.cameras)
-    geometries = model.pairs.geometries.get((first, second), ())
-    if len(geometries) > 1 and geometries[1].weight > _RIVAL * geometries[0].weight:
-        for image in (first, second):
-            found.doubts[image] = (
-                f"its only pair has another geometry with {len(geometries[1].view)} matches "
-                f"({len(geometries[0].view)} support the one in use): take panoramas in between"
-            )
+def _leave_out(model: PlacedModel, found: CameraChecks, *, fixed: Collection[int]) -> bool:
+    """Remove cameras that neither their images nor their pairs support, and those that only these hold."""
+    for image, share in found.shares.items():
+        ratio = share / found.expected[image] if found.expected[image] > _MIN_EXPECTED else np.nan
+        hopeless = ratio < _HOPELESS and model.explained_share_of(image) < _MIN_EXPLAINED
+        if hopeless and image in found.doubts and image not in fixed and len(model.cameras) - len(found.removed) > 2:
+            found.removed[image] = found.doubts[image]
+    for image in model.held_by(found.removed):
+        found.removed[image] = "its pairs are all with images that were left out"
+    for image in found.removed:
+        model.remove(image)
+        del found.shares[image], found.expected[image]
+    return bool(found.removed)

@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST
 from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
-from pano_mvs.algorithms.poses.verification.joints import joint_doubts
 from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, MIN_MATCHES
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
@@ -33,20 +33,24 @@ def verify_poses(
     correct: Annotated[
         bool, Setting("move or remove cameras that the images contradict; false only reports them")
     ] = True,
+    miss_cost: Annotated[
+        float, Setting("cost of a wrong camera that is not doubted, relative to that of a right one that is", gt=0)
+    ] = MISS_COST,
 ) -> Poses:
     """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
     Every camera is swept with its neighbours at 256 columns. A camera that confirms much less than its neighbours is
     tried at the other poses that its pairs suggest; if the images confirm one of them clearly better, it is moved
-    there. A camera that neither images nor pairs support is left out; one that remains doubtful is reported.
+    there. A camera that neither images nor pairs support is left out. All measurements together give the probability
+    that each camera is right (`docs/method.md`); one that is more probably wrong than its cost allows is doubted.
 
     Args:
         poses: of any origin. Cameras that are not moved keep their poses exactly.
         load: returns the panorama and the mask of an image by its name.
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
-        correct: False only reports. The poses then count as measured otherwise than by the pairs: joints of parts that
-            few points connect are not doubted for that alone.
+        correct: False only reports.
+        miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost).
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again if a camera was
@@ -55,7 +59,9 @@ def verify_poses(
     if len(poses.names) < 2:
         return poses
     groups = [
-        verified_group(group, load, features=features or {}, two_views=two_views or {}, correct=correct).poses
+        verified_group(
+            group, load, features=features or {}, two_views=two_views or {}, correct=correct, miss_cost=miss_cost
+        ).poses
         for group in split_groups(poses)
     ]
     return join_groups(groups, order=poses.names, rejected=poses.rejected)
@@ -85,6 +91,7 @@ def verified_group(
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     correct: bool,
+    miss_cost: float = MISS_COST,
 ) -> VerifiedGroup:
     """Check and correct poses of one group; the arguments are those of `verify_poses`."""
     known = all(name in features for name in poses.names)
@@ -93,11 +100,11 @@ def verified_group(
     model = model_of(poses, pairs)
     confirmation = Confirmation(lambda image: load(poses.names[image]))
     fixed = () if correct and inside else range(len(poses.names))
-    checks = correct_cameras(model, confirmation, fixed=fixed)
+    checks = correct_cameras(model, confirmation, fixed=fixed, miss_cost=miss_cost)
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    checked = with_joint_doubts(with_camera_checks(poses, pairs, checks), model, confirmation, given=not correct)
+    checked = with_camera_checks(poses, pairs, checks)
     return VerifiedGroup(with_unconfirmed_doubts(checked, features, inside), model, checks, confirmation)
 
 
@@ -182,19 +189,3 @@ def _kind_of_weakness(view: TwoView, first: Features, second: Features) -> str:
     if others < min(MIN_MATCHES, len(view.matches_idx)):
         return "learned"
     return "few" if first.learned and second.learned and view.log10_false_alarms > MAX_LOG10_LEARNED else ""
-
-
-def with_joint_doubts(poses: Poses, model: PlacedModel, confirmation: Confirmation, *, given: bool = False) -> Poses:
-    """Return poses of one group with the doubts about the joints of its parts, beside those that it has.
-
-    Args:
-        poses: the poses.
-        model: the same with their pairs.
-        confirmation: of the same capture.
-        given: see `joint_doubts`.
-    """
-    doubts = dict(poses.doubts)
-    for image, reason in joint_doubts(model, confirmation, given=given).items():
-        name = model.pairs.names[image]
-        doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
-    return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})

@@ -9,7 +9,6 @@ import pytest
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
-from pano_mvs.algorithms.poses.verification import camera_checks
 from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
@@ -138,6 +137,7 @@ def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: M
     found = verified(given, matches, correct=False) if with_matches else verified(given)
     assert set(found.doubts) == {"2.png"}
     assert "confirm" in found.doubts["2.png"]
+    assert verify_poses(given, load, features=None, two_views=None, miss_cost=1e-6).doubts == {}
     assert found.rejected == {}
     assert found.confirmed_shares is not None
     assert np.argmin(found.confirmed_shares) == 2
@@ -173,7 +173,6 @@ def test_an_image_of_another_place_is_left_out_with_the_reason(matches: Matches)
     )
     assert found.names == ("0.png", "1.png", "2.png", "4.png")
     assert "confirm" in found.rejected["3.png"]
-    assert "of its pairs" in found.rejected["3.png"]
     assert found.doubts == {}
     for name in found.names:
         assert bytes_of(found, name) == bytes_of(given, name)
@@ -223,19 +222,6 @@ def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
     assert found.names == given.names
     assert found.doubts == {}
     assert found.rejected == {}
-
-
-@pytest.mark.slow
-def test_a_group_whose_pairs_contradict_one_another_is_doubted(
-    matches: Matches, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Regression: the limit was defined and nothing read it."""
-    assert verified(displaced(), matches).doubts == {}
-    monkeypatch.setattr(camera_checks, "_MIN_EXPLAINED_IN_ALL", 1.01)
-    monkeypatch.setattr(camera_checks, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
-    found = verified(displaced(), matches)
-    assert set(found.doubts) == set(NAMES)
-    assert all("agree with a common arrangement" in reason for reason in found.doubts.values())
 
 
 def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:

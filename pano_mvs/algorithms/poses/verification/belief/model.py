@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,20 +70,3 @@ class Model:
     def probability(self, row: Mapping[str, float]) -> float:
         """Return the probability that a camera with this evidence is right."""
         return float(1 / (1 + np.exp(-self.intercept - sum(self.contributions(row).values()))))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the model as a JSON object."""
-        terms = {
-            name: {"knots": list(term.knots), "losses": list(term.losses), "missing": term.missing}
-            for name, term in self.terms.items()
-        }
-        return {"intercept": self.intercept, "terms": terms}
-
-    @staticmethod
-    def from_json(content: Mapping[str, Any]) -> Model:
-        """Return the model from the result of `to_json`."""
-        terms = {
-            name: Term(tuple(term["knots"]), tuple(term["losses"]), term["missing"])
-            for name, term in content["terms"].items()
-        }
-        return Model(content["intercept"], terms)

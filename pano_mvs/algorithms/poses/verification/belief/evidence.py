@@ -1,0 +1,136 @@
+"""The evidence for and against each camera of a model: one row of measurements per camera, NaN where one is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.verification.joints import Joint
+from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED
+from pano_mvs.geometry import geodesic_angle
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, float]
+
+# A place counts as another one beyond this share of the distance to the nearest camera, or this rotation.
+_ELSEWHERE, _TURNED_RAD = 0.1, 0.07
+
+
+def camera_evidence(
+    model: PlacedModel,
+    shares: Mapping[int, float],
+    expected: Mapping[int, float],
+    *,
+    joints: Sequence[Joint] = (),
+) -> dict[int, Row]:
+    """Return the evidence for each camera of a model, which is to be measured after all choices were made.
+
+    Args:
+        model: the cameras, with their pairs if these are known.
+        shares: image position to the share of its texture that other images confirm; NaN where unknown.
+        expected: image position to the share that its neighbours suggest.
+        joints: of the parts of the model, as far as the images were consulted.
+
+    Returns:
+        Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
+        `agreeing` (number of pairs that agree), `scale_worst` (largest |log ratio| of a distance between cameras to the
+        one that known points suggest), `place_rival` (weight of another place relative to its own), `repeats` (mean
+        weight of other geometries of the pairs of all cameras, relative to those in use), and `joint_contradicting`
+        (solid angle in which its part and the larger rest look through one another's surfaces, relative to all that
+        both see).
+    """
+    contradicting, repeats = _contradicting_joints(joints), _repeats(model)
+    rows = {}
+    for image in sorted(model.cameras):
+        share = shares.get(image, np.nan)
+        of_pairs = _of_pairs(model, image)
+        # If no pair agrees, and those that do not may be chance, the pairs say nothing.
+        known = of_pairs["agreeing"] > 0 or _has_certain_pair(model, image)
+        rows[image] = {
+            "ratio": share / expected[image] if expected.get(image, np.nan) > 0 else np.nan,
+            "share": share,
+            **(of_pairs if known else dict.fromkeys(of_pairs, np.nan)),
+            "repeats": repeats,
+            "joint_contradicting": contradicting.get(image, np.nan),
+        }
+    return rows
+
+
+def _has_certain_pair(model: PlacedModel, image: int) -> bool:
+    return any(
+        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < MAX_LOG10_LEARNED
+        for edge, view in (model.pairs.compared or {}).items()
+    )
+
+
+def _repeats(model: PlacedModel) -> float:
+    of_cameras: dict[int, list[tuple[float, int]]] = {}
+    for edge, rank in model.chosen.items():
+        found = model.pairs.geometries[edge]
+        rival = max((other.weight for number, other in enumerate(found) if number != rank), default=0.0)
+        for image in edge:
+            of_cameras.setdefault(image, []).append((rival / max(found[rank].weight, 1e-9), len(found[rank].view)))
+    means = [
+        np.average(rivals, weights=matches)
+        for rivals, matches in (zip(*own, strict=True) for own in of_cameras.values())
+    ]
+    return float(np.mean(means)) if means else np.nan
+
+
+def _of_pairs(model: PlacedModel, image: int) -> Row:
+    """Return how well the pairs of a camera agree with it, and with another place."""
+    edges = [edge for edge in model.chosen if image in edge]
+    errors = _scale_errors(model, image, edges)
+    own = sum(model.pairs.geometries[edge][model.chosen[edge]].weight for edge in edges)
+    return {
+        "agreeing": float(len(edges)),
+        "scale_worst": float(errors.max()) if len(errors) else np.nan,
+        "place_rival": _place_rival(model, image, own),
+    }
+
+
+def _scale_errors(model: PlacedModel, image: int, edges: Sequence[Edge]) -> FloatArray:
+    evidence = model.evidence(image, [edge[edge[0] == image] for edge in edges])
+    actual = np.linalg.norm(model.cameras[image].center - evidence.origins, axis=1)
+    used = [model.chosen[min(image, partner), max(image, partner)] for partner in evidence.partner.tolist()]
+    known = (evidence.rank == np.array(used, np.intp)) & np.isfinite(evidence.lengths) & (actual > 0)
+    return np.asarray(np.abs(np.log(evidence.lengths[known] / actual[known])))
+
+
+def _place_rival(model: PlacedModel, image: int, own: float) -> float:
+    """Return the weight of the best other place that the pairs of a camera suggest, relative to its own."""
+    places = model.place(image)[1] if len(model.cameras) > 2 else []
+    if not places or own <= 0:
+        return np.nan
+    here = model.cameras[image]
+    nearest = min(float(np.linalg.norm(pose.center - here.center)) for i, pose in model.cameras.items() if i != image)
+    elsewhere = (
+        place.score
+        for place in places
+        if float(np.linalg.norm(place.cam_from_world.center - here.center)) > _ELSEWHERE * nearest
+        or float(geodesic_angle(place.cam_from_world.rotation, here.rotation)) > _TURNED_RAD
+    )
+    return next(elsewhere, 0.0) / own
+
+
+def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
+    """Return the largest contradicting share on the way, over the strongest joints, from each part to the largest."""
+    parts = sorted({part for joint in joints for part in joint.parts}, key=lambda part: (-len(part), part))
+    if not parts:
+        return {}
+    number = {part: idx for idx, part in enumerate(parts)}
+    ends = np.array([[number[part] for part in joint.parts] for joint in joints])
+    weights = csr_array((1 / np.array([1.0 + joint.matches for joint in joints]), ends.T), shape=(len(parts),) * 2)
+    order, before = breadth_first_order(minimum_spanning_tree(weights), 0, directed=False)
+    share = {frozenset(joint.parts): joint.contradicting for joint in joints}
+    worst = {parts[0]: np.nan}
+    for idx in order[1:]:
+        previous = parts[before[idx]]
+        worst[parts[idx]] = float(np.fmax(worst[previous], share[frozenset((previous, parts[idx]))]))
+    return {image: value for part, value in worst.items() for image in part}

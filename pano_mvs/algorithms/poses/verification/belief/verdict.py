@@ -1,0 +1,101 @@
+"""Which cameras are doubted, and the sentence that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.verification.belief.model import Model
+from pano_mvs.core.text import plural
+
+MISS_COST = 5.0
+"""Cost of a wrong camera that is not doubted, relative to that of a right one that is."""
+
+_NAMED = 2
+_CLOSER, _BETWEEN = "take panoramas closer to one another there", "take panoramas in between"
+_Row = Mapping[str, float]
+
+# For each measurement: what it says, what is said if it is missing, and what to do.
+_SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
+    "ratio": (
+        lambda row: (
+            f"other images confirm {_percent(row['share'])} of its texture, but its neighbours suggest "
+            f"{_percent(row['share'] / max(row['ratio'], 1e-9))}"
+        ),
+        "too little of what it sees has texture that other images could confirm",
+        _CLOSER,
+    ),
+    "share": (
+        lambda row: f"other images confirm only {_percent(row['share'])} of its texture",
+        "too little of what it sees has texture that other images could confirm",
+        _CLOSER,
+    ),
+    "agreeing": (
+        lambda row: (
+            f"only {row['agreeing']:.0f} {plural(round(row['agreeing']), 'pair agrees', 'pairs agree')} with its place"
+        ),
+        "no pair with another image is known",
+        _BETWEEN,
+    ),
+    "scale_worst": (
+        lambda row: (
+            f"its pairs contradict its distances to other cameras by {_percent(np.expm1(row['scale_worst']), 1)}"
+        ),
+        "no points that three images see determine its distances to other cameras",
+        _BETWEEN,
+    ),
+    "repeats": (
+        lambda row: (
+            f"the place repeats: most pairs would agree with other geometries, with {_percent(row['repeats'])} "
+            "of the weight of those in use"
+        ),
+        "no pair agrees with the cameras",
+        _BETWEEN,
+    ),
+    "place_rival": (
+        lambda row: (
+            f"its pairs would place it elsewhere with {_percent(row['place_rival'])} of the weight that its place has"
+        ),
+        "no third image determines its place",
+        _BETWEEN,
+    ),
+    "joint_contradicting": (
+        lambda row: (
+            f"its part of the capture and the rest look through {_percent(row['joint_contradicting'])} of what both see"
+        ),
+        "nothing that two parts of the capture see in common confirms how they are joined",
+        _BETWEEN,
+    ),
+}
+
+
+def is_doubtful(probability: float, *, miss_cost: float = MISS_COST) -> bool:
+    """Return whether a camera with this probability to be right is doubted: the smaller expected cost decides."""
+    return probability < miss_cost / (1 + miss_cost)
+
+
+def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> str:
+    """Return why a camera is doubted: its probability, the two measurements that lower it most, and what to do.
+
+    Args:
+        model: the fitted model.
+        row: the evidence for the camera.
+        ambiguity: description of another arrangement that the images would confirm about as much; "" if none is known.
+    """
+    lost = {name: value for name, value in model.contributions(row).items() if value < 0}
+    if "ratio" in lost:  # both are about what other images confirm
+        lost["ratio"] += lost.pop("share", 0.0)
+    worst = sorted(lost, key=lambda name: (lost[name], name))[:_NAMED]
+    said = [_SAID[name][0](row) if np.isfinite(row.get(name, np.nan)) else _SAID[name][1] for name in worst]
+    advice = dict.fromkeys(_SAID[name][2] for name in worst)
+    why = ", and ".join(dict.fromkeys(filter(None, said)))
+    undecided = f"; it cannot be decided from these images: {ambiguity}" if ambiguity else ""
+    return (
+        f"its pose is right with a probability of {_percent(model.probability(row))}: {why}{undecided}; "
+        + ", or ".join(advice)
+    )
+
+
+def _percent(share: float, digits: int = 0) -> str:
+    return f"{100 * share:.{digits}f} %"

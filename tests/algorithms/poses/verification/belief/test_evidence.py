@@ -1,0 +1,75 @@
+"""What counts as evidence for a camera, and what as none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
+from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
+from pano_mvs.algorithms.poses.verification.joints import Joint
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from tests.algorithms.poses.aliased_capture import view_of
+from tests.algorithms.poses.synthetic_capture import features_from_bearings
+
+Edge = tuple[int, int]
+
+CAMERAS = {idx: Rigid3.from_center(np.eye(3), np.array([idx, 0.0, idx % 2])) for idx in range(6)}
+RAYS = np.random.default_rng(1).normal(size=(60, 3))
+NOTHING = dict.fromkeys(CAMERAS, np.nan)
+
+
+def placed(pairs: Mapping[Edge, tuple[float, ...]], *, agreeing: bool, exponent: float = -100.0) -> PlacedModel:
+    """Return a model with pairs of so many geometries with these weights, of which the first agrees or none does."""
+    away = Rigid3(rotation_from_rotvec((0.0, 1.0, 0.0)), np.array([0.0, 1.0, 0.0]))
+    matches = np.stack([np.arange(30)] * 2, axis=1).astype(np.int32)
+    geometries, compared = {}, {}
+    for (a, b), weights in pairs.items():
+        relative = CAMERAS[b] @ CAMERAS[a].inverse()
+        view = replace(view_of(relative if agreeing else away @ relative, matches), log10_false_alarms=exponent)
+        geometries[a, b] = tuple(Geometry(view, weight, 0.1, 10.0) for weight in weights)
+        compared[a, b] = view
+    found = Pairs({f"{idx}.png": features_from_bearings(RAYS) for idx in CAMERAS}, geometries, compared=compared)
+    return PlacedModel(found, dict(CAMERAS), dict.fromkeys(geometries, 0) if agreeing else {})
+
+
+def test_pairs_that_disagree_and_may_be_chance_are_no_evidence() -> None:
+    """Regression: known poses were doubted because three pairs of 14 to 22 matches disagreed with them."""
+    pairs = {(0, 1): (1.0,), (0, 2): (1.0,)}
+    weak = camera_evidence(placed(pairs, agreeing=False, exponent=-7.0), NOTHING, NOTHING)
+    assert np.isnan(list(weak[0].values())).all()
+    certain = camera_evidence(placed(pairs, agreeing=False), NOTHING, NOTHING)
+    assert certain[0]["agreeing"] == 0
+    assert np.isnan(certain[5]["agreeing"])
+
+
+def test_pairs_that_agree_are_counted_however_weak() -> None:
+    found = camera_evidence(placed({(0, 1): (1.0,), (0, 2): (1.0,)}, agreeing=True, exponent=-7.0), NOTHING, NOTHING)
+    assert [found[idx]["agreeing"] for idx in (0, 1)] == [2, 1]
+
+
+def test_a_place_repeats_as_much_as_the_other_geometries_of_all_pairs_weigh() -> None:
+    found = camera_evidence(placed({(0, 1): (1.0, 0.6, 0.2), (2, 3): (2.0,)}, agreeing=True), NOTHING, NOTHING)
+    assert [row["repeats"] for row in found.values()] == pytest.approx([0.3] * len(CAMERAS))
+
+
+def test_shares_are_compared_with_what_is_expected() -> None:
+    rows = camera_evidence(placed({}, agreeing=True), {0: 0.2, 1: 0.3}, {0: 0.4, 1: 0.0})
+    assert (rows[0]["share"], rows[0]["ratio"]) == (0.2, 0.5)
+    assert np.isnan(rows[1]["ratio"])
+
+
+def test_a_contradicted_joint_counts_for_all_parts_beyond_it() -> None:
+    """The weakest way between two parts does not count if there is a stronger one."""
+    joints = [
+        Joint(((0, 1, 2), (3, 4)), matches=90, contradicting=0.4),
+        Joint(((3, 4), (5,)), matches=50, contradicting=np.nan),
+        Joint(((0, 1, 2), (5,)), matches=10, contradicting=0.9),
+    ]
+    rows = camera_evidence(placed({}, agreeing=True), NOTHING, NOTHING, joints=joints)
+    found = [rows[idx]["joint_contradicting"] for idx in range(6)]
+    np.testing.assert_array_equal(found, [np.nan] * 3 + [0.4] * 3)
