@@ -11,12 +11,14 @@ from pydantic import Field
 
 from pano_mvs.algorithms.patchmatch.full_size import (
     STRIP_ROWS,
+    enlarged_strips,
     joined_strips,
     refine_in_strips,
     sources_in_grey,
     widths_between,
 )
 from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_range
+from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
 from pano_mvs.core.arrays import Picture
 from pano_mvs.io.growing_arrays import GrowingArrays
@@ -38,7 +40,7 @@ class FullSizeParams(Params):
 
 def full_size_memory_bytes(params: FullSizeParams, inputs: Mapping[str, Any]) -> int:
     """Return the memory for the grey levels of the sources, the reference, a strip, and the result of half the size."""
-    width = inputs["ref"].at_width(params.max_width).size_hw[1]
+    width: int = inputs["ref"].at_width(params.max_width).size_hw[1]
     sources = min(len(inputs["sources"]), params.max_sources)
     strip = width * (STRIP_ROWS + 64) * (_STRIP_BYTES + _STRIP_SOURCE_BYTES * sources)
     return width * width // 2 * (_GREY_BYTES * sources + _REFERENCE_BYTES) + strip
@@ -68,24 +70,28 @@ def full_size(
     settings = arguments_from(refine_range, params)
     windows = {name: settings[name] for name in WindowSettings.__dataclass_fields__}
     for width in widths:
-        there = [source.at_width(width) for source in near]
         reference = _painted(ref.at_width(width), ref)
-        grey = sources_in_grey(
-            ((source.load_unmasked(), source.load_mask()) for source in there),
-            sizes_hw=[source.size_hw for source in there],
-            source_from_reference=poses,
-            settings=WindowSettings(**windows),
-        )
-        strips = refine_in_strips(
-            range_map,
-            reference,
-            grey,
-            source_from_reference=poses,
-            rounds=params.rounds,
-            view_weights=params.view_weights,
-            **windows,
-        )
+        size_hw = reference.shape[0], width
+        if params.rounds == 0 or sharp_halvings(reference) > 0:  # half the size shows as much
+            strips = enlarged_strips(range_map, size_hw)
+        else:
+            there = [source.at_width(width) for source in near]
+            strips = refine_in_strips(
+                range_map,
+                reference,
+                sources_in_grey(
+                    ((source.load_unmasked(), source.load_mask()) for source in there),
+                    sizes_hw=[source.size_hw for source in there],
+                    source_from_reference=poses,
+                    settings=WindowSettings(**windows),
+                ),
+                source_from_reference=poses,
+                rounds=params.rounds,
+                view_weights=settings["view_weights"],
+                **windows,
+            )
         range_map = joined_strips(strips) if width < widths[-1] else _in_files(strips, ctx.scratch)
+        del strips, reference  # large
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("width", widths[-1])
     ctx.metric("sources", len(near))

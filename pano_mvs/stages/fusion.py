@@ -163,7 +163,7 @@ def _joined_in_files(clouds: Iterable[PointCloud], *, folder: Path) -> PointClou
         for cloud in clouds:
             points += len(cloud)
             grown.append({name: getattr(cloud, name) for name in _ARRAYS})
-        whole = {name: array for name, array in grown.arrays().items() if len(array) == points}
+        whole: dict[str, Any] = {name: array for name, array in grown.arrays().items() if len(array) == points}
     return PointCloud(**whole) if whole else join_clouds([])
 
 

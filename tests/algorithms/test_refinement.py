@@ -113,7 +113,7 @@ def test_padded_pictures_hold_the_same_patches_and_votes() -> None:
         mine = [(int(patch) >> shift) & 65535 for shift in (0, 16, 32, 48)]
         np.testing.assert_allclose(mine, four, atol=1)
         agreed = bool(around[row : row + 2, column : column + 2].all())
-        assert kernels_match.may_vote(padded.ravel(), int(place), 14) == agreed
+        assert kernels_match.may_count(padded.ravel(), int(place), 14) == agreed
 
 
 @pytest.mark.kernel("patchmatch.kernels_refine")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -74,6 +75,22 @@ def test_the_width_is_limited(
     found = at_full_size(unit, tmp_path, FullSizeParams(max_width=max_width, rounds=0))
     assert found.range.shape[0] == rows
     assert (found is unit[0]) == (rows == 64)
+
+
+def test_a_blurred_panorama_is_only_enlarged(unit: tuple[RangeMap, list[Panorama], list[Pose]], tmp_path: Path) -> None:
+    """Pixels that were interpolated by whoever stitched it say nothing new; the sources are not even read."""
+    given, panoramas, poses = unit
+    given = RangeMap(
+        given.range.repeat(8, axis=0).repeat(8, axis=1), given.confidence.repeat(8, axis=0).repeat(8, axis=1)
+    )
+    small = render(default_room(), poses[0].cam_from_world, (256, 512))[0]
+    write_png(tmp_path / "blurred.png", np.asarray(cv2.resize(small, (2048, 1024)), np.uint8))
+    blurred = Panorama(FilePart(tmp_path / "blurred.png"), SIZE, (1024, 2048), nadir_deg=20)
+    missing = [Panorama(FilePart(tmp_path / "missing.png"), SIZE, (1024, 2048)) for _ in panoramas[1:]]
+    params = FullSizeParams()
+    found = full_size(given, blurred, poses[0], missing, poses[1:], params=params, ctx=context(tmp_path / "stage"))
+    assert found.range.shape == (1024, 2048)
+    assert np.nanmax(np.abs(found.range / given.range.repeat(2, axis=0).repeat(2, axis=1) - 1)) < 0.03
 
 
 def test_what_a_mask_hides_changes_nothing(unit: tuple[RangeMap, list[Panorama], list[Pose]], tmp_path: Path) -> None:

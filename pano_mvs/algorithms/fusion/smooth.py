@@ -86,7 +86,7 @@ def surface_heights(
     grid = _extent(points)
     edges, levels = _levels(grid, sigmas, np.ones(len(points), np.bool_) if chosen is None else chosen)
     for level, edge in edges.items():
-        for own, around in _slabs(points, float(grid[0][0]), edge, points_of_slab):
+        for own, around in _slabs(points, float(grid[0][0]), edge=edge, most=points_of_slab):
             cloud = points[around], normals[around], sigmas[around]
             radii, found = _REACH * cloud[2].astype(np.float64), np.zeros(len(cloud[0]))
             cells = _cells(cloud[0], grid, edge)
@@ -110,7 +110,7 @@ def surface_heights(
 
 
 def _slabs(
-    points: NDArray[np.float32], least: float, edge: float, most: int
+    points: NDArray[np.float32], least: float, *, edge: float, most: int
 ) -> Iterator[tuple[NDArray[np.bool_], IntArray | slice]]:
     """Yield the points of slabs of cells and the next cells on either side, and which of them are in the slab."""
     if len(points) <= most:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pano_mvs.algorithms.patchmatch.refine import WindowSettings, margin_of_part, refine_part, swept_limits
-from pano_mvs.algorithms.scales import EnlargedRangeMap, detail_energy, least_detail, sharp_halvings
+from pano_mvs.algorithms.scales import EnlargedRangeMap, detail_energy, least_detail
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.core.errors import UsageError
@@ -93,8 +93,7 @@ def refine_in_strips(
     `refine_range`. `strip_rows`: rows of a strip, a multiple of 4; the result does not depend on it.
 
     Returns:
-        Strips with the confidences, uncertainties and sky of the nearest pixels of `range_map`, without normals. A
-        panorama that is not sharp at its size is enlarged only.
+        Strips with the confidences, uncertainties and sky of the nearest pixels of `range_map`, without normals.
 
     Raises:
         UsageError: if the reference is not larger than the range map, or its height is odd.
@@ -108,13 +107,9 @@ def refine_in_strips(
     settings = WindowSettings(**windows)
     enlarged = EnlargedRangeMap(range_map, (height, width))
     margin = max(margin_of_part(rounds, settings.window), _DETAIL_MARGIN) + 3 & ~3
-    is_sharp = rounds > 0 and sharp_halvings(reference) == 0
-    least = _least_detail(reference, strip_rows) if is_sharp else 0.0
+    least = _least_detail(reference, strip_rows)
     numbers, limits = settings.numbers(width, source_from_reference), swept_limits(range_map)
     for rows, around in _strips(height, strip_rows, margin):
-        if not is_sharp:
-            yield enlarged.rows(rows)
-            continue
         start, picture = enlarged.rows(around), reference[around]
         refined = refine_part(
             start,
@@ -135,6 +130,13 @@ def refine_in_strips(
             uncertainty=None if start.uncertainty is None else start.uncertainty[inner],
             sky=None if start.sky is None else start.sky[inner],
         )
+
+
+def enlarged_strips(range_map: RangeMap, size_hw: tuple[int, int]) -> Iterator[RangeMap]:
+    """Yield the ranges of a panorama, from the top, as `refine_in_strips` does, without refining them."""
+    enlarged = EnlargedRangeMap(range_map, size_hw)
+    for rows, _ in _strips(size_hw[0], STRIP_ROWS, 0):
+        yield enlarged.rows(rows)
 
 
 def _strips(height: int, strip_rows: int, margin: int) -> Iterator[tuple[slice, slice]]:

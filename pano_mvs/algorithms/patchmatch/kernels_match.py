@@ -7,6 +7,8 @@ a time, in short separate loops (project, gather, blend, sum), as in the sweep.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +18,8 @@ from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fas
 
 # Parts of red, green and blue in 10,000; levels are in 1/256.
 _RED, _GREEN, _BLUE, _WHOLE, _FINE = 2126, 7152, 722, 10000, 256
-# Levels of `pad_grey` are in 1/128; the highest bit marks pixels that do not vote.
-_COARSE, _NO_VOTE, _LEVEL = 128, 32768, 32767
+# Levels of `pad_grey` are in 1/128; the highest bit marks pixels that do not count.
+_COARSE, _MARK, _LEVEL = 128, 32768, 32767
 
 
 @kernel
@@ -54,7 +56,7 @@ def pad_grey(picture: NDArray[np.uint8], votes: NDArray[np.bool_], padded: NDArr
     """Write the grey levels of a picture, (H, W, 3) to (H + 2, W + 2), one pixel over the seam and the poles.
 
     It holds the patches of `pack_grey` in a quarter of the memory, in 1/128 grey levels: (j, i) to (j + 1, i + 1) are
-    those of patch (j, i). Pixels that do not vote, (H, W), are marked.
+    those of patch (j, i). Pixels that do not count, (H, W) False, are marked.
     """
     height, width, _ = picture.shape
     for j in range(height + 2):
@@ -64,13 +66,11 @@ def pad_grey(picture: NDArray[np.uint8], votes: NDArray[np.bool_], padded: NDArr
             red, green, blue = picture[row, column, 0], picture[row, column, 1], picture[row, column, 2]
             level = np.int32(_RED) * red + np.int32(_GREEN) * green + np.int32(_BLUE) * blue
             rounded = (np.uint32(level) * np.uint32(_COARSE) + np.uint32(_WHOLE // 2)) // np.uint32(_WHOLE)
-            padded[j, i] = rounded | np.uint32(0 if votes[row, column] else _NO_VOTE)
+            padded[j, i] = rounded | np.uint32(0 if votes[row, column] else _MARK)
 
 
 Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
-Sources = tuple[
-    NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.uint8], NDArray[np.int64]
-]
+Sources = tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.uint8], NDArray[np.int64]]
 
 _F = np.float32
 _U = np.uint64
@@ -214,11 +214,11 @@ def gather_grey(
 
 
 @inlined
-def may_vote(grey: NDArray[np.uint16], start: int, stride: int) -> bool:
+def may_count(grey: NDArray[np.uint16], start: int, stride: int) -> bool:
     """Return whether no pixel of the patch that begins at `start` of a picture of `pad_grey` is marked."""
     upper, lower = _U(start), _U(start + stride)
     marks = (_U(grey[upper]) | _U(grey[upper + _U(1)])) | (_U(grey[lower]) | _U(grey[lower + _U(1)]))
-    return marks < _U(_NO_VOTE)
+    return bool(marks < _U(_MARK))
 
 
 @kernel
@@ -337,4 +337,4 @@ def sum_windows(
                     if is_packed:
                         votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0
                     else:
-                        votes[s, i] = may_vote(packed, starts[s] + index[i], shapes[s, 2])
+                        votes[s, i] = may_count(packed, starts[s] + index[i], shapes[s, 2])

@@ -211,7 +211,7 @@ def refine_part(
 ) -> RangeMap:
     """Refine the ranges of some rows of a panorama, all columns of them.
 
-    Rows within `margin_of_part` of an edge that is no pole differ from what the whole panorama would give.
+    Rows within `margin_of_part` of an edge that is not a pole differ from what the whole panorama would give.
 
     `range_map`, `reference`: (h, W), as of `refine_range`. `sources`: see `source_arrays`. `numbers`: see
     `WindowSettings`. `window`, `rounds`, `view_weights`: as of `refine_range`. `limits`: see `swept_limits`. `part`:

@@ -41,8 +41,8 @@ class Comparison:
         squared_error: sum of their supports times their squared reprojection errors, in rad².
     """
 
-    agreeing: NDArray[np.int64]
-    contradicting: NDArray[np.int64]
+    agreeing: NDArray[np.uint16]
+    contradicting: NDArray[np.uint16]
     hiding: NDArray[np.uint16]
     support: NDArray[np.float64]
     motion: NDArray[np.float64]
@@ -68,12 +68,8 @@ def compare_with_sources(
     from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows  # compiles on import
 
     shape = ranges.shape
-    comparison = Comparison(
-        np.zeros(shape, np.int64),
-        np.zeros(shape, np.int64),
-        np.zeros(shape, np.uint16),
-        *(np.zeros(shape) for _ in range(3)),
-    )
+    agreeing, contradicting, hiding = (np.zeros(shape, np.uint16) for _ in range(3))
+    comparison = Comparison(agreeing, contradicting, hiding, *(np.zeros(shape) for _ in range(3)))
     counts = comparison.agreeing, comparison.contradicting, comparison.hiding
     sums = comparison.support, comparison.motion, comparison.squared_error
     # Copied, since the kernel is compiled once more for arrays that are read-only.
@@ -85,6 +81,7 @@ def compare_with_sources(
         def compare(
             first: int,
             rows: int,
+            *,
             view: tuple[FloatArray, FloatArray] = view,
             known: NDArray[np.float32] = known,
         ) -> None:

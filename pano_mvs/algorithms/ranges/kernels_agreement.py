@@ -213,7 +213,7 @@ def compare_rows(
     view: tuple[FloatArray, FloatArray],
     source_ranges: NDArray[np.float32],
     limits: Triple,
-    counts: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]],
+    counts: tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint16]],
     sums: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     """Add the verdicts of one source on the pixels of some rows to those of other sources.
