@@ -1,24 +1,27 @@
 """What a plugin can change in its process so that later units compute something else: recorded, compared, restored.
 
-The state is that of OpenCV, numpy, the random numbers of Python and numpy, the floating-point unit, the locale, the
-working folder, the environment, the signal handlers, and the functions and classes of the libraries that stages use,
-with the methods of these classes.
+The state is that of OpenCV, numpy, numba, the random numbers of Python and numpy, the floating-point unit, the locale,
+the working folder, the environment, signals, limits of the system and of the interpreter, the filters of warnings, and
+the functions and classes of the libraries that stages use, with the methods of these classes.
 """
 
 from __future__ import annotations
 
 import builtins
 import ctypes
+import gc
 import locale
 import os
 import random
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence, ValuesView
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from itertools import chain
 from operator import is_
 from types import CodeType, FunctionType, ModuleType
@@ -38,6 +41,17 @@ _LIBRARIES = {
     "scipy",
     "struct",
 }
+_LOADED_BY_STAGES = (
+    "cv2",
+    "scipy.cluster.hierarchy",
+    "scipy.linalg",
+    "scipy.ndimage",
+    "scipy.optimize",
+    "scipy.sparse.csgraph",
+    "scipy.sparse.linalg",
+    "scipy.spatial.transform",
+    "scipy.special",
+)
 _FENV_BYTES = 512  # more than any system's fenv_t
 
 
@@ -107,6 +121,12 @@ def loading_plugin() -> Iterator[None]:
         yield
     finally:
         state.restore()
+
+
+def load_libraries() -> None:
+    """Load what stages import when they need it, so that a plugin that changes it is noticed."""
+    for name in _LOADED_BY_STAGES:
+        import_module(name)
 
 
 def has_plugins() -> bool:
@@ -310,6 +330,101 @@ def _set_handlers(handlers: dict[int, Any]) -> None:
                 signal.signal(number, handler)
 
 
+def _blocked_signals() -> set[int] | None:
+    return {*signal.pthread_sigmask(signal.SIG_BLOCK, ())} if hasattr(signal, "pthread_sigmask") else None
+
+
+def _timers() -> tuple[bool, ...] | None:
+    """Return which interval timers run."""
+    return tuple(signal.getitimer(timer)[0] > 0 for timer in _TIMERS) if _TIMERS else None
+
+
+def _stop_timers(running: tuple[bool, ...]) -> None:
+    for timer, ran in zip(_TIMERS, running, strict=True):
+        if not ran:
+            signal.setitimer(timer, 0)
+
+
+_TIMERS = [getattr(signal, name) for name in ("ITIMER_REAL", "ITIMER_VIRTUAL", "ITIMER_PROF") if hasattr(signal, name)]
+
+
+def _limits() -> dict[int, tuple[int, int]] | None:
+    """Return the limits of the system for this process."""
+    resource = _resource()
+    if resource is None:
+        return None
+    numbers = {value for name, value in vars(resource).items() if name.startswith("RLIMIT_")}
+    return {number: resource.getrlimit(number) for number in sorted(numbers)}
+
+
+def _set_limits(limits: dict[int, tuple[int, int]]) -> None:
+    for number, both in limits.items():
+        with suppress(ValueError, OSError):  # only root may raise what was lowered for good
+            _resource().setrlimit(number, both)
+
+
+@cache
+def _resource() -> Any:
+    try:
+        return import_module("resource")
+    except ImportError:  # Windows
+        return None
+
+
+def _temporary_folder() -> str | None:
+    try:
+        return _library("tempfile") and str(_library("tempfile").gettempdir())
+    except OSError:  # there is none
+        return None
+
+
+def _mode_mask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def _interpreter() -> tuple[Any, ...]:
+    return sys.getrecursionlimit(), sys.getswitchinterval(), sys.get_int_max_str_digits(), gc.isenabled()
+
+
+def _set_interpreter(state: tuple[Any, ...]) -> None:
+    recursion, interval, digits, collects = state
+    sys.setrecursionlimit(recursion)
+    sys.setswitchinterval(interval)
+    sys.set_int_max_str_digits(digits)
+    (gc.enable if collects else gc.disable)()
+
+
+def _set_warnings(filters: list[Any]) -> None:
+    warnings.resetwarnings()  # what was decided by the other filters is forgotten
+    warnings.filters[:] = filters  # type: ignore[index]
+
+
+def _numba_options() -> dict[str, Any] | None:
+    config = _library("numba.core.config")
+    return config and {name: value for name, value in vars(config).items() if name.isupper()}
+
+
+def _decimals() -> tuple[Any, ...] | None:
+    """Return precision, rounding and limits of decimal numbers."""
+    context = _library("decimal") and _library("decimal").getcontext()
+    return context and tuple(getattr(context, name) for name in _DECIMAL)
+
+
+def _set_decimals(values: tuple[Any, ...]) -> None:
+    for name, value in zip(_DECIMAL, values, strict=True):
+        setattr(_library("decimal").getcontext(), name, value)
+
+
+_DECIMAL = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
+
+
+def _set_priority(priority: int) -> None:
+    with suppress(OSError):  # only root may raise it
+        os.setpriority(os.PRIO_PROCESS, 0, priority)
+
+
 def _folder() -> str:
     try:
         return os.getcwd()  # noqa: PTH109  # no path is made of it
@@ -389,4 +504,28 @@ _SETTINGS: Mapping[str, _Setting] = {
     "the working folder": _Setting(_folder, _set_folder),
     "the environment": _Setting(lambda: dict(os.environ), _set_environment),
     "the signal handlers": _Setting(_handlers, _set_handlers),
+    "the blocked signals": _Setting(
+        _blocked_signals, lambda blocked: signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    ),
+    "the timers": _Setting(_timers, _stop_timers),
+    "the limits of the system": _Setting(_limits, _set_limits),
+    "the priority": _Setting(
+        lambda: os.getpriority(os.PRIO_PROCESS, 0) if hasattr(os, "getpriority") else None, _set_priority
+    ),
+    "the mode of new files (umask)": _Setting(_mode_mask, os.umask),
+    "the limits of the interpreter": _Setting(_interpreter, _set_interpreter),
+    "the filters of warnings": _Setting(lambda: [*warnings.filters], _set_warnings),
+    "numba's options": _Setting(_numba_options, lambda options: vars(_library("numba.core.config")).update(options)),
+    "the folder for temporary files": _Setting(
+        _temporary_folder, lambda folder: setattr(_library("tempfile"), "tempdir", folder)
+    ),
+    "the time limit of sockets": _Setting(
+        lambda: _library("socket") and (_library("socket").getdefaulttimeout(),),
+        lambda seconds: _library("socket").setdefaulttimeout(*seconds),
+    ),
+    "decimal numbers": _Setting(_decimals, _set_decimals),
+    "the level of logging": _Setting(
+        lambda: _library("logging") and _library("logging").root.manager.disable,
+        lambda level: _library("logging").disable(level),
+    ),
 }

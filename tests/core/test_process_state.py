@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import ctypes
+import decimal
+import gc
 import locale
+import logging
 import math
 import os
 import random
+import re
+import resource
 import signal
+import socket
 import sys
+import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 import pytest
 
@@ -21,6 +30,7 @@ from pano_mvs.core.process_state import ProcessState, loading_plugin
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Panorama
 
+_MOST_FILES = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 _UPWARD = 0x800  # FE_UPWARD of x86
 
 
@@ -55,6 +65,22 @@ CHANGES: dict[str, tuple[Callable[[], object], str]] = {
     "constant": (lambda: setattr(process_state, "_FENV_BYTES", 1), "pano_mvs.core.process_state._FENV_BYTES"),
     "shadowed builtin": (lambda: setattr(text, "len", max), "pano_mvs.core.text.len"),
     "module": (lambda: sys.modules.update(cv2=np), "cv2"),
+    "umask": (lambda: os.umask(0o777), "the mode of new files (umask)"),
+    "recursion": (lambda: sys.setrecursionlimit(5000), "the limits of the interpreter"),
+    "collection": (gc.disable, "the limits of the interpreter"),
+    "digits": (lambda: sys.set_int_max_str_digits(0), "the limits of the interpreter"),
+    "warnings": (lambda: warnings.simplefilter("error"), "the filters of warnings"),
+    "open files": (lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (100, _MOST_FILES)), "the limits of the system"),
+    "blocked": (
+        lambda: signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGUSR1}),
+        "the blocked signals",
+    ),
+    "timer": (lambda: signal.setitimer(signal.ITIMER_REAL, 1000), "the timers"),
+    "numba": (lambda: setattr(numba.config, "DISABLE_JIT", 7), "numba's options"),
+    "temporary files": (lambda: setattr(tempfile, "tempdir", "/"), "the folder for temporary files"),
+    "sockets": (lambda: socket.setdefaulttimeout(0.1), "the time limit of sockets"),
+    "decimals": (lambda: setattr(decimal.getcontext(), "prec", 3), "decimal numbers"),
+    "logging": (lambda: logging.disable(logging.CRITICAL), "the level of logging"),
     "rounding": (lambda: ctypes.CDLL(None).fesetround(_UPWARD), "the floating-point modes"),
 }
 
@@ -101,3 +127,13 @@ def test_loading_a_plugin_leaves_no_change(monkeypatch: pytest.MonkeyPatch) -> N
         cv2.setUseOptimized(not was)
     assert cv2.useOptimized() == was
     assert process_state.has_plugins()
+
+
+def test_workers_load_what_stages_import_later() -> None:
+    """A plugin that imports a library first could change it before its state is recorded."""
+    process_state.load_libraries()
+    package = Path(process_state.__file__).parents[1]
+    texts = [path.read_text(encoding="utf-8") for path in package.rglob("*.py")]
+    imported = {name for text in texts for name in re.findall(r"(?:from|import) (scipy[\w.]*)", text)}
+    assert len(imported) > 5
+    assert imported <= sys.modules.keys()

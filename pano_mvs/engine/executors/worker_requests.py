@@ -12,7 +12,7 @@ from typing import Any
 
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import is_inside
-from pano_mvs.core.process_state import ProcessState, has_plugins
+from pano_mvs.core.process_state import ProcessState, has_plugins, load_libraries
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.execute import unit_outcome
@@ -28,6 +28,8 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
         return JobOutcome("failed", cause=f"a plugin changed {changes} in its worker after a unit", died=True)
     try:
         store = _store(*request["store"])
+        if request["plugins"]:
+            load_libraries()
         files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
         plugins = {files[path]: digest for path, digest in request["plugins"].items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
