@@ -77,9 +77,9 @@ def test_each_layout_gives_the_same_panoramas_with_their_rig(tmp_path: Path, lay
 def test_files_of_insta360_cameras_are_jpeg(tmp_path: Path) -> None:
     shutil.copytree(tiny_rig_capture(), tmp_path, dirs_exist_ok=True)
     for path in sorted((tmp_path / "images").iterdir()):
-        path.with_suffix(".insp").write_bytes(
-            cv2.imencode(".jpg", cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, 99])[1]
-        )
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        path.with_suffix(".insp").write_bytes(bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 99])[1]))
         path.unlink()
     panorama = stitched(params(tmp_path), tmp_path)["000.png"]
     assert np.abs(panorama.load().astype(int) - tiny_rig_panorama().load()).mean() < 3

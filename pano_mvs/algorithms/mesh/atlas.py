@@ -67,15 +67,16 @@ def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels
     options = xatlas.PackOptions()
     options.padding, options.texels_per_unit = PADDING_PX, float(min(texels_per_unit, most))
     atlas.generate(pack_options=options)
-    of_atlas, uvs, of_parts = np.empty_like(faces, np.int32), [], []
-    for number, (part, used, _) in enumerate(parts):
-        vertex, corners_of_faces, uv = atlas.get_mesh(number)
-        of_atlas[part] = corners_of_faces + sum(map(len, uvs))
-        uvs.append(uv.astype(np.float32))
-        of_parts.append(used[vertex].astype(np.int32))
+    made = [atlas.get_mesh(number) for number in range(len(parts))]
+    of_atlas, first = np.empty_like(faces, np.int32), 0
+    for (part, _, _), (vertex, corners_of_faces, _) in zip(parts, made, strict=True):
+        of_atlas[part] = corners_of_faces + first
+        first += len(vertex)
+    vertex = np.concatenate([used[own] for (_, used, _), (own, _, _) in zip(parts, made, strict=True)])
+    uv = np.concatenate([own for _, _, own in made])
     shrink = min(1.0, max_px / max(atlas.width, atlas.height, 1))
     size_hw = max(1, round(atlas.height * shrink)), max(1, round(atlas.width * shrink))
-    return Atlas(np.concatenate(of_parts), np.concatenate(uvs), of_atlas, size_hw)
+    return Atlas(vertex.astype(np.int32), uv.astype(np.float32), of_atlas, size_hw)
 
 
 def _parts(centers: NDArray[np.float64]) -> list[NDArray[np.intp]]:
