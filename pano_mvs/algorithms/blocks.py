@@ -397,10 +397,10 @@ def merge_blocks(
 
 
 def _shares(blocks: Sequence[Poses], names: Sequence[str], owner: Mapping[str, int]) -> dict[str, Any]:
-    """Return the confirmed and expected shares of the cameras, by field; None if no block has them."""
+    """Return what images confirm of the cameras, by field; a field that no block has is left out."""
     positions = [{name: idx for idx, name in enumerate(block.names)} for block in blocks]
     found: dict[str, Any] = {}
-    for field in ("confirmed_shares", "expected_shares"):
+    for field in ("confirmed_shares", "expected_shares", "right_probabilities"):
         columns = [getattr(block, field) for block in blocks]
         if all(column is None for column in columns):
             continue

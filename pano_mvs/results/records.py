@@ -207,6 +207,7 @@ class PosesSummary(OptionalEntry):
         rejected: image without a pose to the reason.
         doubts: registered image whose pose is doubtful to the reason.
         confirmed: image to the share of its texture that other images confirm, and the share that is expected.
+        p_right: image to the probability that its pose is right; None where nothing was measured about it.
         centers: of the registered cameras in the world, in the order of `registered`.
         points: number of triangulated points.
         frame: what the world frame is; of the largest group, as are `scale`, `metric` and `up`.
@@ -222,6 +223,7 @@ class PosesSummary(OptionalEntry):
     rejected: Mapping[str, str] = {}
     doubts: Mapping[str, str] = {}
     confirmed: Mapping[str, tuple[float | None, float | None]] = {}
+    p_right: Mapping[str, float | None] = {}
     centers: tuple[Direction, ...] = ()
     points: int = 0
     frame: str = ""

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.scene.poses import Pose, Poses
+from pano_mvs.scene.poses import PER_CAMERA, Pose, Poses
 
-_PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares")
 ALONE = "no other image shares its frame, so its position is meaningless"
 
 
@@ -108,7 +107,7 @@ def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_],
     names = tuple(np.array(poses.names, object)[cameras])
     tracks = cameras[poses.track_image_idx] & points[poses.track_point_idx]
     world = poses.worlds[number]
-    values: dict[str, Any] = {name: getattr(poses, name) for name in _PER_CAMERA}
+    values: dict[str, Any] = {name: getattr(poses, name) for name in PER_CAMERA}
     return replace(
         poses,
         names=names,
@@ -193,7 +192,7 @@ def _joined_sigmas(groups: Sequence[Poses]) -> NDArray[np.float32] | None:
 def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:
     """Return the values per camera, NaN for groups without them; None if no group has them."""
     joined = {}
-    for field in _PER_CAMERA:
+    for field in PER_CAMERA:
         known = [getattr(group, field) for group in groups]
         filled = [
             np.full(len(group.names), np.nan) if values is None else values

@@ -51,6 +51,10 @@ class Pose(Record):
         return cls(pose, meta.get("group", 0))
 
 
+PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares", "right_probabilities")
+"""Fields of `Poses` that may hold a number for each camera."""
+
+
 class World(NamedTuple):
     """The world of one group of cameras.
 
@@ -93,6 +97,8 @@ class Poses(Record):
         confirmed_shares: (N,) float64 share of each image's textured pixels, by solid angle, whose ranges other images
             confirm in a small sweep with these poses; NaN where too few pixels can be judged; None if not computed.
         expected_shares: (N,) float64 the expected share, from the neighbouring cameras.
+        right_probabilities: (N,) float64 probability that each pose is right, by all that was measured about it; NaN
+            where nothing was; None if not computed.
         doubts: name of every registered image whose pose is doubtful, with the reason.
         track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
             observations by it. None: unknown, equal weights.
@@ -120,6 +126,7 @@ class Poses(Record):
     group_idx: NDArray[np.int32] | None = None
     confirmed_shares: NDArray[np.float64] | None = None
     expected_shares: NDArray[np.float64] | None = None
+    right_probabilities: NDArray[np.float64] | None = None
     doubts: dict[str, str] = field(default_factory=dict)
     other_worlds: tuple[World, ...] = ()
     track_sigmas_rad: NDArray[np.float32] | None = None
@@ -205,7 +212,7 @@ class Poses(Record):
         if self.track_sigmas_rad is not None:
             sigmas = require_array(self, "track_sigmas_rad", dtype=np.float32, shape=(tracks,))
             require(bool((sigmas > 0).all()), self, "an observation has a sigma that is not positive")
-        for name in ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares"):
+        for name in PER_CAMERA:
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
         require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")

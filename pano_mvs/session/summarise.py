@@ -199,6 +199,7 @@ def poses_summary(
         rejected=rejected,
         doubts=doubts,
         confirmed=_confirmed(poses),
+        p_right=_probabilities(poses),
         centers=poses.centers.tolist(),
         points=len(poses.points_in_world),
         frame=poses.frame,
@@ -230,6 +231,14 @@ def _confirmed(poses: Poses) -> dict[str, tuple[float | None, float | None]]:
     columns = zip(poses.names, poses.confirmed_shares.tolist(), poses.expected_shares.tolist(), strict=True)
     shares = {name: (_rounded_share(confirmed), _rounded_share(expected)) for name, confirmed, expected in columns}
     return {name: pair for name, pair in shares.items() if pair[0] is not None}
+
+
+def _probabilities(poses: Poses) -> dict[str, float | None]:
+    """Return the probability that each pose is right; None if nothing was measured about it."""
+    if poses.right_probabilities is None:
+        return {}
+    columns = zip(poses.names, poses.right_probabilities.tolist(), strict=True)
+    return {name: _rounded_share(probability) for name, probability in columns}
 
 
 def _rounded_share(share: float) -> float | None:

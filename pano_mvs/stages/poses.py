@@ -264,6 +264,8 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     ctx.metric("points", len(poses.points_in_world))
     if poses.confirmed_shares is not None and np.isfinite(poses.confirmed_shares).any():
         ctx.metric("confirmed_share_median", np.nanmedian(poses.confirmed_shares))
+    if poses.right_probabilities is not None and np.isfinite(poses.right_probabilities).any():
+        ctx.metric("p_right_lowest", np.nanmin(poses.right_probabilities))
     ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])

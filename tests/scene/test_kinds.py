@@ -34,7 +34,10 @@ KINDS: dict[str, Record] = {
     "binary features": Features(UNITS, np.ones((4, 8), np.uint8), FLOATS, FLOATS, COLORS, "hamming", (10, 20)),
     "descriptor": GlobalDescriptor(FLOATS, np.ones((4, 8), np.int16)),
     "poses": replace(
-        drawn_group(("a", "b", "c"), seed=1), confirmed_shares=np.ones(3), expected_shares=np.full(3, 0.5)
+        drawn_group(("a", "b", "c"), seed=1),
+        confirmed_shares=np.ones(3),
+        expected_shares=np.full(3, 0.5),
+        right_probabilities=np.full(3, 0.9),
     ),
     "range map": RangeMap(np.ones((2, 4), np.float32), np.full((2, 4), 200, np.uint8)),
     "samples": SurfaceSamples(UNITS, FLOATS, COLORS, BYTES),
@@ -59,7 +62,15 @@ ARRAYS = [
     for field in fields_of(value)
     if isinstance(getattr(value, field), np.ndarray)
 ]
-KNOWN_NAN = {"range", "center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares", "normals_in_cam"}
+KNOWN_NAN = {
+    "range",
+    "center_stds",
+    "rotation_stds_rad",
+    "confirmed_shares",
+    "expected_shares",
+    "right_probabilities",
+    "normals_in_cam",
+}
 
 
 def assert_same(first: object, second: object) -> None:

@@ -53,8 +53,8 @@ def verify_poses(
         miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost).
 
     Returns:
-        The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again if a camera was
-        moved or left out.
+        The poses with `confirmed_shares`, `expected_shares`, `right_probabilities` and `doubts`. Points are
+        triangulated again if a camera was moved or left out.
     """
     if len(poses.names) < 2:
         return poses
@@ -140,6 +140,7 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
         poses,
         confirmed_shares=of_each(checks.shares) if checks.asked else None,
         expected_shares=of_each(checks.expected) if checks.asked else None,
+        right_probabilities=of_each(checks.p_right),
         doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )
 
