@@ -34,7 +34,6 @@ from pano_mvs.cli.options import (
     TargetArgument,
     UntilOption,
     WorkflowArgument,
-    given_path,
     takes_record,
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
@@ -267,9 +266,7 @@ def run(given: RunArguments) -> None:
 def tour(
     images: Annotated[
         Path,
-        typer.Argument(
-            metavar="PATH", parser=given_path, help="Folder of panoramas or of a virtual tour, or a video of a walk."
-        ),
+        typer.Argument(metavar="PATH", help="Folder of panoramas or of a virtual tour, or a video of a walk."),
     ],
     out: Annotated[
         Path | None,
