@@ -34,7 +34,6 @@ from pano_mvs.cli.options import (
     TargetArgument,
     UntilOption,
     WorkflowArgument,
-    given_path,
     takes_record,
 )
 from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
@@ -267,9 +266,7 @@ def run(given: RunArguments) -> None:
 def tour(
     images: Annotated[
         Path,
-        typer.Argument(
-            metavar="PATH", parser=given_path, help="Folder of panoramas or of a virtual tour, or a video of a walk."
-        ),
+        typer.Argument(metavar="PATH", help="Folder of panoramas or of a virtual tour, or a video of a walk."),
     ],
     out: Annotated[
         Path | None,
@@ -596,10 +593,8 @@ def share(
     """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
     from pano_mvs.cli.page_commands import share_output
     from pano_mvs.share import ShareOptions
-    from pano_mvs.share.rooms import read_rooms
 
-    given = read_rooms(rooms) if rooms is not None else None
-    options = ShareOptions(title, points, triangles, width, quality, given)
+    options = ShareOptions(title, points, triangles, width, quality, rooms)
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 import sys
 import traceback
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar, cast
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin
 
 import typer
 from rich.markup import escape
+from typer.models import ArgumentInfo
 
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import PanoMvsError, RunStoppedError, StoreError, WorkflowError
@@ -22,7 +25,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def guarded(command: Command) -> Command:
-    """Turn exceptions into messages and exit codes."""
+    """Turn exceptions into messages and exit codes, and refuse empty arguments and empty paths of options."""
 
     @wraps(command)
     def run_guarded(*args: Any, **kwargs: Any) -> None:
@@ -64,4 +67,39 @@ def guarded(command: Command) -> Command:
             errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")
             raise typer.Exit(1) from None
 
+    run_guarded.__signature__ = _refusing_empty(command)  # type: ignore[attr-defined]
     return cast(Command, run_guarded)
+
+
+def _refusing_empty(command: Callable[..., None]) -> inspect.Signature:
+    """Return the signature of a command in which typer finds that empty paths and arguments are errors.
+
+    A variable of the shell without a value makes an empty one, and an empty path is the current folder.
+    """
+    signature = inspect.signature(command, eval_str=True)
+    for parameter in signature.parameters.values():
+        if get_origin(parameter.annotation) is not Annotated:
+            continue
+        hint, info, *_ = get_args(parameter.annotation)
+        if Path in _leaves(hint):
+            info.parser = path
+        elif str in _leaves(hint) and isinstance(info, ArgumentInfo):
+            info.parser = text
+    return signature
+
+
+def _leaves(hint: Any) -> list[Any]:
+    return [leaf for part in get_args(hint) for leaf in _leaves(part)] or [hint]
+
+
+# Some versions of typer show the names of these two in the help, as types.
+def text(given: str) -> str:
+    """Return an argument that is not empty."""
+    if not given:
+        raise typer.BadParameter("the name is empty")
+    return given
+
+
+def path(given: str) -> Path:
+    """Return the path that an argument or an option states."""
+    return Path(text(given))

@@ -28,13 +28,6 @@ def takes_record(command: Callable[[Arguments], None]) -> Callable[..., None]:
     return take
 
 
-def given_path(text: str) -> Path:
-    """Return the path that an option states, which is empty for a variable of the shell without a value."""
-    if not text:
-        raise typer.BadParameter("the name is empty")
-    return Path(text)
-
-
 WorkflowArgument = Annotated[
     str,
     typer.Argument(
@@ -53,8 +46,6 @@ ImagesOption = Annotated[
     Path | None,
     typer.Option(
         "--images",
-        parser=given_path,
-        metavar="PATH",
         help="Folder of panoramas or of a virtual tour, or a video; default: that of the workflow.",
     ),
 ]

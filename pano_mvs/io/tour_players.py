@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from urllib.parse import quote
 from xml.sax.saxutils import quoteattr
 
@@ -106,7 +107,9 @@ def pannellum_tour(scenes: Sequence[Scene]) -> dict[str, object]:
         }
         for number, scene in enumerate(scenes)
     }
-    return {"default": {"firstScene": "scene_0", "autoLoad": True, "sceneFadeDuration": 500}, "scenes": made}
+    default = {"firstScene": "scene_0", "autoLoad": True, "sceneFadeDuration": 500}
+    # Without escapeHTML, which Pannellum reads outside of "default", titles are HTML, and run what a file name says.
+    return {"escapeHTML": True, "default": default, "scenes": made}
 
 
 def pannellum_page(configuration: str) -> str:
@@ -166,8 +169,9 @@ def krpano_tour(scenes: Sequence[Scene]) -> str:
         ]
         for idx, link in enumerate(scene.links):
             arrive = f"loadscene(scene_{link.target}, view.hlookat={link.target_yaw_deg:.4f}, MERGE, BLEND(0.5));"
+            text = quoteattr(escape(scenes[link.target].title, quote=False))  # krpano takes it for HTML
             lines.append(
-                f'    <hotspot name="link_{idx}" type="text" text={quoteattr(scenes[link.target].title)} '
+                f'    <hotspot name="link_{idx}" type="text" text={text} '
                 f'ath="{link.yaw_deg:.4f}" atv="{-link.pitch_deg:.4f}" linkedscene="scene_{link.target}" '
                 f"onclick={quoteattr(arrive)}/>"
             )

@@ -57,6 +57,34 @@ def test_path_that_cannot_be_looked_at_is_no_bug(pano_mvs: Command, path: str) -
         assert "Traceback" not in result.text, command
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(command.replace("PATH", "{}") for command in COMMANDS if "--set" not in command),
+        "run {}",
+        "show {}",
+        "view {}",
+        "view o --screenshot {}",
+        "share {} --to p",
+        "share o --to {}",
+        "share o --to p --rooms {}",
+        "calibrate {} --out c.yaml",
+        "calibrate photos --out {}",
+        "merge o1 {} --out o",
+        "plugins --plugin {}",
+        "plugin new stage s --dir {}",
+        "cache push {}",
+        "doctor --out {}",
+    ],
+)
+def test_an_empty_path_is_refused(pano_mvs: Command, command: str) -> None:
+    """A variable of the shell without a value stood for the current folder, which `share` and `run` then filled."""
+    result = pano_mvs(*(word.format("") for word in command.split()))
+    assert result.code == 2
+    assert "the name is empty" in result.flat
+    assert not any(Path().iterdir())
+
+
 def test_what_is_wrong_with_a_path_is_said(pano_mvs: Command) -> None:
     Path("locked/in").mkdir(parents=True)
     Path("locked").chmod(0)

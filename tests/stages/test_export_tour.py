@@ -173,8 +173,12 @@ def test_names_are_quoted(tmp_path: Path) -> None:
     images = {name: CAPTURE.images[other] for name, other in zip(poses.names, CAPTURE.names, strict=True)}
     params = TourExportParams(players=("pannellum", "krpano"))
     files = tour_of_panoramas(made, poses, images, params, Context(np.random.default_rng(0), tmp_path)).files
-    first = json.loads(files["panoramas/tour.json"].read_text())["scenes"]["scene_0"]
+    pannellum = json.loads(files["panoramas/tour.json"].read_text())
+    assert pannellum["escapeHTML"] is True
+    first = pannellum["scenes"]["scene_0"]
     assert first["panorama"] == "a%20b/%231%20%22x%22%20%3C%26%3E.jpg"
     scene = ElementTree.parse(files["panoramas/krpano.xml"]).find("scene")
     assert scene is not None
     assert scene.get("title") == 'a b/#1 "x" <&>'
+    texts = {spot.get("text") for spot in ElementTree.parse(files["panoramas/krpano.xml"]).iter("hotspot")}
+    assert 'a b/#1 "x" &lt;&amp;&gt;' in texts  # HTML

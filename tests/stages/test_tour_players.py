@@ -32,9 +32,11 @@ FOV_DEG = 60.0
 TENTH_OF_A_DEGREE_PX = np.deg2rad(0.1) * WINDOW_WH[1] / 2 / np.tan(np.deg2rad(FOV_DEG / 2))
 CAMERAS = {
     "a.png": Rigid3.from_center(rotation_from_rotvec(np.array([0.2, 1.1, -0.3])), [0.0, 0.0, 0.0]),
-    "b.png": Rigid3.from_center(rotation_from_rotvec(np.array([-0.4, 2.0, 0.1])), [2.0, -0.7, -1.5]),
+    "<img src=x onerror=alert(1)>.png": Rigid3.from_center(
+        rotation_from_rotvec(np.array([-0.4, 2.0, 0.1])), [2.0, -0.7, -1.5]
+    ),
 }
-TO_B = CAMERAS["b.png"].center - CAMERAS["a.png"].center
+TO_B = np.subtract(*(camera.center for camera in reversed(CAMERAS.values())))
 NORTH = np.array([0.0, 0.0, 1.0])
 HEADING_DEG = np.rad2deg(np.arctan2(TO_B[0], TO_B[2]))
 PITCH_DEG = np.rad2deg(np.arctan2(-TO_B[1], np.hypot(TO_B[0], TO_B[2])))
@@ -76,8 +78,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     for name, camera in CAMERAS.items():
         write_png(folder / name, marked(camera, TO_B if name == "a.png" else -TO_B))
         images[name] = Panorama(FilePart(folder / name, external=True), SIZE_HW, SIZE_HW)
-        (folder / name[0]).mkdir()
-        ctx = Context(np.random.default_rng(0), folder / name[0])
+        (folder / name[:4]).mkdir()
+        ctx = Context(np.random.default_rng(0), folder / name[:4])
         params = PanoramasParams(facing="path", format="png", ranges=False)
         made[name] = panoramas(images[name], Pose(camera), poses, None, params, ctx)
     players = TourExportParams(players=("pannellum", "marzipano"))
@@ -160,3 +162,11 @@ def test_a_link_leads_to_the_other_camera_and_on(window: Browser, player: str) -
     window.wait(arrived[player])
     # The last panorama faces the way that the path came.
     assert window.evaluate(arrived[player]) == pytest.approx([0, 0], abs=0.1)
+
+
+def test_a_title_is_text(window: Browser, player: str) -> None:
+    """Pannellum took the names of files for HTML, with the scripts in them."""
+    spots = {"pannellum": ".pnlm-hotspot span", "marzipano": "button"}
+    shown = f"[...document.querySelectorAll('{spots[player]}')].map((spot) => spot.textContent)"
+    assert "<img src=x onerror=alert(1)>" in window.evaluate(shown)
+    assert window.evaluate("document.querySelectorAll('img[src=x]').length") == 0
