@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,30 @@ def test_a_named_source_and_plain_pictures_are_not_taken_for_a_tour(tmp_path: Pa
         write(tmp_path / f"faces/hall_{face}.png", face_of(face))
     assert not is_tour(tmp_path / "faces")
     assert not is_tour(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("tour.xml", '<krpano><scene name="hall" onstart="if(a && b, c);"/></krpano>'),
+        ("tour.xml", '<krpano><scene name="hall" title="a < b"/></krpano>'),
+        ("tour.json", '{"scenes": {"hall": }'),
+    ],
+)
+def test_a_configuration_that_cannot_be_read_is_named(tmp_path: Path, file: str, text: str) -> None:
+    """source.folder said of each face that it is no full sphere, and advised to set `stereo`."""
+    (tmp_path / file).write_text(text)
+    for scene in ("hall", "room"):
+        for face in CUBE:
+            write(tmp_path / f"{scene}_{face}.png", face_of(face))
+    told = rf"{file}: not used as the configuration of a tour.* Correct the file, or .*images\.use=source\.tour"
+    with pytest.raises(InputError, match=told):
+        open_session("quickstart", images=tmp_path)
+    items = list(list_tour(TourParams.model_validate({"path": tmp_path})))
+    assert [item.name for item in items] == ["hall.png", "room.png"]
+    assert re.search(f"{file}: not used", items[0].notes[0])
+    write(tmp_path / "panorama.png", np.tile(face_of("f"), (1, 2, 1)))
+    assert not is_tour(tmp_path), "pictures of a house may lie beside its panoramas"
 
 
 SKYBOX = dict(zip("ufrbld", range(6), strict=True))

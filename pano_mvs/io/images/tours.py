@@ -87,17 +87,34 @@ def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
 
 
 def is_tour(folder: Path) -> bool:
-    """Return whether a folder holds two complete cubes or more, and no other panorama outside of its subfolders."""
+    """Return whether a folder holds two complete cubes or more, and no other panorama outside of its subfolders.
+
+    Raises:
+        InputError: if the names of its files alone show these cubes, because its configuration cannot be read.
+    """
     try:
         capture = _Capture(folder, list(files_below(folder, [])))
     except InputError:
         return False
-    cubes = [tiles for levels in _scenes(capture, _TILES).values() if (tiles := _finest(levels))]
+    cubes, unreadable = _cubes(capture, _TILES), list[str]()
     if len(cubes) < 2:
-        cubes = [dict(scene.tiles) for scene in _stated(capture, []) if scene.tiles]
+        cubes = [dict(scene.tiles) for scene in _stated(capture, unreadable) if scene.tiles]
+    by_name = not cubes and bool(unreadable)
+    if by_name:
+        cubes = _cubes(capture, _TILES + _SIX_FILES)
     used = {path for tiles in cubes for path in tiles.values()}
     others = (path for path in capture.pictures.values() if path.parent == folder and path not in used)
-    return len(cubes) > 1 and not any(map(_is_panorama, others))
+    holds = len(cubes) > 1 and not any(map(_is_panorama, others))
+    if holds and by_name:
+        raise InputError(
+            f"{unreadable[0]}. Correct the file, or read the scenes by the names of their files with "
+            "--set images.use=source.tour"
+        )
+    return holds
+
+
+def _cubes(capture: _Capture, layouts: Iterable[re.Pattern[str]]) -> list[Tiles]:
+    return [tiles for levels in _scenes(capture, layouts).values() if (tiles := _finest(levels))]
 
 
 def _is_panorama(path: Path) -> bool:
