@@ -51,7 +51,29 @@ def read_rooms(path: Path) -> dict[str, tuple[str, ...]]:
         raise InputError(f"--rooms: {error}") from error
     if not isinstance(rooms, dict) or not all(isinstance(names, list) for names in rooms.values()):
         raise InputError(f"--rooms {path}: give rooms with lists of panoramas, such as `Kitchen: [IMG_0001.jpg]`")
-    return {str(room): tuple(str(name) for name in names) for room, names in rooms.items()}
+    for room, names in rooms.items():
+        for name in names:
+            if not isinstance(name, str):
+                raise InputError(
+                    f"--rooms {path}: {room}: {name!r} is not text. Give names of panoramas, in quotes if they look "
+                    "like something else"
+                )
+    return {room: tuple(names) for room, names in rooms.items()}
+
+
+def unmatched(names: Sequence[str], given: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the given names and patterns that match no panorama.
+
+    Args:
+        names: paths of the panoramas relative to the capture.
+        given: names or patterns of panoramas by room.
+    """
+    wanted = [each for patterns in given.values() for each in patterns]
+    return [each for each in wanted if not any(_matches(name, each) for name in names)]
+
+
+def _matches(name: str, pattern: str) -> bool:
+    return name == pattern or fnmatchcase(name, pattern)
 
 
 def rooms_of(
@@ -69,7 +91,7 @@ def rooms_of(
     """
     if given is not None:
         return [
-            next((room for room, patterns in given.items() if any(fnmatchcase(name, each) for each in patterns)), "")
+            next((room for room, patterns in given.items() if any(_matches(name, each) for each in patterns)), "")
             for name in names
         ]
     paths = [PurePosixPath(name) for name in names]

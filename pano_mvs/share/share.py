@@ -23,7 +23,7 @@ from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.rooms import Sight, rooms_of
+from pano_mvs.share.rooms import Sight, rooms_of, unmatched
 from pano_mvs.share.scene_parts import (
     RANGES_HW,
     ShareOptions,
@@ -147,6 +147,8 @@ def share_run(
     geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
     scene |= geometry
     notes += more
+    if options.rooms is not None:
+        notes += [f"--rooms: {name} matches no panorama of the page" for name in unmatched(names, options.rooms)]
     scene["cameras"] = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
     if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(

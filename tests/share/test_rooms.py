@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
+from pano_mvs.share import ShareOptions, share_run
 from pano_mvs.share.rooms import Sight, read_rooms, rooms_by_sight, rooms_of
 from tests.share.box_run import NAMES, box_run
 from tests.share.test_share import value_of
@@ -70,6 +71,23 @@ def test_a_file_names_rooms(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     cameras = value_of(tmp_path / "page" / "data" / "scene.js")["cameras"]
     assert [camera["room"] for camera in cameras] == ["Küche", "Hall", "Hall"]
+
+
+def test_names_that_match_nothing_are_noted(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=500)
+    rooms = {"Küche": [NAMES[0], "nosuch.jpg"], "Hall": ["*"], "Up": ["up/*"]}
+    shared = share_run(run, tmp_path / "page", ShareOptions(rooms=rooms))
+    assert [note for note in shared.notes if "--rooms" in note] == [
+        f"--rooms: {name} matches no panorama of the page" for name in ("nosuch.jpg", "up/*")
+    ]
+    assert rooms_of(["a[1].jpg", "b.jpg"], {}, {"Hall": ["a[1].jpg"]}) == ["Hall", ""]
+
+
+@pytest.mark.parametrize("entry", ["5", "null", "[a]", "{a: b}"])
+def test_a_name_that_is_not_text_is_refused(tmp_path: Path, entry: str) -> None:
+    (tmp_path / "rooms.yaml").write_text(f"Up: [a.jpg, {entry}]\n")
+    with pytest.raises(InputError, match=r"--rooms .*rooms\.yaml: Up: .* is not text"):
+        read_rooms(tmp_path / "rooms.yaml")
 
 
 @pytest.mark.parametrize("text", ["- a\n- b\n", "Hall: 3\n", "Hall: [a\n", ""])
