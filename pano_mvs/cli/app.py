@@ -593,10 +593,8 @@ def share(
     """Write a page to send: cloud, mesh, cameras and panoramas, for any browser, without a network."""
     from pano_mvs.cli.page_commands import share_output
     from pano_mvs.share import ShareOptions
-    from pano_mvs.share.rooms import read_rooms
 
-    given = read_rooms(rooms) if rooms is not None else None
-    options = ShareOptions(title, points, triangles, width, quality, given)
+    options = ShareOptions(title, points, triangles, width, quality, rooms)
     share_output(out, to, options, images=images, cache=cache, console=Console())
 
 

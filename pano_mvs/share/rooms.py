@@ -37,28 +37,32 @@ class Sight:
     ranges: NDArray[np.float32]
 
 
-def read_rooms(path: Path) -> dict[str, tuple[str, ...]]:
-    """Return the names of panoramas, or patterns of them, of each room that a file lists.
+def given_rooms(given: Mapping[str, Sequence[str]] | str | Path) -> dict[str, tuple[str, ...]]:
+    """Return the names of panoramas, or patterns of them, of each room.
 
-    The file is YAML: the name of a room, and a list such as `[IMG_0001.jpg, kitchen/*]`.
+    Args:
+        given: these; or a YAML file with the name of each room, and a list such as `[IMG_0001.jpg, kitchen/*]`.
 
     Raises:
-        InputError: if the file cannot be read, or has another layout.
+        InputError: if the file cannot be read, or what is given has another layout.
     """
-    try:
-        rooms = parse_yaml(FilePart(path).read_bytes().decode("utf-8", "replace"), str(path)).plain()
-    except WorkflowError as error:
-        raise InputError(f"--rooms: {error}") from error
-    if not isinstance(rooms, dict) or not all(isinstance(names, list) for names in rooms.values()):
-        raise InputError(f"--rooms {path}: give rooms with lists of panoramas, such as `Kitchen: [IMG_0001.jpg]`")
+    rooms: object = given
+    if isinstance(given, (str, Path)):
+        try:
+            rooms = parse_yaml(FilePart(Path(given)).read_bytes().decode("utf-8", "replace"), str(given)).plain()
+        except WorkflowError as error:
+            raise InputError(f"--rooms: {error}") from error
+    option = f"--rooms {given}" if isinstance(given, (str, Path)) else "rooms"
+    if not isinstance(rooms, Mapping) or not all(isinstance(names, (list, tuple)) for names in rooms.values()):
+        raise InputError(f"{option}: give rooms with lists of panoramas, such as `Kitchen: [IMG_0001.jpg]`")
     for room, names in rooms.items():
         for name in names:
             if not isinstance(name, str):
                 raise InputError(
-                    f"--rooms {path}: {room}: {name!r} is not text. Give names of panoramas, in quotes if they look "
-                    "like something else"
+                    f"{option}: {room}: {name!r} is not text. Give names of panoramas, in quotes if they look like "
+                    "something else"
                 )
-    return {room: tuple(names) for room, names in rooms.items()}
+    return {str(room): tuple(names) for room, names in rooms.items()}
 
 
 def unmatched(names: Sequence[str], given: Mapping[str, Sequence[str]]) -> list[str]:

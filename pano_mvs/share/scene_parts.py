@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -55,7 +56,8 @@ class ShareOptions:
         max_triangles: about the largest number of triangles of a mesh without texture; 0 for no mesh.
         max_width: largest width of a panorama in pixels, at least 1024.
         jpeg_quality: of the panoramas, 1 to 100.
-        rooms: names or patterns of panoramas by room; None to take them from folders, names, or what is seen.
+        rooms: names or patterns of panoramas by room, or the file that `--rooms` takes; None to take them from folders,
+            names, or what is seen.
         max_single_file_bytes: size up to which everything is also written as one HTML file.
     """
 
@@ -64,7 +66,7 @@ class ShareOptions:
     max_triangles: int = 300_000
     max_width: int = 8192
     jpeg_quality: int = 85
-    rooms: Mapping[str, Sequence[str]] | None = None
+    rooms: Mapping[str, Sequence[str]] | str | Path | None = None
     max_single_file_bytes: int = 40_000_000
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.page_folder import PageFolder
-from pano_mvs.share.rooms import Sight, rooms_of, unmatched
+from pano_mvs.share.rooms import Sight, given_rooms, rooms_of, unmatched
 from pano_mvs.share.scene_parts import (
     RANGES_HW,
     ShareOptions,
@@ -98,7 +98,7 @@ def share_run(
     folder: str | Path,
     options: ShareOptions | None = None,
     *,
-    images: Path | None = None,
+    images: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Shared:
     """Write a page with the cloud, the mesh, the cameras and the panoramas of a run.
@@ -117,11 +117,13 @@ def share_run(
         progress: is called after each panorama.
 
     Raises:
-        InputError: if the run has neither a cloud nor cameras.
+        InputError: if the run has neither a cloud nor cameras, or the rooms cannot be read.
         UsageError: if the folder holds something else.
         StoreError: if a file cannot be written.
     """
     run, folder, options = run if isinstance(run, RunOutput) else load(run), Path(folder), options or ShareOptions()
+    images = Path(images) if images is not None else None
+    rooms = given_rooms(options.rooms) if options.rooms is not None else None
     poses = split_groups(run.poses)[0] if run.poses is not None else None
     cloud = run.cloud.groups()[0] if run.cloud is not None else None
     if poses is None and (cloud is None or not len(cloud)):
@@ -147,9 +149,11 @@ def share_run(
     geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
     scene |= geometry
     notes += more
-    if options.rooms is not None:
-        notes += [f"--rooms: {name} matches no panorama of the page" for name in unmatched(names, options.rooms)]
-    scene["cameras"] = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
+    notes += [f"--rooms: {name} matches no panorama of the page" for name in unmatched(names, rooms or {})]
+    described, sights = _put_cameras(page, run, poses, frame=frame, options=options, images=images, progress=progress)
+    for entry, room in zip(described, rooms_of(names, sights, rooms), strict=True):
+        entry["room"] = room
+    scene["cameras"] = described
     if missing := [entry["name"] for entry in scene["cameras"] if not entry["levels"]]:
         notes.append(
             f"{len(missing)} of {len(cameras)} panoramas could not be read, such as {missing[0]}; give their folder "
@@ -208,8 +212,8 @@ def _put_cameras(
     options: ShareOptions,
     images: Path | None,
     progress: Progress | None,
-) -> list[dict[str, Any]]:
-    """Write the panoramas, and return what the page needs to know of each camera."""
+) -> tuple[list[dict[str, Any]], dict[str, Sight]]:
+    """Write the panoramas, and return what the page needs to know of each camera, and what cameras see by name."""
     described: list[dict[str, Any]] = []
     sights = {}
     for idx, name in enumerate(poses.names if poses is not None else ()):
@@ -224,10 +228,7 @@ def _put_cameras(
             sights[name] = Sight(pose, reduced(view.range_map))
         if progress is not None:
             progress(idx + 1, len(poses.names))
-    rooms = rooms_of([entry["name"] for entry in described], sights, options.rooms)
-    for entry, room in zip(described, rooms, strict=True):
-        entry["room"] = room
-    return described
+    return described, sights
 
 
 def _image(run: RunOutput, name: str, images: Path | None, *, max_width: int) -> NDArray[np.uint8] | None:

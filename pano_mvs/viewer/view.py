@@ -43,8 +43,8 @@ class ViewOptions:
         ranges: whether a camera's ranges are shown inside it instead of its panorama.
     """
 
-    images: Path | None = None
-    screenshot: Path | None = None
+    images: str | Path | None = None
+    screenshot: str | Path | None = None
     view: str = "overview"
     color: str = "rgb"
     surface: str = ""
@@ -62,7 +62,7 @@ def view_run(
 ) -> NDArray[np.uint8] | None:
     """View a run or a PLY file in a window until it is closed, or write an image of it.
 
-    >>> picture = view_run("out", ViewOptions(screenshot=Path("top.png"), view="top"))
+    >>> picture = view_run("out", ViewOptions(screenshot="top.png", view="top"))
     >>> picture.shape
     (860, 1280, 3)
 
@@ -80,30 +80,31 @@ def view_run(
         StoreError: if the image cannot be written.
     """
     options = options or ViewOptions()
+    images, screenshot = (None if path is None else Path(path) for path in (options.images, options.screenshot))
     size_wh = _size_wh(options.size)
-    if options.screenshot is not None:
-        _check_screenshot(options.screenshot)
+    if screenshot is not None:
+        _check_screenshot(screenshot)
     path = run.out if isinstance(run, RunOutput) else Path(run)
-    scene = open_scene(path, images=options.images, group=options.group)
-    if options.screenshot is None:
+    scene = open_scene(path, images=images, group=options.group)
+    if screenshot is None:
         require_display()
     else:
         require_drawing()
     tour = _tour(scene, options, size_wh)
     from pano_mvs.viewer.window import SceneWindow  # imported on use, because pyvista is slow to import
 
-    if options.screenshot is not None:
+    if screenshot is not None:
         quiet_vtk()
-    window = SceneWindow(tour, size_wh=size_wh, off_screen=options.screenshot is not None, budget=options.points)
+    window = SceneWindow(tour, size_wh=size_wh, off_screen=screenshot is not None, budget=options.points)
     for note in scene.notes:
         say(note)
-    if options.screenshot is None:
+    if screenshot is None:
         require_window(window.plotter.render_window.GetClassName())
         window.run()
         return None
     picture = window.picture()
     window.close()
-    _write(options.screenshot, picture)
+    _write(screenshot, picture)
     return picture
 
 

@@ -40,7 +40,7 @@ def test_a_picture_is_written_without_a_display(out: Path, tmp_path: Path, name:
 
 def test_a_run_is_viewed_from_python(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
-    options = pano_mvs.ViewOptions(screenshot=tmp_path / "a.png", size="320x200")
+    options = pano_mvs.ViewOptions(screenshot=str(tmp_path / "a.png"), images=str(tmp_path), size="320x200")
     picture = pano_mvs.view_run(str(out), options)
     assert picture is not None
     assert (picture == decode_image(tmp_path / "a.png")).all()

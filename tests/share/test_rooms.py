@@ -12,7 +12,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.share import ShareOptions, share_run
-from pano_mvs.share.rooms import Sight, read_rooms, rooms_by_sight, rooms_of
+from pano_mvs.share.rooms import Sight, given_rooms, rooms_by_sight, rooms_of
 from tests.share.box_run import NAMES, box_run
 from tests.share.test_share import value_of
 
@@ -66,7 +66,7 @@ def test_a_file_names_rooms(tmp_path: Path) -> None:
     run = box_run(tmp_path, points=500)
     rooms = tmp_path / "rooms.yaml"
     rooms.write_text("Küche: [lobby/000.png]\nHall: ['*/00[12].png']\n", encoding="utf-8")
-    assert rooms_of(NAMES, {}, read_rooms(rooms)) == ["Küche", "Hall", "Hall"]
+    assert rooms_of(NAMES, {}, given_rooms(rooms)) == ["Küche", "Hall", "Hall"]
     done = CliRunner().invoke(app, ["share", str(run.out), "--to", str(tmp_path / "page"), "--rooms", str(rooms)])
     assert done.exit_code == 0, done.output
     cameras = value_of(tmp_path / "page" / "data" / "scene.js")["cameras"]
@@ -80,6 +80,10 @@ def test_names_that_match_nothing_are_noted(tmp_path: Path) -> None:
     assert [note for note in shared.notes if "--rooms" in note] == [
         f"--rooms: {name} matches no panorama of the page" for name in ("nosuch.jpg", "up/*")
     ]
+    (tmp_path / "rooms.yaml").write_text(f"Hall: ['{NAMES[0]}']\n", encoding="utf-8")
+    share_run(run, tmp_path / "page", ShareOptions(rooms=str(tmp_path / "rooms.yaml")))
+    cameras = value_of(tmp_path / "page" / "data" / "scene.js")["cameras"]
+    assert [camera["room"] for camera in cameras] == ["Hall", "", ""]
     assert rooms_of(["a[1].jpg", "b.jpg"], {}, {"Hall": ["a[1].jpg"]}) == ["Hall", ""]
 
 
@@ -87,13 +91,21 @@ def test_names_that_match_nothing_are_noted(tmp_path: Path) -> None:
 def test_a_name_that_is_not_text_is_refused(tmp_path: Path, entry: str) -> None:
     (tmp_path / "rooms.yaml").write_text(f"Up: [a.jpg, {entry}]\n")
     with pytest.raises(InputError, match=r"--rooms .*rooms\.yaml: Up: .* is not text"):
-        read_rooms(tmp_path / "rooms.yaml")
+        given_rooms(tmp_path / "rooms.yaml")
 
 
 @pytest.mark.parametrize("text", ["- a\n- b\n", "Hall: 3\n", "Hall: [a\n", ""])
 def test_a_file_of_another_layout_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rooms.yaml").write_text(text)
     with pytest.raises(InputError, match=r"--rooms.*rooms\.yaml"):
-        read_rooms(tmp_path / "rooms.yaml")
+        given_rooms(tmp_path / "rooms.yaml")
     with pytest.raises(InputError, match=r"none\.yaml"):
-        read_rooms(tmp_path / "none.yaml")
+        given_rooms(tmp_path / "none.yaml")
+
+
+def test_rooms_of_another_layout_are_refused(tmp_path: Path) -> None:
+    run = box_run(tmp_path, points=500)
+    for rooms, told in (("nofile", "nofile"), ({"Hall": "a.jpg"}, "lists of panoramas"), ({"Hall": [5]}, "5 is not")):
+        with pytest.raises(InputError, match=told):
+            share_run(run, tmp_path / "page", ShareOptions(rooms=rooms))  # type: ignore[arg-type]
+    assert not (tmp_path / "page").exists()
