@@ -10,7 +10,7 @@ from rich.markup import escape
 from pano_mvs import __version__
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import write_given
 from pano_mvs.io.images.captures import Layout
 from pano_mvs.io.rig_calibration import calibration_text
 from pano_mvs.session.calibrating import QUARTER_TURNS, calibrate_camera
@@ -48,7 +48,7 @@ def calibrate(
     Raises:
         UsageError: if an option is wrong.
         InputError: if the pictures do not determine the lenses.
-        StoreError: if the file cannot be written.
+        StoreError: if the disk is full.
     """
     lenses = tuple(part.strip() for part in names.split(","))
     if len(lenses) != 2 or not all(lenses) or lenses[0] == lenses[1]:
@@ -73,7 +73,7 @@ def calibrate(
         progress=lambda step: console.print(step, highlight=False, style="dim"),
     )
     comments = [f"estimated by pano-mvs {__version__} calibrate from {photos.name}", *lines]
-    write_text(out, calibration_text(rig, comments=comments))
+    write_given(out, calibration_text(rig, comments=comments), f"--out {out}")
     console.say("\n".join(map(escape, lines)))
     console.say(
         f"calibration: {escape(str(out))}\nto use it: pano-mvs run quickstart --images {escape(str(photos))} "

@@ -53,7 +53,7 @@ def share_output(
 
     Raises:
         InputError: if the folder holds no run, or the run has nothing to show.
-        UsageError: if `to` holds something else.
+        UsageError: if `to` holds something else, or cannot be written.
         StoreError: if a file cannot be written.
     """
     with console.status("panoramas") as status:

@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.files import write_given
 from pano_mvs.core.paths import exists
 from pano_mvs.core.text import without_controls
 from pano_mvs.engine.stages.registry import Registry
@@ -31,6 +31,7 @@ def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None
 
     Raises:
         UsageError: if the file exists, or cannot be written.
+        StoreError: if the disk is full.
     """
     text = resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text
     text = without_controls(text).rstrip("\n")
@@ -39,10 +40,7 @@ def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None
         return
     if exists(out):
         raise UsageError(f"--out {out}: there is such a file already. Give a new name, or remove the file")
-    try:
-        write_text(out, f"{text}\n")
-    except StoreError as error:
-        raise UsageError(f"--out {error}") from error
+    write_given(out, f"{text}\n", f"--out {out}")
     print(f"written to {out}")
 
 
@@ -55,6 +53,7 @@ def show_schema(workflow: str | None, out: Path | None) -> None:
 
     Raises:
         UsageError: if there is no such workflow, or the file cannot be written.
+        StoreError: if the disk is full.
     """
     registry = Registry.installed()
     inherited = {} if workflow is None else _inherited(workflow, registry)
@@ -62,10 +61,7 @@ def show_schema(workflow: str | None, out: Path | None) -> None:
     if out is None:
         print(text, end="")
         return
-    try:
-        write_text(out, text)
-    except StoreError as error:
-        raise UsageError(f"{error}") from error
+    write_given(out, text, f"--out {out}")
     hint = f"put this line at the top of a workflow: # yaml-language-server: $schema={out.as_posix()}"
     Console().say(escape(hint))
 

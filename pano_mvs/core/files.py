@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from pano_mvs.core.errors import StoreError
+from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.paths import children, exists, is_file, is_folder, is_link
 from pano_mvs.core.processes import process_place, start_of
 
@@ -42,6 +42,7 @@ def _umask() -> int:
 
 _UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
+_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 
 
@@ -155,10 +156,10 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
     except OSError as error:
         if isinstance(error, StoreError):
             raise
-        reason = error.strerror or str(error)
+        remedy = "Free some space" if is_full_disk(error) else "Check the permissions"
         raise StoreError(
-            f"{path} cannot be written: {reason}. Free some space, check the permissions or choose another "
-            "folder, then run the same command again"
+            f"{path} cannot be written: {_reason(error)}. {remedy} or choose another folder, then run the same "
+            "command again"
         ) from error
     finally:
         if temporary is not None:
@@ -169,6 +170,37 @@ def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durab
     """Write a text file atomically (UTF-8, line ends as given); see `replacing`."""
     with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
         temporary.write_bytes(text.encode(errors="backslashreplace"))  # file names may have bytes that are not text
+
+
+def write_given(path: Path, text: str, what: str) -> None:
+    """Write the first file of a place that the user names, as `write_text` does.
+
+    Args:
+        path: the file.
+        text: what to write.
+        what: the option and the place that it names, for messages.
+
+    Raises:
+        UsageError: if the place cannot be used.
+        StoreError: if the disk is full.
+    """
+    try:
+        write_text(path, text)
+    except StoreError as error:
+        cause = error.__cause__
+        if not isinstance(cause, OSError) or is_full_disk(cause):
+            raise
+        raise UsageError(f"{what}: cannot be written ({_reason(cause)}). Give another folder") from error
+
+
+def is_full_disk(error: BaseException | None) -> bool:
+    """Return whether a system error means that the disk is full or a quota is used up."""
+    return isinstance(error, OSError) and error.errno in _FULL
+
+
+def _reason(error: OSError) -> str:
+    """Return the reason of an error in writing, which for a folder below a file is sometimes that this exists."""
+    return os.strerror(errno.ENOTDIR) if isinstance(error, FileExistsError) else error.strerror or str(error)
 
 
 def read_regular(path: Path | str) -> bytes:

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import remove_whole, write_text
+from pano_mvs.core.files import remove_whole, write_given, write_text
 from pano_mvs.core.paths import children, exists, is_file, is_folder
 
 SCRIPTS = (
@@ -63,13 +63,14 @@ class PageFolder:
         """Make the folder, or empty one that holds an earlier page.
 
         Raises:
-            UsageError: if the folder holds something else.
-            StoreError: if it cannot be written.
+            UsageError: if the folder holds something else, or cannot be written.
+            StoreError: if the disk is full.
         """
         require_free(folder, "--to ")
         for name in ("data", "index.html", SINGLE_FILE):
             remove_whole(folder / name)
-        write_text(folder / _MARK, "This folder was written by pano-mvs share, which may replace its files.\n")
+        mark = "This folder was written by pano-mvs share, which may replace its files.\n"
+        write_given(folder / _MARK, mark, f"--to {folder}")
         self.folder = folder
         self.written: dict[str, int] = {}
 

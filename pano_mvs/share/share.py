@@ -118,7 +118,7 @@ def share_run(
 
     Raises:
         InputError: if the run has neither a cloud nor cameras, or the rooms cannot be read.
-        UsageError: if the folder holds something else.
+        UsageError: if the folder holds something else, or cannot be written.
         StoreError: if a file cannot be written.
     """
     run, folder, options = run if isinstance(run, RunOutput) else load(run), Path(folder), options or ShareOptions()

@@ -8,6 +8,7 @@ import pytest
 
 from tests.cli.conftest import Command, run_json
 from tests.permissions import permissions_hold
+from tests.share.box_run import box_run
 
 IMAGES_ALONE = """\
 pano_mvs: 1
@@ -83,6 +84,21 @@ def test_an_empty_path_is_refused(pano_mvs: Command, command: str) -> None:
     assert result.code == 2
     assert "the name is empty" in result.flat
     assert not any(Path().iterdir())
+
+
+def test_a_place_below_a_file_is_a_mistake_and_no_full_disk(pano_mvs: Command, tmp_path: Path) -> None:
+    """`share` advised to free some space, with the exit code of a full disk."""
+    run = box_run(tmp_path, points=200)
+    Path("afile").touch()
+    for command in (
+        ("share", run.out, "--to", "afile/x"),
+        ("show", "fast", "--out", "afile/x"),
+        ("schema", "--out", "afile/x"),
+        ("plugin", "new", "mask", "s", "--dir", "afile/x"),
+    ):
+        result = pano_mvs(*command)
+        assert result.code == 2, result.text
+        assert "afile/x: cannot be written (Not a directory). Give another folder" in result.flat
 
 
 def test_what_is_wrong_with_a_path_is_said(pano_mvs: Command) -> None:

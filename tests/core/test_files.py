@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core import files
-from pano_mvs.core.errors import StoreError
+from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import clear_abandoned, replacing, temporary_prefix, write_text
 from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
@@ -93,8 +94,24 @@ def test_file_is_the_old_one_until_it_is_the_new_one(tmp_path: Path, durable: bo
 
 def test_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StoreError, match=r"file.b\.txt cannot be written: (Not a directory|File exists)"):
+    with pytest.raises(StoreError, match=r"file.b\.txt cannot be written: Not a directory\. Check the permissions"):
         write_text(tmp_path / "file" / "b.txt", "x")
+
+
+@pytest.mark.parametrize("place", ["file/b.txt", "file/deep/b.txt"])
+def test_a_given_place_that_cannot_be_used_is_a_mistake_of_the_user(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"--to p: cannot be written \(Not a directory\)\. Give another folder"):
+        files.write_given(tmp_path / place, "x", "--to p")
+
+
+def test_a_full_disk_is_no_mistake_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("tempfile.mkstemp", full)
+    with pytest.raises(StoreError, match=r"No space left on device\. Free some space"):
+        files.write_given(tmp_path / "b.txt", "x", "--to p")
 
 
 def test_age_of_what_is_gone_is_no_error(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import write_given
 from pano_mvs.core.paths import exists
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -103,7 +103,8 @@ def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> Non
     """Write a new plugin and its test into a folder, and print how to use it.
 
     Raises:
-        UsageError: if a file with that name exists, or as for `rendered`.
+        UsageError: if a file with that name exists or cannot be written, or as for `rendered`.
+        StoreError: if the disk is full.
     """
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
@@ -111,7 +112,7 @@ def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> Non
         if exists(path):
             raise UsageError(f"{path} already exists; nothing was written. Choose another name or another --dir")
     for path, text in zip(paths, (plugin, test), strict=True):
-        write_text(path, text)
+        write_given(path, text, f"--dir {folder}")
     console.say(f"wrote {escape(str(paths[0]))} and its test")
     console.print("use it in a workflow:", highlight=False)
     console.print(f"  plugins: [{name}.py]", highlight=False, markup=False)

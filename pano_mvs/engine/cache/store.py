@@ -12,7 +12,6 @@ of runs on several hosts can share a cache, also on a network file system.
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import shutil
@@ -29,6 +28,7 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import (
     CACHE_MARK,
     clear_abandoned,
+    is_full_disk,
     make_room,
     read_regular,
     replacing,
@@ -43,7 +43,6 @@ from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.unit_times import FILE_NAME, UnitTimes
 from pano_mvs.scene import Record
 
-_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
 _FULL_BELOW_BYTES = 1_000_000
 
 
@@ -119,11 +118,6 @@ class DiskGuard:
             f"the disk of the cache {self._root} is full, or your quota is used up. Make room (`pano-mvs cache gc` "
             "shows what can be deleted) and run the same command again: finished units stay in the cache"
         )
-
-
-def is_full_disk(error: BaseException | None) -> bool:
-    """Return whether a system error means that the disk is full or a quota is used up."""
-    return isinstance(error, OSError) and error.errno in _FULL
 
 
 LAYOUT_VERSION = 2

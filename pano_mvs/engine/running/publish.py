@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.file_names import is_of_the_run
-from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, set_aside
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, is_full_disk, set_aside
 from pano_mvs.core.paths import is_file, is_inside, is_link
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
-from pano_mvs.engine.cache.store import ItemRef, Store, is_full_disk
+from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.scene import Files
 from pano_mvs.scene.files import item_stems
 
