@@ -102,4 +102,6 @@ def text(given: str) -> str:
 
 def path(given: str) -> Path:
     """Return the path that an argument or an option states."""
+    if "\0" in str(given):
+        raise typer.BadParameter("a path cannot hold a null byte")
     return Path(text(given))
