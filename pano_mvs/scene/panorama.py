@@ -126,7 +126,8 @@ class Panorama(Record):
 
     def at_width(self, width: int) -> Panorama:
         """Return the panorama at another working resolution: at most that of its file, and a multiple of four."""
-        width = min(width, self.source_size_hw[1]) // 4 * 4
+        if width != self.size_hw[1]:
+            width = min(width, self.source_size_hw[1]) // 4 * 4
         return self if width == self.size_hw[1] else replace(self, size_hw=(width // 2, width))
 
     def loading_bytes(self) -> int:
