@@ -46,6 +46,7 @@ else:
 
 # Headers that state at most this many pixels are accepted whatever the size of the file. Above that, a JPEG, PNG or
 # TIFF cannot have more pixels per byte than this: deflate expands one byte to at most 1032, each with 8 bilevel pixels.
+# HEIC and AVIF could, but not of a photograph.
 _ACCEPTED_PIXELS = 64_000_000
 _MAX_PIXELS_PER_BYTE = 10_000
 _COMPRESSED_STARTS = (JPEG_START, PNG_START, *TIFF_STARTS)
@@ -132,7 +133,8 @@ def readable_pixels(path: Path, max_pixels: int) -> int:
 
 
 def _is_too_short(data: bytes, length: int, pixels: int) -> bool:
-    return data.startswith(_COMPRESSED_STARTS) and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * length)
+    is_compressed = data.startswith(_COMPRESSED_STARTS) or data[4:8] == b"ftyp"
+    return is_compressed and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * length)
 
 
 def _decoded(data: bytes, flags: int) -> tuple[NDArray[np.generic] | None, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tempfile
 from pathlib import Path
 
@@ -111,6 +112,14 @@ def test_a_width_that_the_file_cannot_hold_plans_no_memory() -> None:
     changed = bytearray(SOUND["tif"])
     changed[20] = 127  # the most significant half of the width
     read_with_neighbours(bytes(changed), "tif")
+
+
+def test_a_size_that_a_heic_file_cannot_hold_plans_no_memory() -> None:
+    changed = bytearray(BOXES["heif"])
+    changed[changed.index(b"ispe") + 8] = 32  # the most significant byte of the width
+    read_with_neighbours(bytes(changed), "heic")
+    changed[changed.index(b"ispe") + 8 : changed.index(b"ispe") + 16] = struct.pack(">II", 32_000, 16_000)
+    read_with_neighbours(bytes(changed), "heic")
 
 
 def test_a_heic_file_without_images_is_refused() -> None:
