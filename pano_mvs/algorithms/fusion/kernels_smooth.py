@@ -228,5 +228,5 @@ def find_heights(
             weigh_block(near, first * 7, inside, point, axes, radii[i], weighed)
             count += add_block(weighed, inside, a, b)
         height, _, _, ok = solve_symmetric(a, b)
-        off_center = (a[1] * a[1] + a[2] * a[2]) / (_MAX_OFF_CENTER * _MAX_OFF_CENTER * a[0] * a[0])
-        heights[i] = height if ok and count >= _MIN_NEIGHBOURS and off_center < 1 else 0.0
+        is_central = a[1] * a[1] + a[2] * a[2] < _MAX_OFF_CENTER * _MAX_OFF_CENTER * a[0] * a[0]
+        heights[i] = height if ok and count >= _MIN_NEIGHBOURS and is_central else 0.0
