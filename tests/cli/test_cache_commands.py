@@ -242,9 +242,9 @@ def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:
     run(toy, "two", "--set", "scaled.by=5")
     for run_name, name, why in (
         ("nothing", "good", "0 runs match"),
-        ("", "good", "2 runs match"),
+        ("", "good", "the name is empty"),
         (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
-        (str(toy.folder / "one"), "", "not a valid name of a pin"),
+        (str(toy.folder / "one"), "", "the name is empty"),
     ):
         code, said = cache("pin", run_name, name)
         assert code == 2

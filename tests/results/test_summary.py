@@ -49,6 +49,7 @@ POSES = [
     "rejected",
     "doubts",
     "confirmed",
+    "p_right",
     "centers",
     "points",
     "frame",
