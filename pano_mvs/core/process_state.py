@@ -379,7 +379,7 @@ def _temporary_folder() -> str | None:
 
 
 def _mode_mask() -> int:
-    mask = os.umask(0o077)
+    mask = os.umask(0o077)  # for a moment, files that another thread makes can be read by their owner alone
     os.umask(mask)
     return mask
 
