@@ -25,10 +25,16 @@ def line_from_event(event: Event) -> str:
     fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
     if isinstance(event, RunStarted):
         fields["schema"] = SCHEMA
-    fields |= dataclasses.asdict(event)
+    fields |= {name: getattr(event, name) for name in event.__dataclass_fields__}
     if isinstance(event, RunFinished) and event.verdict is None:
         del fields["verdict"], fields["doubts"]
-    return json_without_controls(json.dumps(fields, ensure_ascii=False, allow_nan=False, default=str)) + "\n"
+    return json_without_controls(json.dumps(fields, ensure_ascii=False, allow_nan=False, default=_json_value)) + "\n"
+
+
+def _json_value(value: Any) -> Any:
+    """Return a value that is no JSON as a JSON value: records as objects, all else as text."""
+    is_record = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return dataclasses.asdict(value) if is_record else str(value)
 
 
 def event_from_line(line: str | bytes) -> tuple[float, Event] | None:

@@ -215,7 +215,8 @@ def _plans(run: Run) -> list[StagePlan]:
     """Plan a run; if this takes too long, assume that nothing is cached."""
     deadline = time.monotonic() + _MAX_PLANNING_S
 
-    def watch(_unit: Unit, _record: UnitRecord | None, _reason: str) -> None:
+    def watch(unit: Unit, record: UnitRecord | None, _reason: str) -> None:
+        run.note_planned(unit, record)
         if time.monotonic() > deadline:
             raise _TooLargeError
 

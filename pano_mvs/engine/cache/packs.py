@@ -101,6 +101,7 @@ class Packs:
         self._temporary = root / "tmp"
         self._indexes: dict[Path, tuple[tuple[int, ...], NDArray[Any]]] = {}
         self._sorted: tuple[list[Path], NDArray[Any]] = [], np.zeros(0, _TABLE)
+        self._highs = np.zeros(0, np.uint64)  # of the table; contiguous, or each search would copy it
         self._seen_ns = -1
 
     def find(self, digest: str, *, refresh: bool = False) -> Packed | None:
@@ -112,12 +113,11 @@ class Packs:
         """
         self._refresh(force=refresh)
         packs, table = self._sorted
-        if not len(table):
-            return None
         high, low = _halves(digest)
-        wanted = np.uint64(high)
-        first, end = (np.searchsorted(table["high"], wanted, side) for side in ("left", "right"))
-        for _, found_low, offset, size, pack, kind in table[first:end].tolist():
+        for row in range(int(self._highs.searchsorted(np.uint64(high))), len(table)):
+            found_high, found_low, offset, size, pack, kind = table[row].item()
+            if found_high != high:
+                break
             if found_low == low:
                 return Packed(packs[pack], offset, size, digest, _KINDS[kind])
         return None
@@ -238,6 +238,7 @@ class Packs:
         if found.keys() != self._indexes.keys() or any(found[pack] is not self._indexes[pack] for pack in found):
             self._indexes = found
             self._sorted = sorted(found), _table([found[pack][1] for pack in sorted(found)])
+            self._highs = self._sorted[1]["high"].copy()
         return True
 
 

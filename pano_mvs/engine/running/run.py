@@ -109,6 +109,7 @@ class Run:
         self.keys: dict[str, dict[str, str]] = {}
         self.computed: set[str] = set()
         self.refreshed: set[str] = set()
+        self._planned: dict[str, UnitRecord] = {}
         self._has_passed = False  # whether the last pass ended without an error
         self._warnings: list[str] = []
         self._last_keys = store.runs.last_keys(workflow.id) if options.accept_code else {}
@@ -166,7 +167,13 @@ class Run:
             if unit.key not in self.computed:
                 return None
         last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
-        return self.store.find(unit.key) or self.options.accepted(unit, last, self.store)
+        record = self._planned.pop(unit.key, None) or self.store.find(unit.key)
+        return record or self.options.accepted(unit, last, self.store)
+
+    def note_planned(self, unit: Unit, record: UnitRecord | None) -> None:
+        """Keep a record that the forecast has found for `find_record`, so that it is read and checked once."""
+        if record is not None and record.key == unit.key:
+            self._planned[unit.key] = record
 
     def warn(self, text: str) -> None:
         """Add a warning to the result, and notify the observer."""
