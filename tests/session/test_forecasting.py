@@ -80,6 +80,15 @@ def test_planning_that_takes_too_long_expects_that_all_is_computed(toy: Toy, mon
     assert (units["images"], units["mean"], units["shifted"], units["difference"]) == ((5, 0), (5, 0), (1, 0), (4, 0))
 
 
+def test_what_the_forecast_has_found_is_not_read_again(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_toy(toy)
+    found: list[str] = []
+    find = Store.find
+    monkeypatch.setattr(Store, "find", lambda store, key: found.append(key) or find(store, key))
+    assert run_toy(toy).summary.units.run == 0
+    assert len(found) == len(set(found))
+
+
 def test_the_report_is_remembered_only_if_something_was_computed(toy: Toy) -> None:
     size = CaptureSize(5, 2.0)
     fresh, again = run_of(toy), run_of(toy)

@@ -203,7 +203,7 @@ class MergeFiles:
         if not any(block.has_cloud for block in self.blocks):
             return 0
         turn = z_up_from_world(world_up(self.merged.poses))
-        with replacing(self._to_write("cloud.ply")) as temporary:
+        with replacing(self.to_write("cloud.ply")) as temporary:
             return write_ply_parts(temporary, self._cloud_parts(), quality=True, uncertainty=True, file_from_world=turn)
 
     def write_ranges(self) -> list[ViewSummary]:
@@ -227,30 +227,30 @@ class MergeFiles:
             return False
         range_file, confidence_file, uncertainty_file = map_files(stem)
         ranges = (view.range_map * np.float32(scale)).astype(np.float32)
-        write_range_tiff(self._to_write(range_file), ranges)
+        write_range_tiff(self.to_write(range_file), ranges)
         if view.confidence is not None:
-            write_confidence_png(self._to_write(confidence_file), np.ascontiguousarray(view.confidence))
+            write_confidence_png(self.to_write(confidence_file), np.ascontiguousarray(view.confidence))
         if view.uncertainty is not None:
-            write_range_tiff(self._to_write(uncertainty_file), np.ascontiguousarray(view.uncertainty))
+            write_range_tiff(self.to_write(uncertainty_file), np.ascontiguousarray(view.uncertainty))
         return True
 
     def _preview(self, view: RunView, stem: str) -> str:
         if view.preview is None:
             return ""
         name = f"preview/{stem}{view.preview.suffix}"
-        copy_file(view.preview, self._to_write(name))
+        copy_file(view.preview, self.to_write(name))
         return name
 
     def remove_stale(self, earlier: RunSummary) -> None:
         """Delete files of an earlier merge into the folder that this one has not written: they are in another world."""
         stems = item_stems(earlier.poses.registered)
         maps = (name for view in earlier.views if view.name in stems for name in map_files(stems[view.name]))
-        old = {"cloud.ply", *maps, *(view.preview for view in earlier.views if view.preview)}
+        old = {"cloud.ply", *maps, *earlier.files, *(view.preview for view in earlier.views if view.preview)}
         for name in old - self.written:
             if path := file_inside(self.out, name):
                 path.unlink()
 
-    def _to_write(self, name: str) -> Path:
+    def to_write(self, name: str) -> Path:
         """Return the path of a file that is about to be written, in its folder."""
         path = path_inside(self.out, name)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -33,6 +33,7 @@ from pano_mvs.results.records import CloudSummary, ImageReason, MergedSummary, P
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import BLOCKS, FAILED_ITEMS, RunSummary
 from pano_mvs.scene import Poses
+from pano_mvs.session.merging.exports import repeat_exports
 from pano_mvs.session.merging.files import Block, MergeFiles, load_blocks
 from pano_mvs.session.summarise import poses_summary
 
@@ -40,7 +41,7 @@ _STAGE = "merge"
 _ADJUSTS = "poses.refine"  # without it, blocks have poses that are to be kept
 _MERGED_NAMES = {
     *(OUTPUT_MARK, LOCK_NAME, BLOCKS, "cloud.ply", "colmap", "transforms.json", "poses.json"),
-    *("range", "confidence", "uncertainty", "preview"),
+    *("range", "confidence", "uncertainty", "preview", "floor_plan", "mesh.ply", "tiles_3d"),
 }
 
 
@@ -64,8 +65,8 @@ class MergeResult:
 def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) -> MergeResult:
     """Merge the output folders of blocks that have cameras in common, and write the result to another folder.
 
-    The folder gets the COLMAP model, transforms.json, poses.json, cloud.ply, range maps with their confidence, run.json
-    and a report. The world is that of the largest block whose unit is the metre, or else of the largest block. Nothing
+    The folder gets the COLMAP model, transforms.json, poses.json, cloud.ply, range maps with their confidence, what the
+    exports of the largest block that read nothing but poses and cloud make of these, run.json and a report. The world is that of the largest block whose unit is the metre, or else of the largest block. Nothing
     is written if the blocks are not connected, or disagree.
 
     Args:
@@ -100,7 +101,7 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     (to / OUTPUT_MARK).touch()
     with output_lock(to):
         files = MergeFiles(to, blocks, similarities, merged)
-        summary = _written(files, alignment)
+        summary = _written(files, alignment, exports_of=blocks[reference].run.summary)
         files.remove_stale(earlier)
         summary = summary.model_copy(
             update={
@@ -138,13 +139,14 @@ def require_free(to: Path) -> RunSummary:
     return earlier
 
 
-def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
+def _written(files: MergeFiles, alignment: BlockAlignment, *, exports_of: RunSummary) -> RunSummary:
     """Write all files except run.json and the report, and return the summary."""
     blocks, poses = files.blocks, files.merged.poses
     points = files.write_cloud()
     files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged))
+    exported, left_out = repeat_exports(files, exports_of)
+    notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged), *left_out)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     rejected = _rejected(blocks, poses)
     warnings = (*_disagreements(blocks, alignment), *_failures(blocks, rejected))
@@ -160,6 +162,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment) -> RunSummary:
         poses=poses_summary(poses, rejected=rejected, doubts=poses.doubts, links=_links(blocks)),
         views=tuple[ViewSummary, ...](views),
         cloud=CloudSummary(points=points or None),
+        files=exported,
         versions=dict(max((block.run.summary for block in blocks), key=lambda summary: summary.started).versions),
     )
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks import nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
@@ -365,3 +366,55 @@ def test_the_cloud_moves_with_the_cameras(tmp_path: Path) -> None:
     assert np.abs(cloud - still).max() > 0.01
     followed, _ = found.move(still, still, nearest_cameras(still, found.before.centers))
     np.testing.assert_allclose(cloud, followed, atol=1e-4)
+
+
+def with_exports(folder: Path, *uses: StageOutcome) -> list[Path]:
+    """Write the blocks, as if their workflow had these stages."""
+    for number, chosen in enumerate(RANGES):
+        out = folder / f"block_{number}"
+        write_block(out, list(chosen), some_world(number))
+        RunSummary.read(out).model_copy(update={"stages": uses}).write(out)
+    return [folder / f"block_{number}" for number in range(len(RANGES))]
+
+
+def test_exports_of_poses_and_cloud_are_made_of_the_whole_capture(tmp_path: Path) -> None:
+    tiles = StageOutcome(name="tiles", use="export.tiles_3d", params={"tile_points": 1000})
+    plan = StageOutcome(name="plan", use="export.floor_plan", params={"formats": ["svg"]})
+    textured = StageOutcome(name="textured", use="export.mesh_textured")
+    outs = with_exports(tmp_path, tiles, plan, textured, StageOutcome(name="ply", use="export.ply"))
+    merged = merge_outputs(outs, tmp_path / "merged")
+    tileset = json.loads((tmp_path / "merged/tiles_3d/tileset.json").read_text())
+    low, high = _corners(tileset["root"]["boundingVolume"]["box"])
+    points = read_ply(tmp_path / "merged/cloud.ply").points_in_world
+    turned = points @ np.array(tileset["extras"]["file_from_world"]).T
+    np.testing.assert_allclose([low, high], [turned.min(axis=0), turned.max(axis=0)], atol=1e-3)
+    about = json.loads((tmp_path / "merged/floor_plan/floor_plan.json").read_text())
+    assert sum(len(storey["cameras"]) for storey in about["storeys"]) == 30
+    assert {"tiles_3d/tileset.json", "floor_plan/floor_plan.json"} <= merged.summary.files.keys()
+    assert "of each block, and not merged: the files of export.mesh_textured" in merged.summary.notes
+    assert not list((tmp_path / "merged").glob(".tmp-*"))
+
+
+def _corners(box: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    center, half = np.array(box[:3]), np.abs(np.array(box[3:]).reshape(3, 3)).sum(axis=0)
+    return center - half, center + half
+
+
+def test_an_export_that_fails_is_named_and_loses_nothing(tmp_path: Path) -> None:
+    mesh = StageOutcome(name="mesh", use="export.mesh", params={"min_views": 200})
+    gone = StageOutcome(name="tiles", use="export.tiles_3d", params={"no_such_setting": 1})
+    merged = merge_outputs(with_exports(tmp_path, mesh, gone), tmp_path / "merged")
+    for use in ("export.mesh", "export.tiles_3d"):
+        assert any(f"{use} was not repeated for the merged capture" in note for note in merged.summary.notes)
+    assert (tmp_path / "merged/cloud.ply").is_file()
+
+
+def test_exports_of_an_earlier_merge_do_not_stay(tmp_path: Path) -> None:
+    tiles = StageOutcome(name="tiles", use="export.tiles_3d")
+    merge_outputs(with_exports(tmp_path, tiles), tmp_path / "merged")
+    assert (tmp_path / "merged/tiles_3d/tileset.json").is_file()
+    for number in range(3):
+        out = tmp_path / f"block_{number}"
+        RunSummary.read(out).model_copy(update={"stages": ()}).write(out)
+    merge_outputs([tmp_path / f"block_{number}" for number in range(3)], tmp_path / "merged")
+    assert not (tmp_path / "merged/tiles_3d/tileset.json").exists()
