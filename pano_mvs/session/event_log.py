@@ -25,7 +25,7 @@ def line_from_event(event: Event) -> str:
     fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
     if isinstance(event, RunStarted):
         fields["schema"] = SCHEMA
-    fields |= {name: getattr(event, name) for name in event.__dataclass_fields__}
+    fields |= {field.name: getattr(event, field.name) for field in dataclasses.fields(event)}
     if isinstance(event, RunFinished) and event.verdict is None:
         del fields["verdict"], fields["doubts"]
     return json_without_controls(json.dumps(fields, ensure_ascii=False, allow_nan=False, default=_json_value)) + "\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import get_args
@@ -47,6 +48,12 @@ EVENTS: tuple[Event, ...] = (
     BlockStarted("block_2", 2, 3, images=12, images_left=12),
     RunFinished(3, "", run=3, failed=1, seconds=9.0, out=Path("out"), verdict=VERDICT, doubts={"a": "b"}),
 )
+
+
+def test_a_line_has_the_fields_of_the_event() -> None:
+    line = json.loads(line_from_event(UnitFinished("depth", "a.png", "run", 1.25)))
+    del line["time"]
+    assert line == {"event": "unit_finished", "stage": "depth", "item": "a.png", "outcome": "run", "seconds": 1.25}
 
 
 def test_every_event_comes_back() -> None:

@@ -36,7 +36,7 @@ class Place:
         truth = {f"{idx:05d}.jpg": pose for idx, pose in enumerate(self.poses)}
         for name, pose in list(truth.items())[: views or None]:
             if not (folder / name).is_file():
-                image = draw(self.boxes, pose, (width // 2, width), reach=self.reach)
+                image, _ = draw(self.boxes, pose, (width // 2, width), reach=self.reach)
                 part = folder.with_suffix(".part.jpg")
                 cv2.imwrite(str(part), image[:, :, ::-1], _QUALITY)
                 part.rename(folder / name)

@@ -18,6 +18,7 @@ from pano_mvs.geometry import Rigid3, ray_grid
 
 _SKY = np.array([(0.85, 0.9, 0.95), (0.35, 0.55, 0.85)])
 _NOISE = 1.0
+_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,10 @@ class Boxes:
     windows: NDArray[np.float64]
 
 
-def draw(boxes: Boxes, cam_from_world: Rigid3, size_hw: tuple[int, int], *, reach: float) -> NDArray[np.uint8]:
-    """Return the panorama (H, W, 3) uint8 RGB of a camera, with sensor noise.
+def draw(
+    boxes: Boxes, cam_from_world: Rigid3, size_hw: tuple[int, int], *, reach: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return the panorama (H, W, 3) uint8 RGB of a camera, with sensor noise, and its ranges (H, W), NaN for the sky.
 
     Args:
         boxes: of the place. The camera may be inside a box, whose inner side it then sees.
@@ -49,21 +52,21 @@ def draw(boxes: Boxes, cam_from_world: Rigid3, size_hw: tuple[int, int], *, reac
     gaps = np.maximum(np.maximum(boxes.low - center, center - boxes.high), 0)
     near = np.flatnonzero(np.linalg.norm(gaps, axis=1) < reach)
     near = near[np.argsort(np.linalg.norm(gaps[near], axis=1), kind="stable")]
-    rays = (ray_grid(size_hw).reshape(-1, 3) @ cam_from_world.rotation).reshape(*size_hw, 3)
-    image = _traced(
-        rays,
-        center,
-        (boxes.low[near], boxes.high[near], gaps[near]),
-        (near, boxes.colors_rgb[near], boxes.windows[near]),
-        2 * math.pi / size_hw[1],
-    )
+    shapes = boxes.low[near], boxes.high[near], gaps[near]
+    looks = near, boxes.colors_rgb[near], boxes.windows[near]
+    image, ranges = np.empty((*size_hw, 3), np.uint8), np.empty(size_hw, np.float32)
     rng = np.random.default_rng(np.abs(1e6 * center).astype(np.int64))
-    noise = rng.standard_normal(image.shape, np.float32)
-    return np.clip(np.rint(255 * image + _NOISE * noise), 0, 255).astype(np.uint8)
+    for first in range(0, size_hw[0], _ROWS):
+        rows = slice(first, min(first + _ROWS, size_hw[0]))
+        rays = np.ascontiguousarray(ray_grid(size_hw, rows) @ cam_from_world.rotation)
+        colors, ranges[rows] = _traced(rays, center, shapes, looks, 2 * math.pi / size_hw[1])
+        noise = rng.standard_normal(colors.shape, np.float32)
+        image[rows] = np.clip(np.rint(255 * colors + _NOISE * noise), 0, 255)
+    return image, ranges
 
 
 def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True, fastmath=True, nogil=True)(function)
+    return numba.njit(cache=True, fastmath=True)(function)
 
 
 @_compiled
@@ -108,7 +111,7 @@ def _traced(rays: Any, center: Any, shapes: Any, looks: Any, pixel_rad: float) -
     lows, highs, gaps = shapes
     seeds, colors, windows = looks
     height, width = rays.shape[:2]
-    image = np.empty((height, width, 3), np.float32)
+    image, ranges = np.empty((height, width, 3), np.float32), np.full((height, width), np.nan, np.float32)
     for row in range(height):
         for column in range(width):
             ray = rays[row, column]
@@ -137,6 +140,7 @@ def _traced(rays: Any, center: Any, shapes: Any, looks: Any, pixel_rad: float) -
                 for k in range(3):
                     image[row, column, k] = _SKY[0, k] + high * (_SKY[1, k] - _SKY[0, k])
                 continue
+            ranges[row, column] = best
             slant = max(0.05, abs(ray[axis]))
             across = 2 if axis == 0 else 0
             up = 2 if axis == 1 else 1
@@ -147,4 +151,4 @@ def _traced(rays: Any, center: Any, shapes: Any, looks: Any, pixel_rad: float) -
             light = 0.75 + 0.25 * (1 if side == 4 else 0.5 if axis == 0 else 0.1)
             for k in range(3):
                 image[row, column, k] = min(1.0, max(0.0, 1.3 * light * colors[hit, k] * value))
-    return image
+    return image, ranges
