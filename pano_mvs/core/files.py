@@ -126,6 +126,29 @@ def is_older(path: Path, seconds: float) -> bool:
         return False
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents, if they do not exist.
+
+    In a folder that its group shares (`chmod g+ws`), folders, and files of `replacing`, are the group's too, whatever
+    the umask.
+
+    Raises:
+        OSError: if it cannot be created.
+    """
+    if folder.is_dir():
+        return
+    make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    if shared := _shared_mode(folder.parent):
+        folder.chmod(stat.S_IMODE(folder.stat().st_mode) | shared | stat.S_ISGID)
+
+
+def _shared_mode(folder: Path) -> int:
+    """Return the permissions that a group has in a folder that it shares; 0 elsewhere."""
+    mode = folder.stat().st_mode
+    return mode & stat.S_IRWXG if mode & stat.S_ISGID and mode & stat.S_IWGRP else 0
+
+
 @contextmanager
 def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path to write to; on success it is renamed to `path`, otherwise it is removed.
@@ -141,13 +164,13 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
     folder = temporary_in or path.parent
     temporary: Path | None = None
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
+        make_folder(path.parent)
         handle, name = tempfile.mkstemp(dir=folder, prefix=temporary_prefix(), suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        temporary.chmod(0o666 & ~_UMASK)
+        temporary.chmod(0o666 & (~_UMASK | _shared_mode(path.parent)))
         if durable:
             _flush(temporary)
         _take_name(temporary, path)

@@ -122,3 +122,23 @@ def test_age_of_what_is_gone_is_no_error(tmp_path: Path) -> None:
 def test_names_of_files_that_are_no_text_can_be_written_of(tmp_path: Path) -> None:
     write_text(tmp_path / "page.html", "of \udcff.png")
     assert (tmp_path / "page.html").read_text(encoding="utf-8") == "of \\udcff.png"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="groups and their permissions are those of POSIX")
+def test_what_lies_in_a_folder_of_a_group_is_the_groups_whatever_the_umask(
+    toy: Toy,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cache = toy.folder / "cache"
+    cache.mkdir()
+    cache.chmod(0o2770)
+    monkeypatch.setattr(files, "_UMASK", 0o077)
+    before = os.umask(0o077)
+    try:
+        toy.run()
+    finally:
+        os.umask(before)
+    found = {path: path.stat().st_mode & 0o7777 for path in cache.rglob("*")}
+    assert not [path for path, mode in found.items() if path.is_dir() and mode != 0o2770]
+    assert not [path for path, mode in found.items() if path.is_file() and mode != 0o660]
+    assert (toy.folder / "out").stat().st_mode & 0o070 == 0

@@ -29,6 +29,7 @@ from pano_mvs.core.files import (
     CACHE_MARK,
     clear_abandoned,
     is_full_disk,
+    make_folder,
     make_room,
     read_regular,
     replacing,
@@ -73,7 +74,7 @@ class DiskGuard:
         """
         self.require()
         try:
-            parent.mkdir(parents=True, exist_ok=True)
+            make_folder(parent)
             folder = Path(tempfile.mkdtemp(dir=parent, prefix=temporary_prefix()))
         except OSError as error:
             raise self.cannot_write(error) from error

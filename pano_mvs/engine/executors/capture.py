@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from pano_mvs.core.files import make_folder
+
 _STDOUT, _STDERR = 1, 2
 _TAIL_BYTES = 8192
 
@@ -21,7 +23,7 @@ def captured(log: Path) -> Iterator[None]:
 
     This redirects the descriptors 1 and 2 of the whole process; to print meanwhile, use a duplicate made before.
     """
-    log.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(log.parent)
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
     kept_streams = sys.stdout, sys.stderr
     kept = [os.dup(_STDOUT), os.dup(_STDERR)]

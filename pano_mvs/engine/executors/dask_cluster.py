@@ -26,7 +26,7 @@ import pano_mvs
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.extras import import_extra
-from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.core.paths import below, children, is_file
 from pano_mvs.engine.cache.store import Store
@@ -105,7 +105,7 @@ class DaskExecutor:
         # What each worker compares with its own: the cache, a file in it, and the versions.
         self._expected = str(store.root.absolute()), self._token.name, versions()
         try:
-            self._token.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._token.parent)
             self._token.write_text(self._token.name, encoding="ascii")
         except OSError as error:
             self.close()

@@ -29,6 +29,7 @@ from pano_mvs.core.errors import (
     StoreError,
     UsageError,
 )
+from pano_mvs.core.files import make_folder
 from pano_mvs.core.process_state import Changes, ProcessState, has_plugins
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.cache.blobs import DamagedBlobError
@@ -279,7 +280,7 @@ def unit_outcome(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOut
     """Run a unit with its output in `log`, store its result, and return how it ended."""
     started = time.perf_counter()
     try:
-        log.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(log.parent)
         log.touch()
     except OSError as error:
         return JobOutcome("stopped", cause=str(store.cannot_write(error)), error="StoreError", exit_code=4)

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
@@ -113,7 +113,7 @@ class ProcessExecutor:
     def _add_worker(self) -> None:
         errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
         try:
-            errors.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(errors.parent)
         except OSError as error:
             raise self._store.cannot_write(error) from error
         worker = WorkerProcess(self.cores, errors)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.files import make_folder
 from pano_mvs.core.paths import reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.protocol import Job
@@ -63,7 +64,7 @@ def has_large_inputs(unit: Unit) -> bool:
 
 def write_large_inputs(unit: Unit, store: Store, path: Path) -> None:
     """Write the large inputs of a unit, and the parts of its identity that describe them."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with path.open("w", encoding="utf-8") as stream:
         for port in _large_ports(unit):
             value = unit.inputs[port]

@@ -66,8 +66,9 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     """Merge the output folders of blocks that have cameras in common, and write the result to another folder.
 
     The folder gets the COLMAP model, transforms.json, poses.json, cloud.ply, range maps with their confidence, what the
-    exports of the largest block that read nothing but poses and cloud make of these, run.json and a report. The world is that of the largest block whose unit is the metre, or else of the largest block. Nothing
-    is written if the blocks are not connected, or disagree.
+    exports of the largest block that read nothing but poses and cloud make of these, run.json and a report. The world
+    is that of the largest block whose unit is the metre, or else of the largest block. Nothing is written if the blocks
+    are not connected, or disagree.
 
     Args:
         outs: output folders of runs.

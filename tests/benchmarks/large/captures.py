@@ -1,4 +1,4 @@
-"""Captures of hundreds to thousands of panoramas, from images to the cloud: `python -m tests.benchmarks large.captures`.
+"""Captures of hundreds of panoramas, from images to the cloud: `python -m tests.benchmarks large.captures FOLDER`.
 
 A city that a car drives through, or a building of rooms that somebody walks through (`places`), is drawn once, and its
 first images are run with a preset, first to the poses, then to the end, then again. Printed are, for each number of

@@ -112,7 +112,7 @@ _LONG, _WIDE, _CEILING, _CAMERA, _DOOR, _HALF_WALL = 7.0, 6.0, 3.2, 1.5, 1.4, 0.
 
 
 def building(views: int, *, seed: int = 0, step: float = 1.4) -> Place:
-    """Return rooms on a grid, with doors to all neighbours, furniture and pictures, walked row by row, then by column."""
+    """Return rooms on a grid, with doors to all neighbours and furniture, walked row by row, then by column."""
     builder = _Builder(seed)
     lines = _lines(views * step / _WIDE)
     wide, long = lines * _WIDE, lines * _LONG
@@ -178,7 +178,9 @@ def _along(
         raise ValueError(f"the path has {int(along[-1] / step) + 1} views, not {views}")
     poses = []
     for distance in np.arange(views) * step:
-        here, ahead = (np.array([np.interp(at, along, path[:, k]) for k in (0, 1)]) for at in (distance, distance + 0.5))
+        here, ahead = (
+            np.array([np.interp(at, along, path[:, k]) for k in (0, 1)]) for at in (distance, distance + 0.5)
+        )
         yaw = float(np.arctan2(*(ahead - here))) + rng.normal(0, 0.1)
         center = (here[0] + rng.normal(0, 0.1), height + rng.normal(0, 0.03), here[1] + rng.normal(0, 0.1))
         tilt = rotation_from_rotvec(rng.normal(0, np.radians(2), 3))
