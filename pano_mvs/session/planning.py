@@ -21,6 +21,7 @@ from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import WHOLE, Unit
 from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.stages.stage import is_only_planned
 from pano_mvs.scene import Axis
 from pano_mvs.session.progress import Forecast
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
@@ -135,8 +136,12 @@ def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> Run
     store = Store(session.store_root, for_reading=True)
     workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
     listing = SourceListing()
-    with without_collector():
-        plans = make_plan(workflow, graph, store, options=session.run_options, listing=listing)
+    only_planned = is_only_planned.set(True)
+    try:
+        with without_collector():
+            plans = make_plan(workflow, graph, store, options=session.run_options, listing=listing)
+    finally:
+        is_only_planned.reset(only_planned)
     with suppress(StoreError):  # a cache of other users can be read, not written
         store.stat_cache.save()
     workers, threads = shape(workers, threads)

@@ -16,6 +16,7 @@ from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
+from pano_mvs.engine.stages.stage import is_only_planned
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.images.copies import Copy, find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
@@ -81,7 +82,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         require_masks(params.masks, [path.relative_to(params.path).as_posix() for path in pictures])
     names = [printable_name(path.relative_to(params.path).as_posix()) for path in pictures]
     usable = {name: path for path, (name, problem) in zip(pictures, names, strict=True) if not problem}
-    copies = find_copies(usable, max_pixels=params.max_pixels)
+    copies = find_copies(usable, max_pixels=params.max_pixels, read=not is_only_planned.get())
     if len(pictures) - len(copies) < 2:
         raise InputError(
             f"{params.path}: all images are copies of one ({pictures[0].name}); depth needs two or more panoramas of "

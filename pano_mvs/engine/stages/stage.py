@@ -7,6 +7,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -111,6 +112,9 @@ class SourceItem:
         """Return a file as part of a record; its `read_bytes` raises if the file has changed since it was listed."""
         return FilePart(self.files[role], external=True, digest=self.digests.get(role, ""))
 
+
+is_only_planned: ContextVar[bool] = ContextVar("is_only_planned", default=False)
+"""Whether items are listed for a plan, so that nobody should wait for what takes long and rarely changes the list."""
 
 ListItems = Callable[[Any], Iterable[SourceItem]]
 MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]

@@ -6,8 +6,10 @@ A copy shows the world from the same place, so that it adds nothing, but it coun
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
-from pano_mvs.core.files import replacing
+from pano_mvs.core.files import read_regular, replacing
 from pano_mvs.io.images.keyframe_file import file_of_state
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
@@ -26,6 +28,10 @@ _BLUR_PX = 2.0  # coarser structure is alike in all pictures of a place
 # Copies at a quarter of the size, or saved as JPEG of quality 30, have .91 and more; other panoramas .77 and less
 # (20 places with up to 44 panoramas, some with a tripod or the same logo in each).
 _MIN_CORRELATION = 0.85
+# Of 512 magnitudes: such copies agree by .98 and more, other panoramas by .89 and less (rooms, a city, a flat).
+_SAMPLES, _MIN_AGREEMENT = 512, 0.9
+_ROWS_AT_ONCE = 1024
+_KEPT_SPECTRA = 64
 _REDUCED = {8: cv2.IMREAD_REDUCED_GRAYSCALE_8, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 2: cv2.IMREAD_REDUCED_GRAYSCALE_2}
 
 
@@ -42,40 +48,77 @@ class Copy:
     turn_deg: float
 
 
-def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS) -> dict[str, Copy]:
+def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read: bool = True) -> dict[str, Copy]:
     """Return, for each picture that is a copy of an earlier one, which one.
 
-    Pictures that OpenCV does not read are compared with none.
+    Two pictures are compared by the largest circular correlation of their fine structure over all turns, if some of the
+    magnitudes of its spectrum agree: turns do not change these.
+
+    Args:
+        paths: of the pictures, by name. Those that OpenCV does not read are compared with none.
+        max_pixels: limit of a picture.
+        read: whether to read the pictures that no earlier command has read, which takes long; else they are no copies.
     """
-    known = {name: picture for name, path in paths.items() if (picture := _reduced(path, max_pixels)) is not None}
-    return copies_among(known)
-
-
-def copies_among(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, Copy]:
-    """Return, for each small grey picture (128, 256) that is a copy of an earlier one, which one.
-
-    Two pictures are compared by the largest circular correlation of their fine structure over all turns. By the
-    inequality of Cauchy and Schwarz, it is at most the scalar product of the norms of their rows, which turns do not
-    change, so that most pairs need no transform.
-    """
-    if len(pictures) < 2:
+    with ThreadPoolExecutor() as pool:
+        found = pool.map(lambda path: _magnitudes(path, max_pixels, read=read), paths.values())
+        known = {name: magnitudes for name, magnitudes in zip(paths, found, strict=True) if magnitudes.any()}
+    if len(known) < 2:
         return {}
-    names = list(pictures)
-    fine = np.array([_fine_structure(picture) for picture in pictures.values()])
-    norms = np.linalg.norm(fine, axis=2)
-    likely = np.tril(norms @ norms.T >= _MIN_CORRELATION, -1)
-    spectra = np.fft.rfft(fine, axis=2).astype(np.complex64)
-    found: dict[str, Copy] = {}
-    for later in range(len(names)):
-        for earlier in np.flatnonzero(likely[later]).tolist():
-            if names[earlier] in found:
+    names, magnitudes = list(known), np.array(list(known.values()))
+    copies: dict[str, Copy] = {}
+
+    @lru_cache(maxsize=_KEPT_SPECTRA)
+    def spectrum(name: str) -> NDArray[np.complex64] | None:
+        picture = _reduced(paths[name], max_pixels)
+        return None if picture is None else _spectrum(picture)
+
+    for first in range(0, len(names), _ROWS_AT_ONCE):
+        likely = magnitudes[first : first + _ROWS_AT_ONCE] @ magnitudes.T >= _MIN_AGREEMENT
+        for later, earlier in np.argwhere(np.tril(likely, first - 1)).tolist():
+            name, original = names[first + later], names[earlier]
+            if name in copies or original in copies:
                 continue
-            correlation = np.fft.irfft((np.conj(spectra[later]) * spectra[earlier]).sum(axis=0), _SIZE_HW[1])
+            own, other = spectrum(name), spectrum(original)
+            if own is None or other is None:
+                continue
+            correlation = np.fft.irfft((np.conj(own) * other).sum(axis=0), _SIZE_HW[1])
             best = int(correlation.argmax())
             if correlation[best] >= _MIN_CORRELATION:
-                found[names[later]] = Copy(names[earlier], 360 * best / _SIZE_HW[1])
-                break
+                copies[name] = Copy(original, 360 * best / _SIZE_HW[1])
+    return copies
+
+
+def _magnitudes(path: Path, max_pixels: int, *, read: bool) -> NDArray[np.float32]:
+    """Return what is compared first: magnitudes of the spectrum, with norm 1; zeros if the picture is plain or unread.
+
+    They are stored among the user's caches for the next command.
+    """
+    kept = file_of_state(path, "copies", [*_SIZE_HW, _SAMPLES], suffix=".f2")
+    if kept is not None:
+        with suppress(OSError, ValueError):
+            stored = np.frombuffer(read_regular(kept), "<f2")
+            if stored.shape == (_SAMPLES,) and np.isfinite(stored).all():
+                return stored.astype(np.float32)
+    found = np.zeros(_SAMPLES, np.float32)
+    if not read:
+        return found
+    if (picture := _decoded(path, max_pixels)) is not None:
+        sampled = np.abs(_spectrum(picture))[_sampled_places()]
+        found = np.asarray(sampled / max(float(np.linalg.norm(sampled)), 1e-12), np.float32)
+    _keep(kept, found.astype("<f2").tobytes())
     return found
+
+
+@cache
+def _sampled_places() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows, except those near the poles, and frequencies of the spectrum that are compared first."""
+    rng = np.random.default_rng(0)
+    height, width = _SIZE_HW
+    return rng.integers(height // 16, height * 15 // 16, _SAMPLES), rng.integers(2, width // 4, _SAMPLES)
+
+
+def _spectrum(picture: NDArray[np.uint8]) -> NDArray[np.complex64]:
+    return np.fft.rfft(_fine_structure(picture), axis=1).astype(np.complex64)
 
 
 def _fine_structure(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -96,6 +139,13 @@ def _reduced(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
             picture = cv2.imdecode(np.fromfile(kept, np.uint8), cv2.IMREAD_GRAYSCALE)
             if picture is not None and picture.shape == _SIZE_HW:
                 return np.asarray(picture, np.uint8)
+    small = _decoded(path, max_pixels)
+    if small is not None:
+        _keep(kept, cv2.imencode(".png", small)[1].tobytes())
+    return small
+
+
+def _decoded(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
     with suppress(InputError):
         data = FilePart(path).read_bytes()
         size_hw = stated_size(data)
@@ -103,13 +153,11 @@ def _reduced(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
         flags = next((flag for by, flag in _REDUCED.items() if width >= by * _SIZE_HW[1]), cv2.IMREAD_GRAYSCALE)
         decoded = decode_picture(data, path, flags | cv2.IMREAD_IGNORE_ORIENTATION, max_pixels=max_pixels)
         if decoded is not None:
-            small = np.asarray(cv2.resize(decoded, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA), np.uint8)
-            _keep(kept, small)
-            return small
+            return np.asarray(cv2.resize(decoded, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     return None
 
 
-def _keep(path: Path | None, picture: NDArray[np.uint8]) -> None:
+def _keep(path: Path | None, data: bytes) -> None:
     if path is not None:
         with suppress(OSError, StoreError), replacing(path) as temporary:
-            temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+            temporary.write_bytes(data)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import pano_mvs
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.images import copies
 from pano_mvs.io.images.copies import find_copies
 from pano_mvs.stages.source import FolderParams, list_folder
 from pano_mvs.testing.room import default_room, render
@@ -79,3 +81,32 @@ def test_the_source_names_copies_and_uses_each_picture_once(tmp_path: Path, pict
     problems = {item.name: item.problem for item in list_folder(params)}
     copied = "it is a copy of 1.png, turned by 90°, which is used alone, as a copy adds nothing; remove one of them"
     assert problems == {"1.png": "", "2.png": copied, "3.png": ""}
+
+
+def test_a_plan_does_not_read_pictures_for_copies(tmp_path: Path, picture: NDArray[np.uint8]) -> None:
+    paths = {name: tmp_path / name for name in ("a.png", "b.png")}
+    for path in paths.values():
+        cv2.imwrite(str(path), picture)
+    assert find_copies(paths, read=False) == {}
+    assert list(find_copies(paths)) == ["b.png"]
+    assert list(find_copies(paths, read=False)) == ["b.png"]
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number, center in enumerate(((0.6, 0.0, 0.2), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
+        cv2.imwrite(str(folder / f"{number}.png"), room_seen_from(*center))
+    settings = {"cache": tmp_path / "cache", "out": tmp_path / "out", "until": ["images"]}
+    assert list(pano_mvs.plan("fast", images=folder, **settings)["images"].run) == ["0.png", "1.png", "2.png"]
+    pano_mvs.run("fast", images=folder, **settings)
+    assert list(pano_mvs.plan("fast", images=folder, **settings)["images"].cached) == ["0.png", "1.png"]
+
+
+def test_a_picture_that_is_not_read_is_tried_once(
+    tmp_path: Path, picture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = {name: tmp_path / name for name in ("a.png", "b.png", "c.png")}
+    for path in paths.values():
+        cv2.imwrite(str(path), picture)
+    paths["c.png"].write_bytes(b"no picture")
+    assert list(find_copies(paths)) == ["b.png"]
+    monkeypatch.setattr(copies, "_decoded", lambda path, _: pytest.fail(f"{path} is read again"))
+    assert list(find_copies(paths)) == ["b.png"]
