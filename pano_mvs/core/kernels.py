@@ -13,6 +13,8 @@ from typing import Any
 from numba import config, njit
 from numba.core.caching import IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.sigutils import normalize_signature
+from numba.core.types.misc import unliteral
 
 from pano_mvs.core.kernel_cache import PACKAGE, compilation_time, kernels_digest
 
@@ -40,8 +42,10 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         compile_or_load, folder = compiled.compile, _cache_folder(compiled, function)
 
         def compile_once(signature: Any) -> Any:
+            # For a call with a constant, such as `f(a, 0)`, numba would compile another copy for this constant.
+            arguments = tuple(unliteral(argument) for argument in normalize_signature(signature)[0])
             with _alone(folder):
-                return compile_or_load(signature)
+                return compile_or_load(arguments)
 
         compiled.compile = compile_once
     return compiled

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core import kernel_cache
+from pano_mvs.core.kernels import kernel
 
 
 def test_folder_changes_with_any_kernel_file(tmp_path: Path) -> None:
@@ -148,3 +149,18 @@ def test_kernels_that_others_could_have_written_are_not_used(tmp_path: Path, mon
     folder.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match="no writable folder for caches"):
         kernel_cache._own_temporary_folder()
+
+
+@kernel
+def _scaled(value: float, factor: int) -> float:
+    return value * factor
+
+
+@kernel
+def _scaled_twice(value: float, factor: int) -> float:
+    return float(_scaled(value, factor) + _scaled(value, 3))
+
+
+def test_a_call_with_a_constant_compiles_no_further_copy() -> None:
+    assert _scaled_twice(2.0, 4) == 14.0
+    assert len(_scaled.overloads) == 1

@@ -292,7 +292,10 @@ def bistochastise(
             # Some corners receive no weight from any pixel; 0 / 0 there would make the whole solution NaN.
             n[vertex] = np.sqrt(n[vertex] * mass[vertex] / blurred[vertex]) if mass[vertex] > 0 else 0.0
     # Compute m from n instead of taking the mass: the rows of D_m − D_n B̄ D_n then sum to exactly zero.
-    return n, n * blur(n, starts, indices, strengths, center)
+    m = blur(n, starts, indices, strengths, center)
+    for vertex in range(len(n)):
+        m[vertex] *= n[vertex]
+    return n, m
 
 
 @kernel
@@ -309,8 +312,12 @@ def apply_system(
     gram: FloatArray,
 ) -> FloatArray:
     """Return (λ (D_m − D_n B̄ D_n) + S C Sᵀ) values."""
-    blurred = blur(n * values, starts, indices, strengths, center)
-    result: FloatArray = smoothness * (m * values - n * blurred)
+    result = np.empty_like(values)
+    for vertex in range(len(values)):
+        result[vertex] = n[vertex] * values[vertex]
+    blurred = blur(result, starts, indices, strengths, center)
+    for vertex in range(len(values)):
+        result[vertex] = smoothness * (m[vertex] * values[vertex] - n[vertex] * blurred[vertex])
     for element in range(len(vertices)):
         for a in range(4):
             total = 0.0
@@ -328,20 +335,29 @@ def solve(
 
     `system` holds the arguments of `apply_system` after the values.
     """
-    values = initial.copy()
-    residual = right - apply_system(values, *system)
-    scaled = residual / diagonal
-    direction = scaled.copy()
-    energy = np.sum(residual * scaled)
-    goal = tolerance**2 * np.sum(right * right / diagonal)
+    count = len(right)
+    values, direction = initial.copy(), np.empty_like(right)
+    residual = apply_system(values, *system)
+    energy = square = 0.0
+    for i in range(count):
+        residual[i] = right[i] - residual[i]
+        direction[i] = residual[i] / diagonal[i]
+        energy += residual[i] * direction[i]
+        square += right[i] * right[i] / diagonal[i]
+    goal = tolerance**2 * square
     done = 0
     while done < iterations and energy > goal:
         image = apply_system(direction, *system)
-        step = energy / np.sum(direction * image)
-        values += step * direction
-        residual -= step * image
-        scaled = residual / diagonal
-        previous, energy = energy, np.sum(residual * scaled)
-        direction = scaled + (energy / previous) * direction
+        along = 0.0
+        for i in range(count):
+            along += direction[i] * image[i]
+        step, previous, energy = energy / along, energy, 0.0
+        for i in range(count):
+            values[i] += step * direction[i]
+            residual[i] -= step * image[i]
+            image[i] = residual[i] / diagonal[i]
+            energy += residual[i] * image[i]
+        for i in range(count):
+            direction[i] = image[i] + (energy / previous) * direction[i]
         done += 1
     return values, done

@@ -177,10 +177,10 @@ def add_source(
     weighted = uncertainty.size > 0
     sigma = 1.0
     verdicts, found = np.empty(ranges.shape[1], np.uint8), np.empty((5, ranges.shape[1]))
-    view = rotation, translation, center
+    view, bounds = (rotation, translation, center), (limits[0], limits[1], limits[2])
     for row in range(rows[0], rows[1]):
         sine, cosine = elevations[0, row], elevations[1, row]
-        judge_row(ranges[row], turns, (sine, cosine), view, source_ranges, limits, verdicts, found)
+        judge_row(ranges[row], turns, (sine, cosine), view, source_ranges, bounds, verdicts, found)
         for column in range(ranges.shape[1]):
             verdict, x, y = verdicts[column], found[0, column], found[1, column]
             if verdict != AGREES and verdict != CONTRADICTS:

@@ -105,7 +105,7 @@ class GuidedSweep:
         if not self._by_paths:
             sweep = sweep._replace(scale=np.float32(0))
         costs = np.empty((run.rows, _COUNT, len(columns)), self.volume.dtype)
-        sweep_guided_band(run.first, sweep, Guide(around, self._table, _TABLE_PER_PLANE), costs)
+        sweep_guided_band(run.first, sweep, sweep.others, Guide(around, self._table, _TABLE_PER_PLANE), costs)
         rows, own = run.place
         self.volume[rows, layer * _COUNT : (layer + 1) * _COUNT, own] = costs[:, :, run.inner]
 
@@ -137,7 +137,8 @@ class GuidedSweep:
         state, planes = fresh_state(run.rows, len(run.with_margin))
         farthest = int(self.guides[(slice(None), *run.place)].max()) + STEPS
         ranges = np.ascontiguousarray(self.work.ranges[: farthest + 1 : _SEARCH_STEP])
-        sweep_band(run.first, run_arguments(self._shared, run), ranges, NO_VOLUME, state, planes)
+        sweep = run_arguments(self._shared, run)
+        sweep_band(run.first, sweep, sweep.others, ranges, NO_VOLUME, state, planes)
         plane[run.place] = _SEARCH_STEP * planes[:, run.inner]
         costs[run.place] = state[BEST][:, run.inner]
 

@@ -60,7 +60,7 @@ def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[n
         arguments = run_arguments(sweep, run)
         for idx in range(len(work.ranges)):
             state, planes = fresh_state(run.rows, run.columns + 2 * run.margin)
-            sweep_band(run.first, arguments, work.ranges[idx : idx + 1], NO_VOLUME, state, planes)
+            sweep_band(run.first, arguments, arguments.others, work.ranges[idx : idx + 1], NO_VOLUME, state, planes)
             costs[idx, own] = state[BEST][place]
     return costs
 

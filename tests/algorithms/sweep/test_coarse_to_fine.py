@@ -87,7 +87,9 @@ def _compare_with_the_plain_sweep(height: int, settings: SweepSettings) -> None:
     shared = sweep_arguments(work)
     for first in bands:
         rows = min(32, height - first)
-        sweep_band(first, shared, work.ranges, plain[first : first + rows], *fresh_state(rows, 2 * height))
+        sweep_band(
+            first, shared, shared.others, work.ranges, plain[first : first + rows], *fresh_state(rows, 2 * height)
+        )
     with ThreadPoolExecutor(1) as pool:
         sweep = GuidedSweep(work, np.full((2, height, 2 * height), 9.0, np.float32), pool)
         sweep._sweep(0, np.ones((height, 2 * height), np.bool_))

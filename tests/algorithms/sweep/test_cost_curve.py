@@ -77,7 +77,8 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
             if costs is not None:
                 volume[row, :, column] = np.rint(costs.raw * 255)
     stored = np.empty((24, 9, 48), np.uint8)
-    sweep_band(0, sweep_arguments(work), work.ranges, stored, *fresh_state(24, 48))
+    arguments = sweep_arguments(work)
+    sweep_band(0, arguments, arguments.others, work.ranges, stored, *fresh_state(24, 48))
     total = _aggregate(averaged(stored.astype(np.int64), work), work)
     for row in (0, 12, 23):
         for column in (3, 19, 35):

@@ -56,7 +56,7 @@ def _warped(
     masked = np.array([[0, valid.size]])  # none is, but all are asked
     sources = Sources(poses, packed, colors, starts, shapes, valid, np.zeros(1, np.int64), masked, vector)
     found = Lookup(knots, warped, votes, against, pixel_costs)
-    warp_band(first - halo, height, sin_cos, sources, 0, 1.3, pad, found)
+    warp_band(first - halo, height, sin_cos, sources, 0, True, 1.3, pad, found)
     assert votes.all()
     return pixel_costs if len(against) else warped
 

@@ -251,7 +251,7 @@ def _box_winners(work: SweepInput, sweep: Sweep) -> Winners:
 
     def sweep_rows(first: int) -> None:
         state, planes = fresh_state(min(BAND_ROWS, height - first), width)
-        sweep_band(first, sweep, work.ranges, NO_VOLUME, state, planes)
+        sweep_band(first, sweep, sweep.others, work.ranges, NO_VOLUME, state, planes)
         keep_band(found, state, planes, first=first)
 
     with workers() as pool:
@@ -267,7 +267,7 @@ def _volume_of(work: SweepInput, sweep: Sweep, around: slice) -> NDArray[np.uint
         rows = min(BAND_ROWS, around.stop - first)
         state, planes = fresh_state(rows, volume.shape[2])
         here = first - around.start
-        sweep_band(first, sweep, work.ranges, volume[here : here + rows], state, planes)
+        sweep_band(first, sweep, sweep.others, work.ranges, volume[here : here + rows], state, planes)
 
     with workers() as pool:
         run_jobs(pool, sweep_rows, range(around.start, around.stop, BAND_ROWS))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.costs import census_weight
-from pano_mvs.algorithms.sweep.kernels_constants import CENSUS_GRADIENT
+from pano_mvs.algorithms.sweep.kernels_constants import CENSUS, CENSUS_GRADIENT
 from pano_mvs.algorithms.sweep.numba.kernels_records import Combination, Sources, Sweep, Windows
 from pano_mvs.algorithms.sweep.numba.kernels_winner import STATES
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
@@ -121,6 +121,7 @@ def sweep_arguments(work: SweepInput) -> Sweep:
         sources=_sources(work),
         windows=windows,
         cost=kernel,
+        others=None if kernel in (CENSUS, CENSUS_GRADIENT) else True,
         census_weight=census_weight(settings.compare_radius) if kernel == CENSUS_GRADIENT else 0,
         combination=Combination(
             weights=source_weights((height, width), work.source_from_reference, settings),

@@ -182,12 +182,13 @@ def _combine_weighted(costs: F32, y: int, combination: Combination, picture_row:
 
 
 @kernel
-def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, planes: I32) -> None:
+def sweep_band(first: int, sweep: Sweep, others: bool | None, ranges: F64, volume: U8, state: F32, planes: I32) -> None:
     """Compute the costs of one band at all depth hypotheses, into the volume or straight into the winners.
 
-    `first`: the first row of the band; it has as many rows as `planes`. `sweep`: what all bands share. `ranges`: (D,)
-    float64. `volume`: (rows, D, W) uint8, the band's, written; empty if the winner is wanted at once. `state`: (STATES,
-    rows, W) float32, infinite; see `update_plain`. `planes`: (rows, W) int32, written if the volume is empty.
+    `first`: the first row of the band; it has as many rows as `planes`. `sweep`: what all bands share. `others`: its
+    field. `ranges`: (D,) float64. `volume`: (rows, D, W) uint8, the band's, written; empty if the winner is wanted at
+    once. `state`: (STATES, rows, W) float32, infinite; see `update_plain`. `planes`: (rows, W) int32, written if the
+    volume is empty.
     """
     rows, width = planes.shape
     sources, windows, combination, reference = sweep.sources, sweep.windows, sweep.combination, sweep.reference
@@ -206,20 +207,22 @@ def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, pl
     summed = is_sad and all_vote and one_box_serves(count, combination, box_radius, pad)
     above = first - halo + pad
     fused = is_sad and len(sources.colors) > 0 and width % PIXELS == 0
-    against = interleave_rows(reference, above, pixel_costs.shape[0] if fused else 0, pad)
+    against = np.empty((0, width), np.uint32)
+    if others is not None and fused:
+        against = interleave_rows(reference, above, pixel_costs.shape[0], pad)
     found = Lookup(knots, warped, votes, against, pixel_costs)
     for d in range(len(ranges)):
         for s in range(count):
             if is_sad and (s == 0 or not summed):
                 pixel_costs[:] = 0
-            warp_band(first - halo, height, sin_cos_azimuth, sources, s, ranges[d], pad, found)
-            if is_sad:
+            warp_band(first - halo, height, sin_cos_azimuth, sources, s, others, ranges[d], pad, found)
+            if others is not None and is_sad:
                 if not fused:
                     add_differences(reference, above, warped, pad, pixel_costs)
                 if s == count - 1 or not summed:
                     average_differences(pixel_costs, reach, box_radius, pad, scratch, costs[s])
             else:
-                source_cost(first, sweep, warped, pixel_costs, scratch, costs[s])
+                source_cost(first, sweep, others, warped, pixel_costs, scratch, costs[s])
             if sources.masked[s, 0] < sources.masked[s, 1]:
                 silence(votes, halo, costs[s])
         held = d % PLANES_AT_ONCE

@@ -336,6 +336,7 @@ def divide_row(sums: F32, count: int, result: F32) -> None:
 @kernel
 def pixel_cost_row(
     cost: int,
+    others: bool | None,
     census_weight: int,
     reference: U8,
     reference_row: int,
@@ -348,10 +349,10 @@ def pixel_cost_row(
 ) -> None:
     """Write what each pixel of a row costs by itself. A new cost that is compiled has its branch here.
 
-    `cost`: which one, of `kernels_constants`. `census_weight`: of census beside grey levels. `reference`: (C, rows, W +
-    2 pad) uint8. `reference_row`: its row. `warped`: (C, rows, W + 2 pad) uint8, the source. `warped_row`: its row.
-    `offsets`: (window,) int64 columns of the window in that row. `pad`: the margin. `disagree`: (W,) uint8, scratch.
-    `total`: (W,) uint16, written.
+    `cost`: which one, of `kernels_constants`. `others`: see `Sweep`. `census_weight`: of census beside grey levels.
+    `reference`: (C, rows, W + 2 pad) uint8. `reference_row`: its row. `warped`: (C, rows, W + 2 pad) uint8, the source.
+    `warped_row`: its row. `offsets`: (window,) int64 columns of the window in that row. `pad`: the margin. `disagree`:
+    (W,) uint8, scratch. `total`: (W,) uint16, written.
     """
     if cost == CENSUS:
         count_census_row(reference[0], reference_row, warped[0], warped_row, offsets, pad, disagree)
@@ -361,28 +362,30 @@ def pixel_cost_row(
         census_gradient_row(
             reference[0], reference_row, warped[0], warped_row, offsets, census_weight, pad, disagree, total
         )
-    elif cost == SAD_GRADIENT:
+    elif others is not None and cost == SAD_GRADIENT:
         sad_gradient_row(reference, reference_row, warped, warped_row, offsets[2], pad, total)
-    else:
+    elif others is not None:
         total[:] = 0
         for c in range(reference.shape[0]):
             difference_row(reference[c], reference_row, warped[c], warped_row, pad, total)
 
 
 @kernel
-def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch: I32, means: F32) -> None:
+def source_cost(
+    first: int, sweep: Sweep, others: bool | None, warped: U8, pixel_costs: U16, scratch: I32, means: F32
+) -> None:
     """Compare a band of the reference with a warped source and average over the box.
 
-    `first`: the first row of the band. `sweep`: the reference, the windows and the cost. `warped`: (C, rows + 2
-    (compare_radius + box_radius), W + 2 pad) uint8. `pixel_costs`: (rows + 2 box_radius, W + 2 pad) uint16, scratch.
-    `scratch`: (2, W + 2 pad) int32. `means`: (rows, W) float32, written.
+    `first`: the first row of the band. `sweep`: the reference, the windows and the cost. `others`: its field. `warped`:
+    (C, rows + 2 (compare_radius + box_radius), W + 2 pad) uint8. `pixel_costs`: (rows + 2 box_radius, W + 2 pad)
+    uint16, scratch. `scratch`: (2, W + 2 pad) int32. `means`: (rows, W) float32, written.
     """
     rows, width = means.shape
     reference, cost, census_weight = sweep.reference, sweep.cost, sweep.census_weight
     window_offsets, all_reach, compare_radius, box_radius, pad = sweep.windows
     height = window_offsets.shape[0]
     reach = all_reach[first : first + rows]
-    if cost == ZNCC:
+    if others is not None and cost == ZNCC:
         zncc_rows(first, reference[0], warped[0], reach, box_radius, pad, pixel_costs, scratch, means)
         return
     disagree = np.empty(width, np.uint8)
@@ -392,7 +395,7 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
         offsets = window_offsets[mirrored]
         compared = j + compare_radius
         total = pixel_costs[j, pad : pad + width]
-        pixel_cost_row(cost, census_weight, reference, y + pad, warped, compared, offsets, pad, disagree, total)
+        pixel_cost_row(cost, others, census_weight, reference, y + pad, warped, compared, offsets, pad, disagree, total)
         wrap_row(pixel_costs[j], width, pad)
     if box_radius:
         box_rows(pixel_costs, reach, box_radius, pad, scratch[0], scratch[1], means)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import wrap_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 from pano_mvs.core.kernels import kernel
 
@@ -25,9 +26,9 @@ def _average_row(costs: U8, columns: I64, weights: U16, row: int, padded: U8, to
     """Average a row, (W,), around the sphere along itself; `padded` and `total` are scratch."""
     width = costs.shape[0]
     margin = (padded.shape[0] - width) // 2
-    padded[:margin] = costs[width - margin :]
-    padded[margin : margin + width] = costs
-    padded[margin + width :] = costs[:margin]
+    for i in range(_U(width)):
+        padded[_U(margin) + i] = costs[i]
+    wrap_row(padded, width, margin)
     total[:] = _HALF
     for k in range(weights.shape[0]):
         _add_weighted(weights[k, row], padded, margin + columns[row, k], total)
@@ -38,10 +39,12 @@ def _average_row(costs: U8, columns: I64, weights: U16, row: int, padded: U8, to
 @kernel
 def _row_beyond(rows: U8, row: int, at_pole: bool, result: U8) -> None:
     """Write the row that follows beyond the first or last one: half a turn further on beyond a pole, else the same."""
-    turn = rows.shape[1] // 2 if at_pole else 0
-    width = rows.shape[1]
-    result[: width - turn] = rows[row, turn:]
-    result[width - turn :] = rows[row, :turn]
+    width = _U(rows.shape[1])
+    turn = width // _U(2) if at_pole else _U(0)
+    for i in range(width - turn):
+        result[i] = rows[row, turn + i]
+    for i in range(turn):
+        result[width - turn + i] = rows[row, i]
 
 
 @kernel
@@ -57,7 +60,10 @@ def average_planes(
     height, _, width = volume.shape
     side = along.shape[0]
     radius = side // 2
-    margin = max(1, int(columns.max()))
+    margin = 1
+    for y in range(columns.shape[0]):
+        for k in range(columns.shape[1]):
+            margin = max(margin, columns[y, k])
     padded, total = np.empty(width + 2 * margin, np.uint8), np.empty(width, np.uint16)
     rows = np.empty((height + 2 * radius, width), np.uint8)
     for d in range(first, first + count):

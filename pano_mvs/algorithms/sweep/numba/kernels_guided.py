@@ -73,12 +73,14 @@ def project_guided_row(
 
 
 @kernel
-def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift: int, found: Lookup) -> None:
+def warp_guided_band(
+    first: int, sweep: Sweep, others: bool | None, source: int, guide: Guide, shift: int, found: Lookup
+) -> None:
     """Look up the rows `first` …, `shift` planes beyond the guide, in one source.
 
-    `first`: the first row, may be negative. `sweep`: the sources and the directions of the columns. `source`: the index
-    of the source. `guide`: the surface, in these rows. `shift`: planes. `found`: written; `knots`, `against` and
-    `pixel_costs` are not used.
+    `first`: the first row, may be negative. `sweep`: the sources and the directions of the columns. `others`: its
+    field. `source`: the index of the source. `guide`: the surface, in these rows. `shift`: planes. `found`: written;
+    `knots`, `against` and `pixel_costs` are not used.
     """
     sources, height = sweep.sources, sweep.windows.offsets.shape[0]
     pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
@@ -104,17 +106,17 @@ def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift:
         inverse_row(positions[j], shift, table, per_plane, inverse)
         project_guided_row(sin_cos_azimuth, matrix, offset, translation, inverse, shape, x_px, y_px)
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
-        sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
+        sample_row(packed, colors, others, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
         vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
 @kernel
-def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any]) -> None:
+def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guide, costs: NDArray[Any]) -> None:
     """Compute the costs of one band at some planes on either side of the guide.
 
-    `first`: the first row of the band. `sweep`: what all bands share. `guide`: the surface, in the rows of the band and
-    compare_radius + box_radius rows on either side. `costs`: (rows, 2 steps + 1, W), written: uint8 on the scale of the
-    volume; float32 means if `sweep.scale` is 0.
+    `first`: the first row of the band. `sweep`: what all bands share. `others`: its field. `guide`: the surface, in the
+    rows of the band and compare_radius + box_radius rows on either side. `costs`: (rows, 2 steps + 1, W), written:
+    uint8 on the scale of the volume; float32 means if `sweep.scale` is 0.
     """
     rows, count, width = costs.shape
     windows = sweep.windows
@@ -129,8 +131,8 @@ def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any
     found = Lookup(np.empty((0, 0, 0), np.float32), warped, votes, np.empty((0, 0), np.uint32), pixel_costs)
     for k in range(count):
         for s in range(sources):
-            warp_guided_band(first - halo, sweep, s, guide, k - count // 2, found)
-            source_cost(first, sweep, warped, pixel_costs, scratch, means[s])
+            warp_guided_band(first - halo, sweep, others, s, guide, k - count // 2, found)
+            source_cost(first, sweep, others, warped, pixel_costs, scratch, means[s])
             if sweep.sources.masked[s, 0] < sweep.sources.masked[s, 1]:
                 silence(votes, halo, means[s])
         for j in range(rows):
@@ -138,7 +140,8 @@ def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any
             if sweep.scale > _F(0):
                 store_row(combined, sweep.scale, costs[j, k])
             else:
-                costs[j, k] = combined
+                for i in range(_U(width)):
+                    costs[j, k, i] = combined[i]
 
 
 _H = np.uint16

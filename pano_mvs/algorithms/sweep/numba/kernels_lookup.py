@@ -328,6 +328,7 @@ def warp_band(
     sin_cos_azimuth: F32,
     sources: Sources,
     source: int,
+    others: bool | None,
     virtual_range: float,
     pad: int,
     found: Lookup,
@@ -338,8 +339,8 @@ def warp_band(
     around by themselves.
 
     `first`: the first row, may be negative. `height`: rows of the reference picture. `sin_cos_azimuth`: (2, W) float32.
-    `sources`: all sources. `source`: the index of the one. `virtual_range`: in scene units. `pad`: width of the wrapped
-    margin of the result. `found`: written.
+    `sources`: all sources. `source`: the index of the one. `others`: see `Sweep`. `virtual_range`: in scene units.
+    `pad`: width of the wrapped margin of the result. `found`: written.
     """
     pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
     packed, colors, vector = sources.packed, sources.colors, sources.vector
@@ -369,10 +370,10 @@ def warp_band(
                 project_row(sin_cos_azimuth, matrix, offset, shape, runs[k, 0], runs[k, 1], exact[0], exact[1])
                 replace_rough(rough, exact, runs[k, 0], runs[k, 1], x_px, y_px)
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
-        if len(against):
+        if others is not None and len(against):
             add_sampled_differences(colors, starts[0], index, weight_y, weight_x, against, j, pad, pixel_costs)
         else:
-            sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
+            sample_row(packed, colors, others, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
         vote_row(valid, valid_start, first_masked, after_masked, index, votes, j)
 
 
@@ -380,6 +381,7 @@ def warp_band(
 def sample_row(
     packed: U32,
     colors: U64,
+    others: bool | None,
     starts: I64,
     vector: bool,
     index: I32,
@@ -392,12 +394,12 @@ def sample_row(
 ) -> None:
     """Sample one row of a source at places that are known. No records: at each row they would cost what they hold.
 
-    `packed`: (·,) uint32 of `Sources`. `colors`: (·,) uint64 likewise. `starts`: (C or 1,) int64 of this source.
-    `vector`: whether to use vector instructions. `index`: (W,) int32 of the patches, see `place_row`. `weight_y`: (W,)
-    int32. `weight_x`: (W,) int32. `patches`: (W,) uint32, scratch. `warped`: (C, rows, W + 2 pad) uint8, written.
-    `row`: of `warped`. `pad`: width of the wrapped margin.
+    `packed`: (·,) uint32 of `Sources`. `colors`: (·,) uint64 likewise. `others`: see `Sweep`. `starts`: (C or 1,) int64
+    of this source. `vector`: whether to use vector instructions. `index`: (W,) int32 of the patches, see `place_row`.
+    `weight_y`: (W,) int32. `weight_x`: (W,) int32. `patches`: (W,) uint32, scratch. `warped`: (C, rows, W + 2 pad)
+    uint8, written. `row`: of `warped`. `pad`: width of the wrapped margin.
     """
-    if len(colors):
+    if others is not None and len(colors):
         _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, row, pad)
     else:
         _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, row, pad)

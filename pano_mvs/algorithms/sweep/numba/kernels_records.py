@@ -79,9 +79,10 @@ class Sweep(NamedTuple):
 
     `reference`: (C, H + 2 pad, W + 2 pad) uint8, padded over the seam and the poles. `sin_cos_azimuth`: (2, W) float32
     sin θ and cos θ of the columns. `sources`: the sources. `windows`: the windows. `cost`: the number of the cost, see
-    `kernels_constants`. `census_weight`: of census beside grey levels; 0 for other costs. `combination`: how the costs
-    of the sources become one. `scale`: float32 from mean costs to those of the volume, 0 to 255; 0 keeps mean costs in
-    `sweep_guided_band`.
+    `kernels_constants`. `others`: None for census and census_gradient, which most workflows use: kernels that get None
+    do not compile what other costs need. `census_weight`: of census beside grey levels; 0 for other costs.
+    `combination`: how the costs of the sources become one. `scale`: float32 from mean costs to those of the volume, 0
+    to 255; 0 keeps mean costs in `sweep_guided_band`.
     """
 
     reference: U8
@@ -89,6 +90,7 @@ class Sweep(NamedTuple):
     sources: Sources
     windows: Windows
     cost: int
+    others: bool | None
     census_weight: int
     combination: Combination
     scale: np.float32

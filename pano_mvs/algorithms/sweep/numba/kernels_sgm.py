@@ -232,10 +232,12 @@ def _take_front(front: Front, column: int, lines: int, state: U16, least: U16) -
         while done < lines:
             start = (column + done) % width
             count = min(lines - done, width - start)
-            to = LINES + done
-            least[way, to : to + count] = front.least[way, start : start + count]
+            to, source = _U(LINES + done), _U(start)
+            for k in range(_U(count)):
+                least[way, to + k] = front.least[way, source + k]
             for d in range(depth):
-                state[way, d, to : to + count] = front.paths[way, d, start : start + count]
+                for k in range(_U(count)):
+                    state[way, d, to + k] = front.paths[way, d, source + k]
             done += count
 
 
@@ -285,7 +287,9 @@ def follow_block(
         _step_row(costs, row, (columns, lines), _ALL, line, state, least, scratch, sums, not beyond)
         _step_row(costs, row, (columns + lines, halo), 2, after, state, least, scratch, sums, False)
     for way in range(3):
-        start = LINES + count - (0, count, -count)[way]
-        new_front.least[way, first : first + lines] = least[way, start : start + lines]
+        start, to = _U(LINES + count - (0, count, -count)[way]), _U(first)
+        for i in range(_U(lines)):
+            new_front.least[way, to + i] = least[way, start + i]
         for d in range(depth):
-            new_front.paths[way, d, first : first + lines] = state[way, d, start : start + lines]
+            for i in range(_U(lines)):
+                new_front.paths[way, d, to + i] = state[way, d, start + i]
