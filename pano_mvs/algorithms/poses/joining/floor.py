@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
-from pano_mvs.algorithms.poses.frame.vertical_lines import up_of_panorama
+from pano_mvs.algorithms.poses.frame.upside_down import up_of_picture
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray
@@ -117,8 +117,7 @@ class Floors:
         """Return a panorama in grey and its mask, both small and padded, and its axes: right, down and forward."""
         picture, mask = self._load(image)
         small = reduced_panorama(picture, _WIDTH_PX)
-        lines = up_of_panorama(picture, mask)
-        down = -lines.up if lines else np.array([0.0, 1.0, 0.0])
+        down = -up_of_picture(picture, mask)
         forward = np.array([0.0, 0.0, 1.0]) - down[2] * down
         forward /= np.linalg.norm(forward)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
