@@ -10,16 +10,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
-from pano_mvs.algorithms.poses.joining.proposals import (
-    PairHypothesis,
-    least_costly,
-    pair_proposals,
-    pivoted,
-)
+from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis, least_costly, pair_proposals
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 
-_FINALISTS, _PIVOTED = 10, 6
+_FINALISTS = 10
 _MAX_EVALUATIONS = 12
 _MIN_REFINED = 8
 
@@ -71,9 +66,6 @@ def align_models(
     proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad)
     if not proposals:
         return None
-    proposals = least_costly(proposals, matches, threshold_rad=threshold_rad, count=_PIVOTED)
-    for start in tuple(proposals):
-        proposals += pivoted(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
     finalists = [
         _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
         for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)

@@ -7,17 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3
 
 _LENGTHS = np.geomspace(0.1, 30.0, 80)
-_MIN_PIVOTED = 4
-_PIVOT_RAD = np.deg2rad([-24, -18, -14, -11, -8, -6, -4, -2, 2, 4, 6, 8, 11, 14, 18, 24])
-_PIVOT_AXES = np.array(
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
-)
-_FACTORS = np.geomspace(0.5, 2.0, 15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,42 +50,6 @@ def least_costly(
     """Return the similarities with the lowest costs, best first."""
     costs = [alignment_cost(one, matches, threshold_rad=threshold_rad) for one in similarities]
     return [similarities[idx] for idx in np.argsort(costs, kind="stable")[:count]]
-
-
-def pivoted(
-    similarity: FloatArray, matches: CrossMatches, *, threshold_rad: float, has_scale: bool
-) -> list[FloatArray]:
-    """Return the best similarities that turn the second model about the points that both see.
-
-    Through a door, both models see few points in one direction; a turn about these, together with the shift that it
-    causes, hardly changes what is seen there. Other matches then decide.
-    """
-    rotation, shift, scale = parts_of(similarity)
-    points = np.where(
-        np.isfinite(matches.points[:, 0]), matches.points[:, 0], scale * matches.points[:, 1] @ rotation.T + shift
-    )
-    near = (errors_and_residuals(similarity, matches)[0] < 2 * threshold_rad) & matches.known
-    if near.sum() < _MIN_PIVOTED:
-        return []
-    pivot = np.median(points[near], axis=0)
-    found = []
-    for axis in _PIVOT_AXES:
-        for angle in _PIVOT_RAD:
-            turn = rotation_from_rotvec(angle * axis)
-            turned = turn @ rotation
-            moved = turn @ (shift - pivot) + pivot
-            found.append(np.concatenate([turned.ravel(), moved, [scale]]))
-    best = least_costly(found, matches, threshold_rad=2 * threshold_rad, count=2)
-    return best if not has_scale else [_rescaled(one, pivot, matches, threshold_rad=threshold_rad) for one in best]
-
-
-def _rescaled(similarity: FloatArray, pivot: FloatArray, matches: CrossMatches, *, threshold_rad: float) -> FloatArray:
-    """Return a similarity with the best scale about a point."""
-    found = []
-    for factor in _FACTORS:
-        shift = factor * (similarity[9:12] - pivot) + pivot
-        found.append(np.concatenate([similarity[:9], shift, [factor * similarity[12]]]))
-    return least_costly(found, matches, threshold_rad=2 * threshold_rad, count=1)[0]
 
 
 def _with_lengths(
