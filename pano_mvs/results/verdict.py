@@ -240,17 +240,20 @@ def _doubts(summary: RunSummary) -> Iterator[Finding]:
     doubts, poses = summary.doubtful_images, summary.poses
     if not doubts:
         return
-    reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
-    more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
     what = "camera" if poses.doubts else "image"
-    count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
-    them = plural(len(reasons), "it and its", "them and their")
+    count = f"{len(doubts)} {plural(len(doubts), f'{what} is', f'{what}s are')} doubtful"
     mood = doubt_mood(poses) if poses.doubts else "fair"
+    if len(doubts) > 1 and len(reasons := {*doubts.values()}) == 1 and doubts.keys() >= {*poses.registered}:
+        yield Finding(mood, f"All {count}: {reasons.pop()}.")
+        return
+    named = [f"{name} ({reason})" for name, reason in doubts.items()]
+    more = f"; and {len(named) - _SHOWN_DOUBTS} more" if len(named) > _SHOWN_DOUBTS else ""
+    them = plural(len(doubts), "it and its", "them and their")
     yield Finding(
         mood,
-        f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+        f"{count}: {'; '.join(named[:_SHOWN_DOUBTS])}{more}.",
         f"Take panoramas between {them} neighbours that show something unique, or leave "
-        f"{plural(len(reasons), 'it', 'these images')} out.",
+        f"{plural(len(doubts), 'it', 'these images')} out.",
     )
 
 

@@ -21,6 +21,7 @@ from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 _UP_OF_WORLD = np.array([0.0, -1.0, 0.0])
+_UPSIDE_DOWN = -0.8  # cosine between the up directions of a camera and of the world
 
 
 @params_from(level_poses)
@@ -59,11 +60,19 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
             ctx.note(f"{which}levelled by {vertical.evidence}, uncertain by {vertical.uncertainty_deg:.1f}°")
             if _on_orientation(vertical):
                 ctx.note(f"{which}{_on_orientation(vertical)}")
+            if over := _turned_over(level_group):
+                ctx.note(f"{which}upside down unlike the others, which the poses allow for: {', '.join(over)}")
             if not number:
                 ctx.metric("uncertainty_deg", vertical.uncertainty_deg)
                 if np.isfinite(vertical.disagreement_deg):
                     ctx.metric("disagreement_deg", vertical.disagreement_deg)
     return join_groups(levelled, order=poses.names, rejected=poses.rejected)
+
+
+def _turned_over(level_group: Poses) -> list[str]:
+    """Return the images that are upside down in a level world; none if all are."""
+    over = level_group.rotations[:, 1, 1] < _UPSIDE_DOWN
+    return [] if over.all() else [name for name, is_over in zip(level_group.names, over, strict=True) if is_over]
 
 
 def _on_orientation(vertical: Vertical) -> str:

@@ -86,6 +86,7 @@ def doubting(count: int) -> dict[str, Any]:
         ({"exit_code": 3, "poses": doubting(1)}, "fair", "1 camera is doubtful: 0.png (confirmed 1 %)."),
         ({"poses": doubting(5)}, "fair", "5 cameras are doubtful: 0.png (confirmed 1 %); 1.png"),
         ({"poses": doubting(6)}, "bad", "4.png (confirmed 1 %); and 1 more."),
+        ({"poses": doubting(len(NAMES))}, "bad", f"All {len(NAMES)} cameras are doubtful: confirmed 1 %."),
         (
             {"poses": POSES | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}},
             "fair",

@@ -350,6 +350,17 @@ def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context) -> None:
         assert ctx.notes[number].startswith(f"group {number}: levelled by")
 
 
+def test_a_camera_that_is_upside_down_unlike_the_others_is_named(rooms: Rooms, ctx: Context) -> None:
+    over = np.diag([-1.0, -1.0, 1.0])
+    name, images, poses = _LARGE[-1], dict(rooms.images), split_groups(rooms.poses)[0]
+    idx = poses.names.index(name)
+    images[name] = replace(images[name], up_in_cam=tuple(over @ images[name].up_in_cam))
+    turned = replace(poses, rotations=poses.rotations.copy(), translations=poses.translations.copy())
+    turned.rotations[idx], turned.translations[idx] = over @ poses.rotations[idx], over @ poses.translations[idx]
+    level(poses=turned, images=images, params=LevelParams.model_validate({"evidence": "sensors"}), ctx=ctx)
+    assert ctx.notes[-1] == f"upside down unlike the others, which the poses allow for: {name}"
+
+
 def _metres(poses: Poses, first: str, second: str) -> float:
     positions = dict(zip(poses.names, poses.centers, strict=True))
     return float(np.linalg.norm(positions[first] - positions[second]))

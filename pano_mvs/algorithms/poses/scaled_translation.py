@@ -9,7 +9,6 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
 from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
-from pano_mvs.algorithms.poses.joining.floor import Floors
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
@@ -67,8 +66,7 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    floors = None if load is None else Floors(lambda image: load(names[image]))
-    models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation, floors=floors)
+    models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation)
     groups = [_finished(grown, adjust=adjust) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
@@ -86,7 +84,7 @@ def solve_scaled_translation(
 
 
 def _grown_and_joined(
-    pairs: Pairs, *, adjust: bool, confirmation: Confirmation | None, floors: Floors | None
+    pairs: Pairs, *, adjust: bool, confirmation: Confirmation | None
 ) -> tuple[list[GrownModel], dict[int, str]]:
     """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
@@ -104,7 +102,7 @@ def _grown_and_joined(
     placed = {image for one in grown for image in one.model.cameras}
     alone = [PlacedModel(pairs, {image: Rigid3.identity()}) for image in range(len(pairs.names)) if image not in placed]
     found: list[GrownModel] = []
-    for model, numbers in join_models([*(one.model for one in grown), *alone], floors) if grown else []:
+    for model, numbers in join_models([*(one.model for one in grown), *alone]) if grown else []:
         if len(numbers) > 1:
             settle(model, adjust=adjust, confirmation=confirmation)
             found.append(GrownModel(model, {}, check_cameras(model, confirmation)))

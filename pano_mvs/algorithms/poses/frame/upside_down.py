@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
-from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
+from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, up_of_panorama
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
 from pano_mvs.scene import Poses
@@ -41,8 +41,22 @@ def upside_down_probability(poses: Poses, pictures: Mapping[str, Picture], up: F
         pictures: image name to a function that loads its panorama; one is in memory at a time.
         up: (3,) unit vector, the up direction in the world according to the cameras.
     """
-    log_odds = float(np.tanh(differences_below(poses, pictures, up) / _SCALES) @ _WEIGHTS) + PRIOR_LOG_ODDS
-    return 1 / (1 + float(np.exp(-log_odds)))
+    return 1 / (1 + float(np.exp(-_log_odds(differences_below(poses, pictures, up)))))
+
+
+def up_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> FloatArray:
+    """Return the zenith (3,) in the camera frame of a single panorama, which may be upside down.
+
+    Its vertical lines determine the axis, within 20° of the camera's own, which counts if there are none. Brightness
+    and texture determine which end of it is up.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        valid: (H, W) bool; masked (False) pixels have no lines.
+    """
+    lines = up_of_panorama(image, valid)
+    up = lines.up if lines else _UP
+    return -up if _log_odds(_in_picture(image, up)) > 0 else up
 
 
 def differences_below(poses: Poses, pictures: Mapping[str, Picture], up: FloatArray) -> FloatArray:
@@ -62,6 +76,12 @@ def differences_below(poses: Poses, pictures: Mapping[str, Picture], up: FloatAr
     floor, ceiling = (floor_below(poses.points_in_world, poses.centers, towards) for towards in (up, -up))
     pictured = np.mean(seen, axis=0) if seen else np.zeros(2)
     return np.array([*pictured, np.log1p(floor.points) - np.log1p(ceiling.points)])
+
+
+def _log_odds(differences: FloatArray) -> float:
+    """Return the log-odds that a place is upside down, from the first two or all three of `differences_below`."""
+    count = len(differences)
+    return float(np.tanh(differences / _SCALES[:count]) @ _WEIGHTS[:count]) + PRIOR_LOG_ODDS
 
 
 def _in_picture(image: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:

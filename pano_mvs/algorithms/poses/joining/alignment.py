@@ -10,17 +10,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
-from pano_mvs.algorithms.poses.joining.proposals import (
-    PairHypothesis,
-    camera_proposals,
-    least_costly,
-    pair_proposals,
-    pivoted,
-)
+from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis, least_costly, pair_proposals
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 
-_FINALISTS, _PIVOTED = 10, 6
+_FINALISTS = 10
 _MAX_EVALUATIONS = 12
 _MIN_REFINED = 8
 
@@ -53,31 +47,25 @@ class Alignment:
 def align_models(
     matches: CrossMatches,
     *,
-    rng: np.random.Generator,
     threshold_rad: float,
     has_scale: bool,
-    hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]] | None = None,
+    hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]],
 ) -> Alignment | None:
     """Return the similarity of two models on which most of their matches agree; None if there is none.
 
-    Every camera of one model is resected against the known points of the other one, in both directions. Each pose
-    suggests a similarity, whose scale is the one with which most matches agree. The best are refined on all matches
-    together: those with a known point by the angles between rays and point, the others by their epipolar error.
+    Each relative pose of an image of either model suggests a similarity. Its lengths are those of its matches, or those
+    with which most matches agree. The best are refined on all matches together: those with a known point by the angles
+    between rays and point, the others by their epipolar error.
 
     Args:
         matches: between the images of the two models.
-        rng: draws the samples.
         threshold_rad: maximum error of an inlier.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
-        hypotheses: relative poses of pairs of images, as further proposals.
+        hypotheses: relative poses of pairs of images.
     """
-    proposals = camera_proposals(matches, rng=rng, threshold_rad=threshold_rad, has_scale=has_scale)
-    proposals += pair_proposals(matches, hypotheses or {}, threshold_rad=threshold_rad)
+    proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad)
     if not proposals:
         return None
-    proposals = least_costly(proposals, matches, threshold_rad=threshold_rad, count=_PIVOTED)
-    for start in tuple(proposals):
-        proposals += pivoted(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
     finalists = [
         _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
         for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)

@@ -44,10 +44,6 @@ class CrossMatches:
             self.cameras[chosen], self.keypoints[chosen], self.centers[chosen], self.rays[chosen], self.ranges[chosen]
         )
 
-    def swapped(self) -> CrossMatches:
-        """Return the matches with the second model first."""
-        return CrossMatches(*(np.ascontiguousarray(part[:, ::-1]) for part in _arrays(self)))
-
     @property
     def points(self) -> FloatArray:
         """The points in the world of either model, (M, 2, 3), NaN where unknown."""

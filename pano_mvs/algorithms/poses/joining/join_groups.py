@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors, stacked
-from pano_mvs.algorithms.poses.joining.floor import Floors
 from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
@@ -31,7 +30,7 @@ _NEIGHBOURS = 5  # number of models with which each one is aligned
 Part = tuple[PlacedModel, tuple[int, ...]]
 
 
-def join_models(models: Sequence[PlacedModel], floors: Floors | None = None) -> list[Part]:
+def join_models(models: Sequence[PlacedModel]) -> list[Part]:
     """Return the models after joining those that can be aligned, with the positions of their parts.
 
     An image is added to a growing model only if enough of its points are known there. A door may show too few of them
@@ -41,20 +40,15 @@ def join_models(models: Sequence[PlacedModel], floors: Floors | None = None) -> 
     joined if the matches determine the alignment, if these are far more than chance, and if no other alignment is
     nearly as good. The most certain alignment is the first.
 
-    Where matches leave the lengths open, as with a single pair through a door, the floor determines them in camera
-    heights (see `Floors`), if the rotation and the direction of the pair are verified. A model whose cameras would have
-    another height above their floor than those of the other model is not joined to it.
-
     Args:
         models: of the same pairs, without common images; the world of the largest part is kept.
-        floors: of the capture; None leaves the lengths to the matches.
     """
     left: dict[int, Part] = {number: (model, (number,)) for number, model in enumerate(models)}
     tried: dict[tuple[int, int], Alignment | None] = {}
     while True:
         for pair in _promising({number: model for number, (model, _) in left.items()}):
             if pair not in tried:
-                tried[pair] = _certain_alignment(left[pair[0]][0], left[pair[1]][0], floors)
+                tried[pair] = _certain_alignment(left[pair[0]][0], left[pair[1]][0])
         usable = {pair: one for pair, one in tried.items() if one is not None and left.keys() >= {*pair}}
         if not usable:
             return list(left.values())
@@ -88,22 +82,9 @@ def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[in
     return (a, b) if (len(models[a].cameras), -a) >= (len(models[b].cameras), -b) else (b, a)
 
 
-def _certain_alignment(first: PlacedModel, second: PlacedModel, floors: Floors | None) -> Alignment | None:
-    """Return the alignment of two models by their matches or their floors; None if these do not determine it."""
-    views = _views_between(first, second)
-    best = _by_matches(first, second, views)
-    has_use = len(second.cameras) > 1 if best is not None else any(views.values())
-    if floors is None or not has_use:
-        return best
-    heights = [floors.camera_height(model) if len(model.cameras) > 1 else np.nan for model in (first, second)]
-    if best is not None:
-        # Cameras on tripods, or in a hand, have about the same height everywhere.
-        return None if abs(np.log(best.first_from_second.scale * heights[1] / heights[0])) > _LENGTH else best
-    return _by_floor((first, second), views, heights, floors=floors)
-
-
-def _by_matches(first: PlacedModel, second: PlacedModel, views: Mapping[Edge, TwoView]) -> Alignment | None:
+def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
     """Return the alignment of two models by the matches between them; None if these do not determine it."""
+    views = _views_between(first, second)
     matches = cross_matches(
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
@@ -124,49 +105,6 @@ def _by_matches(first: PlacedModel, second: PlacedModel, views: Mapping[Edge, Tw
     if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
         return best
     return None if _is_rival(best, other, matches) else best
-
-
-def _by_floor(
-    models: tuple[PlacedModel, PlacedModel],
-    views: Mapping[Edge, TwoView],
-    heights: Sequence[float],
-    *,
-    floors: Floors,
-) -> Alignment | None:
-    """Return the alignment of two models by their most significant pair, with lengths that the floor determines.
-
-    Args:
-        models: both models.
-        views: pairs of an image of either model, the most significant ones first.
-        heights: of the cameras of each model above the floor, in its unit; NaN where it is not known.
-        floors: of the capture.
-    """
-    for pair, view in views.items():
-        pose, _ = oriented(view, *pair)
-        length = floors.length(*pair, Rigid3(pose.rotation, pose.translation)) if view else float("nan")
-        if not np.isfinite(length):
-            continue
-        lengths = []
-        for (known, alarms), height, model in zip(_lengths(models, pair, view), heights, models, strict=True):
-            by_matches = known if alarms < _MAX_LOG10_OF_LENGTH else np.nan
-            by_floor = length * (height if len(model.cameras) > 1 else 1.0)
-            lengths.append(float(by_floor if np.isfinite(by_floor) else by_matches))
-        if np.isfinite(lengths).all():
-            similarity = _with_pair(models, pair, _hypotheses(models, pair, view)[0], lengths=(lengths[0], lengths[1]))
-            found = Alignment(similarity, np.zeros(0, np.bool_), 0, view.log10_false_alarms, 0.0, 0.0, 0.0, 0.0)
-            agreeing, disagreeing, _ = _evidence_of_pairs(found, *models, views=views)
-            return found if sum(agreeing) > sum(disagreeing) else None
-    return None
-
-
-def _with_pair(
-    models: tuple[PlacedModel, PlacedModel], pair: Edge, hypothesis: PairHypothesis, *, lengths: tuple[float, float]
-) -> Similarity3:
-    """Return the similarity that puts an image of each model into a relative pose, with its lengths in both units."""
-    centers = [model.cameras[image].center for model, image in zip(models, pair, strict=True)]
-    rotation, direction = hypothesis.second_from_first.rotation.T, hypothesis.second_from_first.center
-    scale = lengths[0] / lengths[1] if len(models[1].cameras) > 1 else 1.0
-    return Similarity3(scale, rotation, centers[0] + lengths[0] * direction - scale * rotation @ centers[1])
 
 
 def _is_significant(
@@ -275,9 +213,7 @@ def _aligned(
 ) -> Alignment | None:
     if not matches.known.any():
         return None
-    return align_models(
-        matches, rng=np.random.default_rng(0), threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses
-    )
+    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses)
 
 
 def _is_rival(best: Alignment, other: Alignment, matches: CrossMatches) -> bool:

@@ -1,4 +1,4 @@
-"""Similarities of two models that are worth refining: from single cameras, and from pairs."""
+"""Similarities of two models that are worth refining, from relative poses of pairs."""
 
 from __future__ import annotations
 
@@ -7,48 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
-from pano_mvs.algorithms.poses.joining.three_points import candidate_poses
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3
 
-_SCALES = np.geomspace(0.02, 50.0, 80)
 _LENGTHS = np.geomspace(0.1, 30.0, 80)
-_MIN_PIVOTED = 4
-_PIVOT_RAD = np.deg2rad([-24, -18, -14, -11, -8, -6, -4, -2, 2, 4, 6, 8, 11, 14, 18, 24])
-_PIVOT_AXES = np.array(
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
-)
-_FACTORS = np.geomspace(0.5, 2.0, 15)
-
-
-def camera_proposals(
-    matches: CrossMatches, *, rng: np.random.Generator, threshold_rad: float, has_scale: bool
-) -> list[FloatArray]:
-    """Return similarities from the resection of each camera of one model against the points of the other one.
-
-    Args:
-        matches: between the images of the two models.
-        rng: draws the samples.
-        threshold_rad: angle between a ray and its point from which a match costs 1.
-        has_scale: whether the second model has a scale of its own.
-
-    Returns:
-        Rotation, translation and scale of first_from_second in one vector each, (13,).
-    """
-    found: list[FloatArray] = []
-    for side, both in ((0, matches), (1, matches.swapped())):
-        known = np.isfinite(both.ranges[:, 0])
-        for camera in np.unique(both.cameras[known, 1]):
-            mine = both[np.flatnonzero(known & (both.cameras[:, 1] == camera))]
-            center = mine.centers[0, 1]
-            # Rays are in the world of the second model, so that the pose is second_from_first without its scale.
-            poses = candidate_poses(mine.points[:, 0], mine.rays[:, 1], rng=rng, threshold_rad=threshold_rad)
-            for pose in poses:
-                found.append(
-                    _scaled(pose, center, matches, reverse=side == 1, has_scale=has_scale, threshold_rad=threshold_rad)
-                )
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +30,11 @@ class PairHypothesis:
 def pair_proposals(
     matches: CrossMatches, hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]], *, threshold_rad: float
 ) -> list[FloatArray]:
-    """Return similarities from relative poses of two images, one of each model."""
+    """Return similarities from relative poses of two images, one of each model.
+
+    Returns:
+        Rotation, translation and scale of first_from_second in one vector each, (13,).
+    """
     found: list[FloatArray] = []
     for cameras, some in hypotheses.items():
         pair = np.flatnonzero((matches.cameras == cameras).all(axis=1))
@@ -83,42 +50,6 @@ def least_costly(
     """Return the similarities with the lowest costs, best first."""
     costs = [alignment_cost(one, matches, threshold_rad=threshold_rad) for one in similarities]
     return [similarities[idx] for idx in np.argsort(costs, kind="stable")[:count]]
-
-
-def pivoted(
-    similarity: FloatArray, matches: CrossMatches, *, threshold_rad: float, has_scale: bool
-) -> list[FloatArray]:
-    """Return the best similarities that turn the second model about the points that both see.
-
-    Through a door, both models see few points in one direction; a turn about these, together with the shift that it
-    causes, hardly changes what is seen there. Other matches then decide.
-    """
-    rotation, shift, scale = parts_of(similarity)
-    points = np.where(
-        np.isfinite(matches.points[:, 0]), matches.points[:, 0], scale * matches.points[:, 1] @ rotation.T + shift
-    )
-    near = (errors_and_residuals(similarity, matches)[0] < 2 * threshold_rad) & matches.known
-    if near.sum() < _MIN_PIVOTED:
-        return []
-    pivot = np.median(points[near], axis=0)
-    found = []
-    for axis in _PIVOT_AXES:
-        for angle in _PIVOT_RAD:
-            turn = rotation_from_rotvec(angle * axis)
-            turned = turn @ rotation
-            moved = turn @ (shift - pivot) + pivot
-            found.append(np.concatenate([turned.ravel(), moved, [scale]]))
-    best = least_costly(found, matches, threshold_rad=2 * threshold_rad, count=2)
-    return best if not has_scale else [_rescaled(one, pivot, matches, threshold_rad=threshold_rad) for one in best]
-
-
-def _rescaled(similarity: FloatArray, pivot: FloatArray, matches: CrossMatches, *, threshold_rad: float) -> FloatArray:
-    """Return a similarity with the best scale about a point."""
-    found = []
-    for factor in _FACTORS:
-        shift = factor * (similarity[9:12] - pivot) + pivot
-        found.append(np.concatenate([similarity[:9], shift, [factor * similarity[12]]]))
-    return least_costly(found, matches, threshold_rad=2 * threshold_rad, count=1)[0]
 
 
 def _with_lengths(
@@ -144,29 +75,3 @@ def _with_lengths(
     scale = lengths[0] / lengths[1]
     place = centers[0] + lengths[0] * direction
     return np.concatenate([rotation.ravel(), place - scale * rotation @ centers[1], [scale]])
-
-
-def _scaled(
-    pose: Rigid3, center: FloatArray, matches: CrossMatches, *, reverse: bool, has_scale: bool, threshold_rad: float
-) -> FloatArray:
-    """Return the similarity of a resected camera, with the scale on which most matches agree.
-
-    Args:
-        pose: rotation into the world of the camera's own model, and the camera's centre in the world of the other one.
-        center: the camera's centre in its own model.
-        matches: of the two models in their order.
-        reverse: whether the camera is one of the first model.
-        has_scale: whether there is a scale to find.
-        threshold_rad: error from which a match costs 1.
-    """
-    candidates = []
-    for scale in _SCALES if has_scale else (1.0,):
-        # other_from_own: X ↦ s Rᵀ (X − c) + C, with R = own_from_other.
-        turn, place = pose.rotation.T, pose.center
-        if not reverse:
-            rotation, size, shift = turn, scale, place - scale * turn @ center
-        else:
-            rotation, size = turn.T, scale
-            shift = center - scale * rotation @ place
-        candidates.append(np.concatenate([rotation.ravel(), shift, [size]]))
-    return least_costly(candidates, matches, threshold_rad=2 * threshold_rad, count=1)[0]

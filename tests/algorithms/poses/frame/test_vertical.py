@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below, sharpest_up
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
+from pano_mvs.algorithms.poses.frame.upside_down import up_of_picture
 from pano_mvs.algorithms.poses.frame.vertical import (
     find_vertical,
     robust_mean_direction,
@@ -254,6 +255,12 @@ def test_a_capture_that_is_upside_down_is_turned_around() -> None:
     assert np.median(level.points_in_world[:, 1]) > 0  # the floor is below the cameras
     kept = find_vertical(poses, pictures=pictures, evidence="cameras")
     assert angle_deg(kept.up_in_world, -UP) < 1
+
+
+def test_a_single_panorama_that_is_upside_down_is_found() -> None:
+    picture, valid = place(ceiling=220, floor=120, textured=True)
+    np.testing.assert_array_equal(up_of_picture(picture, valid), UP)
+    np.testing.assert_array_equal(up_of_picture(np.ascontiguousarray(picture[::-1, ::-1]), valid), -UP)
 
 
 def test_sensors_are_believed_against_the_pictures() -> None:

@@ -32,24 +32,28 @@ def room_poses(*, turned: bool = False) -> dict[str, Rigid3]:
     return poses
 
 
-def room_features(poses: dict[str, Rigid3], *, door: int, own: int = 220, door_seed: int = 7) -> dict[str, Features]:
+def room_features(
+    poses: dict[str, Rigid3], *, door: int, own: int = 220, false: int = 0, door_seed: int = 7
+) -> dict[str, Features]:
     """Return the key points of all cameras: those of the own room, and some of the other one seen through the door.
 
     Args:
         poses: cam_from_world by name.
         door: number of points of either room that the cameras of the other room see too.
         own: number of points of each room.
+        false: number of key points that match in all images, although they show something else in each.
         door_seed: of the points behind the door and of the descriptors.
     """
     rng = np.random.default_rng(door_seed)
     points = np.concatenate([_room_points(rng, -2.0, own), _room_points(rng, 2.0, own)])
     through = np.concatenate([_door_points(rng, -3.0, door), _door_points(rng, 3.0, door)])
-    descriptors = rng.integers(0, 120, (len(points) + len(through), 64)).astype(np.float32)
+    descriptors = rng.integers(0, 120, (len(points) + len(through) + false, 64)).astype(np.float32)
     features = {}
     for name, pose in poses.items():
         mine = np.arange(own) + (0 if name[0] == "a" else own)
-        seen = np.concatenate([mine, 2 * own + np.arange(len(through))])
-        rays = pose.apply(np.concatenate([points, through])[seen])
+        seen = np.concatenate([mine, 2 * own + np.arange(len(through) + false)])
+        elsewhere = rng.normal(size=(false, 3)) * (1.0, 0.3, 1.0)
+        rays = pose.apply(np.concatenate([points, through, elsewhere + pose.center])[seen])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rays += rng.normal(0, NOISE_RAD, rays.shape)
         features[name] = Features(
