@@ -301,7 +301,7 @@ def solve_bilateral(
     diagonal = smoothness * (system.m - _BLUR_CENTER * system.n**2) + data
     # S C Sᵀ 1, the weight of a vertex from its pixels.
     pulled = kernels.sum_at_vertices(system.gram.sum(axis=2), system.vertices, count)
-    arguments = (smoothness, system.n, system.m, *system.graph, _BLUR_CENTER, system.vertices, system.gram)
+    arguments = (float(smoothness), system.n, system.m, *system.graph, _BLUR_CENTER, system.vertices, system.gram)
     # Vertices without pixels are not part of the system: they start at 0 and stay there.
     held = system.mass > 0
     start = np.divide(system.right, pulled, out=np.zeros(count), where=held)

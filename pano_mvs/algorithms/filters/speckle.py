@@ -34,7 +34,8 @@ def remove_speckles(
     from pano_mvs.algorithms.filters.kernels_fill import label_surfaces  # compiles on import
 
     height, width = range_map.range.shape
-    labels = label_surfaces(np.ascontiguousarray(range_map.range), max_relative_step)
+    # Copied, since the kernel is compiled once more for arrays that are read-only.
+    labels = label_surfaces(np.array(range_map.range, order="C"), max_relative_step)
     seen = labels >= 0
     equator_px = pixel_solid_angle((height, width)) * height * width / (2 * np.pi**2)
     sizes = np.bincount(labels[seen], weights=np.repeat(equator_px, width)[seen], minlength=height * width)

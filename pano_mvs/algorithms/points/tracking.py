@@ -254,11 +254,12 @@ def _sightings(
     """Return which of the tested points a view sees."""
     from pano_mvs.algorithms.ranges.kernels_agreement import see_points  # compiles on import
 
-    points, homes = chosen.points[asked], centers[chosen.home_idx[asked]]
+    points, homes = np.ascontiguousarray(chosen.points[asked]), centers[chosen.home_idx[asked]]
     seen, errors, bearings = np.zeros(len(asked), np.bool_), np.zeros(len(asked)), np.zeros((len(asked), 3))
     max_angle = MAX_REPROJECTION_PX * 2 * np.pi / range_map.range.shape[1]
-    view = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-    ranges, confidence = np.ascontiguousarray(range_map.range), np.ascontiguousarray(range_map.confidence)
+    # Copied, since the kernel is compiled once more for each combination of arrays that are read-only.
+    view = np.array(pose.rotation, order="C"), np.array(pose.translation)
+    ranges, confidence = np.array(range_map.range, order="C"), np.array(range_map.confidence, order="C")
     see_points(points, homes, max_angle, view, ranges, confidence, limits, seen, errors, bearings)
     views = np.full(int(seen.sum()), view_idx, np.intp)
     return _Sightings(asked[seen], views, bearings[seen], errors[seen])

@@ -54,7 +54,7 @@ def test_compiled_verdicts_equal_the_plain_ones(size: tuple[int, int]) -> None:
     for ranges in (source.range, smooth.range):
         limits = (0.2, 3 * 2 * np.pi / size[1], 0.3)
         view = pose.rotation, pose.translation
-        counts = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.uint16)
+        counts = np.zeros(size, np.uint16), np.zeros(size, np.uint16), np.zeros(size, np.uint16)
         sums = np.zeros(size), np.zeros(size), np.zeros(size)
         for rows in ((0, 5), (5, size[0])):
             compare_rows(rows, reference.range, sines_of_grid(size), view, ranges, limits, counts, sums)
