@@ -106,6 +106,7 @@ class CameraMap:
         dots: an SVG path of the cameras if there are too many to name.
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
+        judged: the probability that the pose of each of `cameras` is right, None where unknown; empty if all are.
         marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
         path: an SVG path along the cameras of a walk in their order; empty if they were not taken along one.
         ends: (x, y) of the first and the last camera of a walk whose cameras have no labels.
@@ -120,6 +121,7 @@ class CameraMap:
     bar: tuple[float, float, float, str]
     north: bool = False
     doubtful: tuple[tuple[float, float, str, str], ...] = ()
+    judged: tuple[float | None, ...] = ()
     marks: tuple[tuple[float, float, int], ...] = ()
     path: str = ""
     ends: tuple[tuple[float, float], ...] = ()
@@ -178,6 +180,7 @@ def camera_maps(
             links=links,
             walk=walk,
             doubts=doubts,
+            judged=tuple(map(poses.p_right.get, names)) if poses.p_right else (),
             unit=unit,
             tallest=tallest,
             north=north and title == "From above",
@@ -287,6 +290,7 @@ def _drawn(
     links: list[_Joined],
     walk: WalkPath | None,
     doubts: Mapping[int, str],
+    judged: tuple[float | None, ...],
     unit: str,
     tallest: int,
     north: bool,
@@ -326,7 +330,21 @@ def _drawn(
     shown = tuple(cameras if named else ())
     path = "" if walk is None else "".join(_stretch([at[idx] for idx in stretch]) for stretch in walk.stretches)
     ends = () if walk is None or len(labels) <= _MAX_LABELS else (at[0], at[-1])
-    return CameraMap(title, text, (_WIDTH, height), lines, shown, dots, bar, north, doubtful, marked, path, ends)
+    return CameraMap(
+        title,
+        text,
+        (_WIDTH, height),
+        lines,
+        shown,
+        dots,
+        bar,
+        north,
+        doubtful,
+        judged if named else (),
+        marked,
+        path,
+        ends,
+    )
 
 
 def _stretch(places: Sequence[tuple[float, float]]) -> str:

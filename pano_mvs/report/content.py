@@ -211,6 +211,7 @@ class Row:
         registered: whether it has a pose; None if no stage computed poses.
         reason: why it was left out, or "".
         doubtful: why its pose is doubtful, or "".
+        p_right: the probability that its pose is right, or None.
         shares: of the sphere around it, if measured.
         completeness: share of pixels with a range, as its stage reported it, or None.
         consistent: share of pixels on which other views agree, likewise.
@@ -225,6 +226,7 @@ class Row:
     registered: bool | None
     reason: str
     doubtful: str
+    p_right: float | None
     shares: Shares | None
     completeness: float | None
     consistent: float | None
@@ -236,9 +238,12 @@ class Row:
 
     @property
     def doubt(self) -> float:
-        """Sort key, largest first: panoramas left out, doubtful ones, then those with the smallest shares."""
+        """Sort key, largest first: panoramas left out, doubtful ones, then those with the smallest shares.
+
+        Doubtful ones are sorted by the probability of their poses.
+        """
         if self.reason or self.doubtful:
-            return 4.0 if self.reason else 3.0
+            return 5.0 if self.reason else round(4.0 - (self.p_right or 0.0), 4)
         known = (self.completeness or 0.0) + (self.consistent or 0.0)
         return round(2.0 - known, 4)
 
@@ -269,6 +274,7 @@ def panorama_rows(
                 name in registered if poses else None,
                 rejected.get(name, ""),
                 doubts.get(name, ""),
+                poses.p_right.get(name),
                 shares.get(name),
                 view.completeness,
                 view.consistent,

@@ -247,6 +247,7 @@ class PosesSummary(OptionalEntry):
             centers=tuple(centers[name] for name in names if name in centers),
             links=tuple(link for link in self.links if link.first in names and link.second in names),
             doubts={name: self.doubts[name] for name in names if name in self.doubts},
+            p_right={name: self.p_right[name] for name in names if name in self.p_right},
             **{name: getattr(group, name) for name in ("frame", "scale", "metric", "up")},
             points=group.points or 0,
         )

@@ -14,6 +14,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.file_names import path_inside
 from pano_mvs.geometry import Rigid3
+from pano_mvs.results.ramp import ramp_rgb
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart, PointCloud
 from pano_mvs.scene.image_file import decode_image
@@ -22,9 +23,8 @@ MAP_PIXELS = 512
 """Length of the longer side of a map."""
 
 _MARGIN = 0.04
-# Red, yellow and green at one, three and a half, and six views, as in the page's view of the coverage.
+# Red, yellow and green, as in the page's view of the coverage.
 _RAMP_VIEWS = (1.0, 3.5, 6.0)
-_RAMP_RGB = np.array([(199, 38, 74), (250, 204, 77), (26, 153, 115)], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +102,8 @@ def top_view(
 
 def coverage_colors(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the colours of view counts, (..., 4) RGBA: red for one, yellow for three or four, green from six."""
-    channels = [np.interp(views, _RAMP_VIEWS, _RAMP_RGB[:, idx]) for idx in range(3)]
-    return np.stack([*channels, np.where(views > 0, 255, 0)], axis=-1).astype(np.uint8)
+    seen = np.where(views > 0, np.uint8(255), np.uint8(0))
+    return np.concatenate([ramp_rgb(views, _RAMP_VIEWS), seen[..., None]], axis=-1)
 
 
 def closed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
+from pano_mvs.results.figures import share as share_text
+from pano_mvs.results.ramp import probability_color
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import PointCloud, Poses
@@ -221,9 +223,12 @@ def _put_cameras(
         view = run.views.get(name)
         image = _image(run, name, images, max_width=options.max_width)
         pose = poses.cam_from_world(idx) @ frame.inverse()
-        described.append(
-            {"name": name, **put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)}
+        probability = run.summary.poses.p_right.get(name)
+        judged = (
+            {} if probability is None else {"right": share_text(probability), "color": probability_color(probability)}
         )
+        camera = put_camera(page, idx, view=view, image=image, cam_from_page=pose, options=options)
+        described.append({"name": name, **judged, **camera})
         if view is not None and view.range_map is not None:
             sights[name] = Sight(pose, reduced(view.range_map))
         if progress is not None:

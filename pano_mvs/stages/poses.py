@@ -266,6 +266,8 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
         ctx.metric("confirmed_share_median", np.nanmedian(poses.confirmed_shares))
     if poses.right_probabilities is not None and np.isfinite(poses.right_probabilities).any():
         ctx.metric("p_right_lowest", np.nanmin(poses.right_probabilities))
+        rightly = float(np.nansum(poses.right_probabilities))
+        ctx.metric("registered_rightly", rightly / max(1, registered + len(poses.rejected)))
     ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])

@@ -72,6 +72,15 @@ def test_doubtful_cameras_are_drawn_over_the_others_where_they_stand() -> None:
     assert not camera_maps(POSES)[0].doubtful
 
 
+def test_cameras_have_the_probability_of_their_poses_also_in_a_group_of_several() -> None:
+    known = POSES | {"p_right": {"a/1.png": 0.99, "a/3.png": 0.2}}
+    assert [drawn.judged for drawn in camera_maps(known)] == [(0.99, None, 0.2)] * 2
+    groups = [{"images": ["a/1.png", "a/2.png"]}, {"images": ["a/3.png"]}]
+    parts = PosesSummary.model_validate(known | {"groups": groups}).by_group()
+    assert [drawn.judged for part in parts for drawn in camera_map.camera_maps(part)[:1]] == [(0.99, None), (0.2,)]
+    assert camera_maps(POSES)[0].judged == ()
+
+
 def test_of_very_many_links_the_strongest_are_drawn() -> None:
     names = [str(number) for number in range(200)]
     links = [[a, b, idx] for idx, (a, b) in enumerate((a, b) for a in names for b in names if a < b)]

@@ -190,6 +190,17 @@ def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir: Path) -> None
     assert "triangles" not in cleared.words
 
 
+def test_the_probability_of_a_pose_is_in_the_tables_and_the_colour_of_its_camera(out_dir: Path) -> None:
+    poses = SUMMARY["poses"] | {"p_right": {"a/1.png": 0.5, "a/2.png": 0.995, "a/3.png": None}}
+    page = reported(out_dir, SUMMARY | {"poses": poses})
+    assert_sound(page)
+    assert "a/1.png 50 % 12 % 62 % hardly confirmed" in page.words
+    assert page.source.count('style="fill:#c7264a"') == page.source.count('style="fill:#1a9973"') == 2
+    assert page.source.count('data-label="pose right"') == page.source.count("<tr data-doubt")
+    assert "colours are the probability that a pose is right" in page.words
+    assert "Pose right" not in reported(out_dir, SUMMARY).words
+
+
 def test_of_very_many_views_doubtful_ones_are_always_shown_in_full() -> None:
     views = [ViewSummary(name=str(idx), metrics={"completeness": 1.0, "consistent": 0.01 * idx}) for idx in range(100)]
     assert 90 not in chosen_views(views)

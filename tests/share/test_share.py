@@ -57,6 +57,17 @@ def test_the_folder_has_the_cloud_the_cameras_and_the_panoramas(tmp_path: Path) 
     assert tile.shape == (512, 1024, 3)
 
 
+def test_cameras_on_the_map_have_the_probability_of_their_poses_where_it_is_known(tmp_path: Path) -> None:
+    path = box_run(tmp_path).out / "run.json"
+    summary = json.loads(path.read_text())
+    summary["poses"]["p_right"] = {NAMES[0]: 0.5, NAMES[1]: 0.999, NAMES[2]: None}
+    path.write_text(json.dumps(summary))
+    share_run(path.parent, tmp_path / "page")
+    cameras = value_of(tmp_path / "page" / "data" / "scene.js")["cameras"]
+    judged = [(camera.get("right"), camera.get("color")) for camera in cameras]
+    assert judged == [("50 %", "#c7264a"), ("99.9 %", "#1a9973"), (None, None)]
+
+
 def test_a_level_world_is_upright_though_the_cameras_were_tilted() -> None:
     tilted = [Rigid3(rotation_from_rotvec([0.3, 0.0, deg]), np.zeros(3)) for deg in (0.1, 0.2)]
     assert page_from_world(tilted, is_level=True).rotation @ [0, -1, 0] == pytest.approx([0, 1, 0], abs=1e-12)

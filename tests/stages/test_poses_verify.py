@@ -70,6 +70,9 @@ def test_without_matches_or_permission_it_only_reports(
 ) -> None:
     poses = verified(tiny, ctx, matched=matched, correct=correct)
     assert set(poses.doubts) == {WRONG}
+    assert poses.right_probabilities is not None
+    assert ctx.metrics["p_right_lowest"] == poses.right_probabilities.min()
+    assert ctx.metrics["registered_rightly"] == pytest.approx(poses.right_probabilities.mean())
     assert ctx.notes == []
     assert poses.translations.tobytes() == poses_of(tiny, wrong=True).translations.tobytes()
 

@@ -15,7 +15,9 @@ class PlanMap {
       const button = document.createElement("button");
       button.type = "button";
       button.tabIndex = -1;
-      button.ariaLabel = button.title = panorama.camera.title;
+      const { title, right, color } = panorama.camera; // the probability that the pose is right, if it is known
+      button.ariaLabel = button.title = right ? `${title} · pose right with a probability of ${right}` : title;
+      if (color) button.style.setProperty("--judged", color);
       button.disabled = !panorama.camera.levels;
       button.addEventListener("click", () => visit(panorama));
       element("places").append(button);

@@ -47,13 +47,11 @@ def test_true_cameras_choose_the_true_geometry_of_every_pair(model: PlacedModel)
         sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items())
     )
     assert 0.5 < model.explained_share() < 1
-    assert model.explained_share_of(4) == 1
 
 
 def test_a_camera_that_stands_elsewhere_agrees_with_less(model: PlacedModel, capture: AliasedCapture) -> None:
     before = model.explained_share()
     model.add(4, shifted_pose(capture.poses["4.jpg"], 3))
-    assert model.explained_share_of(4) < 0.2
     assert model.explained_share() < before
     model.add(4, capture.poses["4.jpg"])
     assert model.explained_share() == pytest.approx(before)

@@ -29,6 +29,9 @@ SIGNS = {
 
 OF_IMAGES, OF_PAIRS = {"ratio", "share", "joint_contradicting"}, {*SIGNS} - {"ratio", "share", "joint_contradicting"}
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
+ENOUGH = {"ratio": 0.35}
+"""Values beyond which more of a measurement says nothing more, where families that were left out are predicted better
+with such a limit than without it."""
 PENALTY = 3.0
 
 
@@ -99,11 +102,14 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
     """Return the model with the largest likelihood less a penalty on the squared losses.
 
     Knots are quantiles of each measurement. All losses are at least 0, so that each measurement only ever counts the
-    way of its sign, and a missing one is never better than the best. Each camera counts three times: with all that was
-    measured, with the measurements of images alone and with those of pairs alone, since users may lack either.
+    way of its sign, and a missing one is never better than the best. Each camera counts four times: with all that was
+    measured, with the measurements of images alone, with those of pairs alone, and without any, since users may lack
+    either or both.
     """
-    cameras = _joined([cameras, _only(cameras, OF_IMAGES), _only(cameras, OF_PAIRS)])
-    knots = {name: _knots(cameras.columns[name], sign) for name, sign in signs.items()}
+    cameras = _joined([cameras, *(_only(cameras, names) for names in (OF_IMAGES, OF_PAIRS, set[str]()))])
+    knots = {
+        name: _knots(np.minimum(cameras.columns[name], ENOUGH.get(name, np.inf)), sign) for name, sign in signs.items()
+    }
     behind = np.hstack([steps_behind(cameras.columns[name], knots[name]) for name in signs])
     target = cameras.right.astype(np.float64)
 

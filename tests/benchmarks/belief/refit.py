@@ -4,7 +4,8 @@ Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
 
 FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds; FIT may also be `evidence.csv`, the
 table of the captures that docs/benchmarks.md is about. The script prints, for all families and for each, how many right
-cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model.
+cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model,
+and how many captures without a doubt hold a wrong camera.
 Cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. With
 `--coefficients pano_mvs/algorithms/poses/verification/belief/coefficients.py`, the model replaces the one in use;
 `--picture FILE` draws the reliability diagram.
@@ -78,11 +79,30 @@ def show(title: str, cameras: Cameras, probability: FloatArray) -> None:
         print(f"{model.line(f'{family} | model')} {quality} |")
 
 
-def draw(path: Path, probability: FloatArray, right: NDArray[np.bool_]) -> None:
-    """Write a reliability diagram: how many cameras are right, by their probability."""
+def show_captures(cameras: Cameras, probability: FloatArray) -> None:
+    """Print how many captures that were solved with their images have no doubt, and in how many of them all is right.
+
+    Half of the captures were solved without images, or have a camera that was displaced on purpose; these are left out.
+    """
+    as_used = np.array([capture.split()[-1] == "asked" for capture in cameras.capture], np.bool_)
+    print("\n| family | no doubt: all right | with a wrong camera | doubts: all right | with a wrong camera |")
+    print("|---" * 5 + "|")
+    counts = {family: np.zeros(4, int) for family in ("all", *np.unique(cameras.family))}
+    for capture in np.unique(cameras.capture[as_used]):
+        mine = cameras.capture == capture
+        outcome = 2 * int(doubted(probability[mine]).any()) + int(not cameras.right[mine].all())
+        for family in ("all", str(cameras.family[mine][0])):
+            counts[family][outcome] += 1
+    for family, found in counts.items():
+        print(f"| {family} | {' | '.join(map(str, found))} |")
+
+
+def draw(path: Path, probability: FloatArray, cameras: Cameras) -> None:
+    """Write a reliability diagram: how many cameras are right, by their probability and by family."""
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(figsize=(5, 5))
+    figure, (axes, families) = pyplot.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
+    right = cameras.right
     number = np.minimum((probability * BINS).astype(int), BINS - 1)
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for each in np.unique(number):
@@ -92,6 +112,15 @@ def draw(path: Path, probability: FloatArray, right: NDArray[np.bool_]) -> None:
         axes.errorbar(probability[inside].mean(), share, yerr=error, fmt="o", color="C0")
         axes.annotate(str(count), (probability[inside].mean(), share), textcoords="offset points", xytext=(6, -10))
     axes.set(xlabel="probability that a camera is right", ylabel="share of cameras that are right")
+    names = sorted(np.unique(cameras.family), key=lambda name: right[cameras.family == name].mean())
+    for row, name in enumerate(names):
+        mine = cameras.family == name
+        share = right[mine].mean()
+        error = np.sqrt(share * (1 - share) / mine.sum())
+        families.errorbar(share, row, xerr=error, fmt="o", color="C0", label="are right" if not row else None)
+        families.plot(probability[mine].mean(), row, "|", color="C1", ms=14, mew=3, label="" if row else "expected")
+    families.set(yticks=range(len(names)), yticklabels=names, xlabel="share of cameras")
+    families.legend(loc="upper left")
     figure.savefig(path, bbox_inches="tight", dpi=150)
     pyplot.close(figure)
 
@@ -124,6 +153,7 @@ def main() -> None:
     cameras = decidable(cameras)
     probability = left_out(cameras, penalty=options.penalty)
     show("Families left out of the fit", cameras, probability)
+    show_captures(cameras, probability)
     model = fit(cameras, penalty=options.penalty)
     print(f"\n{len(model.terms)} of {len(SIGNS)} measurements count")
     for name, term in model.terms.items():
@@ -136,7 +166,7 @@ def main() -> None:
     if options.coefficients:
         options.coefficients.write_text(source_of(model), encoding="utf-8")
     if options.picture:
-        draw(options.picture, probability, cameras.right)
+        draw(options.picture, probability, cameras)
 
 
 if __name__ == "__main__":

@@ -323,17 +323,6 @@ class PlacedModel:
         """Return the total weight of the geometries that agree with the cameras."""
         return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
 
-    def explained_share_of(self, image: int) -> float:
-        """Return the share of a registered image's pairs, by weight, that its camera explains; 1 if it has no pair."""
-        total = kept = 0.0
-        for partner in self.pairs.partners[image]:
-            if partner in self.cameras:
-                edge = _edge(image, partner)
-                total += self.pairs.geometries[edge][0].weight
-                if edge in self.chosen:
-                    kept += self.pairs.geometries[edge][self.chosen[edge]].weight
-        return kept / total if total else 1.0
-
     def _learn_ranges(self, edge: Edge) -> None:
         """Use the ranges of a pair's matches where their parallax is larger than that of the known ranges."""
         first, second = edge

@@ -12,7 +12,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, enough
 from pano_mvs.algorithms.poses.verification.aliases import Alias, find_aliases, labellings, moved_cameras
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
-from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST, is_doubtful, reason
+from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST, is_doubtful, is_left_out, reason
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
 from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
@@ -20,7 +20,6 @@ from pano_mvs.geometry import Rigid3, geodesic_angle
 
 # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
 _SUSPICIOUS = 0.75
-_HOPELESS, _MIN_EXPLAINED = 0.3, 0.5  # it is left out below these shares of what is expected and of its pairs
 # Where the images confirm more than this share of the texture, matches that contradict a part come from what repeats.
 _MOSTLY_CONFIRMED = 0.5
 # Another pose is used if it is better by this factor and by this difference.
@@ -108,11 +107,11 @@ def correct_cameras(
                 moved = True
         if not moved:
             break
-    _judge(model, confirmation, found)
-    _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
-    if _leave_out(model, found, fixed=fixed):
+    while True:
+        _judge(model, confirmation, found)
         _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
-    return found
+        if not _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
+            return found
 
 
 def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
@@ -366,16 +365,18 @@ def _doubt_contradicted_parts(model: PlacedModel, found: CameraChecks) -> None:
             found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), why)))
 
 
-def _leave_out(model: PlacedModel, found: CameraChecks, *, fixed: Collection[int]) -> bool:
-    """Remove cameras that neither their images nor their pairs support, and those that only these hold."""
-    for image, share in found.shares.items():
-        ratio = share / found.expected[image] if found.expected[image] > _MIN_EXPECTED else np.nan
-        hopeless = ratio < _HOPELESS and model.explained_share_of(image) < _MIN_EXPLAINED
-        if hopeless and image in found.doubts and image not in fixed and len(model.cameras) - len(found.removed) > 2:
-            found.removed[image] = found.doubts[image]
-    for image in model.held_by(found.removed):
-        found.removed[image] = "its pairs are all with images that were left out"
-    for image in found.removed:
+def _leave_out_worst(model: PlacedModel, found: CameraChecks, *, fixed: Collection[int], miss_cost: float) -> bool:
+    """Remove the camera that is wrong most surely, if that is sure enough, and those that only it holds.
+
+    The others may have been doubted because of it, so they are to be judged again.
+    """
+    worst = min(found.p_right.keys() - fixed, key=lambda image: (found.p_right[image], image), default=None)
+    if worst is None or len(model.cameras) <= 2 or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
+        return False
+    held = model.held_by([worst])
+    found.removed |= {worst: found.doubts[worst]} | dict.fromkeys(
+        held, "its pairs are all with images that were left out"
+    )
+    for image in (worst, *held):
         model.remove(image)
-        del found.shares[image], found.expected[image]
-    return bool(found.removed)
+    return True

@@ -41,8 +41,8 @@ def verify_poses(
 
     Every camera is swept with its neighbours at 256 columns. A camera that confirms much less than its neighbours is
     tried at the other poses that its pairs suggest; if the images confirm one of them clearly better, it is moved
-    there. A camera that neither images nor pairs support is left out. All measurements together give the probability
-    that each camera is right (`docs/method.md`); one that is more probably wrong than its cost allows is doubted.
+    there. All measurements together give the probability that each camera is right (`docs/method.md`); one that is more
+    probably wrong than its cost allows is doubted, or left out if it is as surely wrong as others are right.
 
     Args:
         poses: of any origin. Cameras that are not moved keep their poses exactly.
@@ -50,7 +50,8 @@ def verify_poses(
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
         correct: False only reports.
-        miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost).
+        miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost), and left out
+            if it is doubted and below 1 / (1 + miss_cost).
 
     Returns:
         The poses with `confirmed_shares`, `expected_shares`, `right_probabilities` and `doubts`. Points are

@@ -75,6 +75,11 @@ def is_doubtful(probability: float, *, miss_cost: float = MISS_COST) -> bool:
     return probability < miss_cost / (1 + miss_cost)
 
 
+def is_left_out(probability: float, *, miss_cost: float = MISS_COST) -> bool:
+    """Return whether a doubtful camera is left out: as surely wrong as one without a doubt is right."""
+    return is_doubtful(probability, miss_cost=miss_cost) and not is_doubtful(1 - probability, miss_cost=miss_cost)
+
+
 def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> str:
     """Return why a camera is doubted: its probability, the two measurements that lower it most, and what to do.
 

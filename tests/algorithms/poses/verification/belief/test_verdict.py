@@ -7,7 +7,7 @@ import pytest
 
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.model import Model, Term
-from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful, reason
+from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful, is_left_out, reason
 
 BEST = {
     "ratio": 1.2,
@@ -23,6 +23,8 @@ BEST = {
 def test_the_costs_decide() -> None:
     assert [is_doubtful(one) for one in (0.1, 0.83, 0.84, 1.0)] == [True, True, False, False]
     assert not is_doubtful(0.6, miss_cost=1.0)
+    assert [is_left_out(one) for one in (0.1, 0.16, 0.17, 0.9)] == [True, True, False, False]
+    assert not is_left_out(0.4, miss_cost=0.5), "what is not doubted is not left out"
 
 
 def test_a_camera_that_everything_supports_is_right() -> None:
