@@ -77,7 +77,7 @@ def _hash(a: int, b: int, c: int, seed: int) -> float:  # to [0, 1)
 
 
 @_compiled
-def _grain(u: float, v: float, face: int, seed: int) -> float:  # smooth noise of unit wavelength in [0, 1)
+def _grain(u: float, v: float, face: int, seed: int) -> Any:  # smooth noise of unit wavelength in [0, 1)
     cell_u, cell_v = math.floor(u), math.floor(v)
     share_u, share_v = u - cell_u, v - cell_v
     share_u, share_v = share_u * share_u * (3 - 2 * share_u), share_v * share_v * (3 - 2 * share_v)
