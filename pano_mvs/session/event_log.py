@@ -32,7 +32,7 @@ def line_from_event(event: Event) -> str:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a value that is no JSON as a JSON value: records as objects, all else as text."""
+    """Return what JSON does not know as a JSON value: records as objects, all else as text."""
     is_record = dataclasses.is_dataclass(value) and not isinstance(value, type)
     return dataclasses.asdict(value) if is_record else str(value)
 
