@@ -146,7 +146,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment, *, exports_of: RunSum
     points = files.write_cloud()
     files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    exported, left_out = repeat_exports(files, exports_of)
+    exported, left_out = repeat_exports(files, exports_of, has_cloud=points > 0)
     notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged), *left_out)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     rejected = _rejected(blocks, poses)

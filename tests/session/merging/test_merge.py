@@ -418,3 +418,17 @@ def test_exports_of_an_earlier_merge_do_not_stay(tmp_path: Path) -> None:
         RunSummary.read(out).model_copy(update={"stages": ()}).write(out)
     merge_outputs([tmp_path / f"block_{number}" for number in range(3)], tmp_path / "merged")
     assert not (tmp_path / "merged/tiles_3d/tileset.json").exists()
+
+
+def test_stages_of_a_block_cannot_lead_outside(tmp_path: Path) -> None:
+    plan = StageOutcome(name="../../outside", use="export.floor_plan", params={"formats": ["svg"]})
+    merged = merge_outputs(with_exports(tmp_path, plan), tmp_path / "merged")
+    assert "floor_plan/floor_plan.json" in merged.summary.files
+    assert not list(tmp_path.rglob("outside*"))
+
+
+def test_no_export_is_repeated_without_points(tmp_path: Path) -> None:
+    outs = with_exports(tmp_path, StageOutcome(name="tiles", use="export.tiles_3d"))
+    for out in outs:
+        (out / "cloud.ply").unlink()
+    assert merge_outputs(outs, tmp_path / "merged").summary.files == {}
