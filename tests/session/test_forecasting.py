@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session import planning as forecasting
@@ -84,7 +84,12 @@ def test_what_the_forecast_has_found_is_not_read_again(toy: Toy, monkeypatch: py
     run_toy(toy)
     found: list[str] = []
     find = Store.find
-    monkeypatch.setattr(Store, "find", lambda store, key: found.append(key) or find(store, key))
+
+    def noted(store: Store, key: str) -> UnitRecord | None:
+        found.append(key)
+        return find(store, key)
+
+    monkeypatch.setattr(Store, "find", noted)
     assert run_toy(toy).summary.units.run == 0
     assert len(found) == len(set(found))
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -78,4 +79,5 @@ def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
         with GrowingArrays(Path(name) / "cloud") as grown:
             for part in open_ply_points(out / "cloud.ply").cloud_chunks():
                 grown.append({array: getattr(part, array) for array in _ARRAYS})
-        yield PointCloud(**grown.arrays()), Path(name)
+        arrays: dict[str, Any] = grown.arrays()
+        yield PointCloud(**arrays), Path(name)

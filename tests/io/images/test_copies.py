@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -94,7 +95,7 @@ def test_a_plan_does_not_read_pictures_for_copies(tmp_path: Path, picture: NDArr
     folder.mkdir()
     for number, center in enumerate(((0.6, 0.0, 0.2), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
         cv2.imwrite(str(folder / f"{number}.png"), room_seen_from(*center))
-    settings = {"cache": tmp_path / "cache", "out": tmp_path / "out", "until": ["images"]}
+    settings: dict[str, Any] = {"cache": tmp_path / "cache", "out": tmp_path / "out", "until": ["images"]}
     assert list(pano_mvs.plan("fast", images=folder, **settings)["images"].run) == ["0.png", "1.png", "2.png"]
     pano_mvs.run("fast", images=folder, **settings)
     assert list(pano_mvs.plan("fast", images=folder, **settings)["images"].cached) == ["0.png", "1.png"]
