@@ -247,7 +247,7 @@ def _register(summary: RunSummary, found: _Collected) -> None:
     for name in with_partner[:_MAX_UNREGISTERED]:
         link = best[name]
         partner = link.second if link.first == name else link.first
-        reason = f"{name} has no pose; this pair has {_matches(link.inliers, link.candidates)}"
+        reason = f"the image {name} has no pose; this pair has {_matches(link.inliers, link.candidates)}"
         found.between((name, partner), _Severity.UNREGISTERED, reason)
     rest = [name for name in left_out if name not in with_partner[:_MAX_UNREGISTERED]]
     if rest:
@@ -339,7 +339,7 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
 def _doubtful(group: CameraGroup, found: _Collected) -> None:
     for idx, name in enumerate(group.names):
         if name in group.poses.doubts:
-            reason = f"{name} is doubtful: {group.poses.doubts[name]}"
+            reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
             _stand_between(group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason)
 
 
@@ -370,7 +370,7 @@ def _loose(group: CameraGroup, found: _Collected) -> None:
         link = only[name]
         partner = link.second if link.first == name else link.first
         others = [int(at) for at in group.nearest(idx) if group.names[at] != partner]
-        reason = f"{name} shares a verified geometry with one panorama only, {partner} ({_matches(link.inliers, None)})"
+        reason = f"one panorama alone, {partner}, shares a verified geometry with {name} ({_matches(link.inliers, None)})"
         _stand_between(group, found, (idx, others[0]), severity=_Severity.LOOSE, reason=reason)
 
 

@@ -93,7 +93,7 @@ def test_reasons_for_one_place_are_one_suggestion() -> None:
     views = [{"name": name, "consistent": 0.1 if name == "d" else 0.5} for name in "abcdefg"]
     found = advice(in_a_row(0, 1, 2, 5, 9, 10, 11, doubts={"d": "hardly confirmed"}), 6.0, views=views)
     assert found[0].action == "Take 2 panoramas between c and d."
-    assert [reason.split()[0] for reason in found[0].reasons] == ["they", "d", "other"]
+    assert [reason.split()[0] for reason in found[0].reasons] == ["they", "the", "other"]
     assert [one.action for one in found[1:]] == ["Take 3 panoramas between d and e."]
 
 
@@ -102,7 +102,7 @@ def test_a_camera_with_one_partner_needs_another() -> None:
     poses["links"] = [["a", "b", 80], ["b", "c", 70], ["a", "c", 60], ["c", "d", 31], ["b", "d", 0, 12]]
     (found,) = advice(poses, 5.0)
     assert found.action == "Take a panorama between b and d."
-    assert found.reasons == ("d shares a verified geometry with one panorama only, c (31 verified matches)",)
+    assert found.reasons == ("one panorama alone, c, shares a verified geometry with d (31 verified matches)",)
 
 
 def test_groups_without_a_connection_name_the_pair_to_connect() -> None:
@@ -133,7 +133,7 @@ def test_panoramas_without_a_pose_are_to_be_connected_with_those_that_match_best
     }
     first, second = advice(poses, 5.0, **summary)
     assert first.action == "Take a panorama between c and m."
-    assert first.reasons == ("m has no pose; this pair has 4 verified matches of 30 candidates",)
+    assert first.reasons == ("the image m has no pose; this pair has 4 verified matches of 30 candidates",)
     assert second.action == "Take panoramas 0.5–1 m apart on the way to n."
     assert second.reasons == ("1 more panorama of 7 has no pose",)
 
