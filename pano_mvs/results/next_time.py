@@ -370,7 +370,9 @@ def _loose(group: CameraGroup, found: _Collected) -> None:
         link = only[name]
         partner = link.second if link.first == name else link.first
         others = [int(at) for at in group.nearest(idx) if group.names[at] != partner]
-        reason = f"one panorama alone, {partner}, shares a verified geometry with {name} ({_matches(link.inliers, None)})"
+        reason = (
+            f"one panorama alone, {partner}, shares a verified geometry with {name} ({_matches(link.inliers, None)})"
+        )
         _stand_between(group, found, (idx, others[0]), severity=_Severity.LOOSE, reason=reason)
 
 

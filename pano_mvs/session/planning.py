@@ -135,7 +135,7 @@ def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> Run
     """
     store = Store(session.store_root, for_reading=True)
     workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
-    listing = SourceListing()
+    listing = SourceListing(with_digests=not store.is_empty)
     only_planned = is_only_planned.set(True)
     try:
         with without_collector():

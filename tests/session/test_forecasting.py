@@ -6,11 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.cache.unit_times import CaptureSize
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session import planning as forecasting
-from pano_mvs.session.planning import expected_report_s, forecast_run, reference_times, remember_report
+from pano_mvs.session.planning import (
+    expected_report_s,
+    forecast_run,
+    plan_session,
+    reference_times,
+    remember_report,
+)
 from pano_mvs.session.progress import Event, Forecast, RunStarted
 from pano_mvs.session.session import open_session
 from tests.engine.conftest import Toy
@@ -92,6 +99,18 @@ def test_what_the_forecast_has_found_is_not_read_again(toy: Toy, monkeypatch: py
     monkeypatch.setattr(Store, "find", noted)
     assert run_toy(toy).summary.units.run == 0
     assert len(found) == len(set(found))
+
+
+def test_a_plan_with_an_empty_cache_reads_no_file_as_a_whole(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    (toy.folder / "capture/5.txt").unlink()
+    (toy.folder / "capture/5.txt").symlink_to(toy.folder)  # a folder in the place of a file
+    with monkeypatch.context() as patched:
+        patched.setattr(StatCache, "digest", lambda _, path: pytest.fail(f"{path} is read"))
+        stages = plan_session(toy.session())
+    assert list(stages["images"].run) == ["1.txt", "2.txt", "3.txt", "4.txt"]
+    assert "cannot be read" in stages["images"].blocked["5.txt"]
+    toy.run()
+    assert list(plan_session(toy.session())["images"].cached) == ["1.txt", "2.txt", "3.txt", "4.txt"]
 
 
 def test_the_report_is_remembered_only_if_something_was_computed(toy: Toy) -> None:

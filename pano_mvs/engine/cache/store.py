@@ -36,7 +36,7 @@ from pano_mvs.core.files import (
     temporary_prefix,
     write_text,
 )
-from pano_mvs.core.paths import exists, is_folder, is_link, reason_of
+from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packs import RECORD, Packed
@@ -299,6 +299,11 @@ class Store:
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.unit_times = UnitTimes(root / FILE_NAME)
         self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no unit has a record."""
+        return not children(self.root / "records") and not children(self.blobs.packs.folder)
 
     def find(self, key: str) -> UnitRecord | None:
         """Return the record of a key if it is intact and all its blobs exist, otherwise None."""

@@ -11,6 +11,7 @@ from typing import Any
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, InputError, UsageError
 from pano_mvs.core.file_names import item_problem
+from pano_mvs.core.paths import reason_of
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
@@ -36,8 +37,11 @@ class SourceListing:
 
     Attributes:
         lost: file to the reason why this run cannot use it any more.
+        with_digests: False to read no file as a whole: for a plan with an empty cache, where all units are computed,
+            whatever their keys.
     """
 
+    with_digests: bool = True
     lost: dict[Path, str] = field(default_factory=dict)
     _items: dict[str, tuple[SourceItem, ...]] = field(default_factory=dict)
     _files: dict[Path, _ListedFile] = field(default_factory=dict)
@@ -88,6 +92,8 @@ class SourceListing:
     def _listed(self, path: Path, store: Store) -> _ListedFile:
         state = store.stat_cache.state(path)  # before the digest, so that later changes are noticed
         try:
+            if not self.with_digests:
+                return _ListedFile(_path_digest(path), state)
             return _ListedFile(store.blobs.register_external(path), state)
         except InputError as error:
             self.lost[path] = str(error)
@@ -110,6 +116,21 @@ class SourceListing:
             self.lost[path] = reason or changed_text(path)
             raise ChangedFileError(self.lost[path], path)
         return known
+
+
+def _path_digest(path: Path) -> str:
+    """Return a digest of the path of a file.
+
+    Raises:
+        InputError: if the file cannot be read.
+    """
+    try:
+        with path.open("rb"):
+            return digest_from_value(str(path))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
+        ) from error
 
 
 KEY_SCHEMA = 3
