@@ -137,10 +137,23 @@ def make_folder(folder: Path) -> None:
     """
     if folder.is_dir():
         return
-    make_folder(folder.parent)
-    folder.mkdir(exist_ok=True)
-    if shared := _shared_mode(folder.parent):
-        folder.chmod(stat.S_IMODE(folder.stat().st_mode) | shared | stat.S_ISGID)
+    if folder.parent != folder:  # else a drive that does not exist
+        make_folder(folder.parent)
+    shared = _shared_mode(folder.parent)
+    if not shared:
+        folder.mkdir(exist_ok=True)
+        return
+    # It gets its name with its permissions, so that other members never meet it without.
+    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=temporary_prefix()))
+    try:
+        temporary.chmod(0o777 & ~_UMASK | shared | stat.S_ISGID)
+        temporary.rename(folder)
+    except OSError:
+        if not folder.is_dir():  # or else another process was faster
+            raise
+    finally:
+        with suppress(OSError):
+            temporary.rmdir()
 
 
 def _shared_mode(folder: Path) -> int:

@@ -13,7 +13,7 @@ import pytest
 
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import clear_abandoned, replacing, temporary_prefix, write_text
+from pano_mvs.core.files import clear_abandoned, make_folder, replacing, temporary_prefix, write_text
 from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 
@@ -142,3 +142,21 @@ def test_what_lies_in_a_folder_of_a_group_is_the_groups_whatever_the_umask(
     assert not [path for path, mode in found.items() if path.is_dir() and mode != 0o2770]
     assert not [path for path, mode in found.items() if path.is_file() and mode != 0o660]
     assert (toy.folder / "out").stat().st_mode & 0o070 == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="groups and their permissions are those of POSIX")
+def test_a_folder_that_another_member_makes_first_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tmp_path.chmod(0o2770)
+
+    def rename(_: Path, target: Path) -> Path:
+        target.mkdir()
+        raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", rename)
+        make_folder(tmp_path / "records")
+    assert [path.name for path in tmp_path.iterdir()] == ["records"]
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="directory"):
+        make_folder(tmp_path / "file")
+    assert not list(tmp_path.glob(".tmp-*"))

@@ -6,7 +6,6 @@ A copy shows the world from the same place, so that it adds nothing, but it coun
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -31,7 +30,7 @@ _MIN_CORRELATION = 0.85
 # Of 512 magnitudes: such copies agree by .98 and more, other panoramas by .89 and less (rooms, a city, a flat).
 _SAMPLES, _MIN_AGREEMENT = 512, 0.9
 _ROWS_AT_ONCE = 1024
-_KEPT_SPECTRA = 64
+_KEPT_SPECTRA = 1024  # of 132 kB
 _REDUCED = {8: cv2.IMREAD_REDUCED_GRAYSCALE_8, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 2: cv2.IMREAD_REDUCED_GRAYSCALE_2}
 
 
@@ -59,9 +58,8 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
         max_pixels: limit of a picture.
         read: whether to read the pictures that no earlier command has read, which takes long; else they are not copies.
     """
-    with ThreadPoolExecutor() as pool:
-        found = pool.map(lambda path: _magnitudes(path, max_pixels, read=read), paths.values())
-        known = {name: magnitudes for name, magnitudes in zip(paths, found, strict=True) if magnitudes.any()}
+    found = {name: _magnitudes(path, max_pixels, read=read) for name, path in paths.items()}
+    known = {name: magnitudes for name, magnitudes in found.items() if magnitudes.any()}
     if len(known) < 2:
         return {}
     names, magnitudes = list(known), np.array(list(known.values()))
@@ -74,17 +72,16 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
 
     for first in range(0, len(names), _ROWS_AT_ONCE):
         likely = magnitudes[first : first + _ROWS_AT_ONCE] @ magnitudes.T >= _MIN_AGREEMENT
-        for later, earlier in np.argwhere(np.tril(likely, first - 1)).tolist():
-            name, original = names[first + later], names[earlier]
-            if name in copies or original in copies:
-                continue
-            own, other = spectrum(name), spectrum(original)
-            if own is None or other is None:
-                continue
-            correlation = np.fft.irfft((np.conj(own) * other).sum(axis=0), _SIZE_HW[1])
-            best = int(correlation.argmax())
-            if correlation[best] >= _MIN_CORRELATION:
-                copies[name] = Copy(original, 360 * best / _SIZE_HW[1])
+        for later, row in enumerate(likely, start=first):
+            for earlier in np.flatnonzero(row[:later]).tolist():
+                own, other = (None if names[earlier] in copies else spectrum(names[at]) for at in (later, earlier))
+                if own is None or other is None:
+                    continue
+                correlation = np.fft.irfft((np.conj(own) * other).sum(axis=0), _SIZE_HW[1])
+                best = int(correlation.argmax())
+                if correlation[best] >= _MIN_CORRELATION:
+                    copies[names[later]] = Copy(names[earlier], 360 * best / _SIZE_HW[1])
+                    break
     return copies
 
 
@@ -105,7 +102,7 @@ def _magnitudes(path: Path, max_pixels: int, *, read: bool) -> NDArray[np.float3
     if (picture := _decoded(path, max_pixels)) is not None:
         sampled = np.abs(_spectrum(picture))[_sampled_places()]
         found = np.asarray(sampled / max(float(np.linalg.norm(sampled)), 1e-12), np.float32)
-    _keep(kept, found.astype("<f2").tobytes())
+        _keep(kept, found.astype("<f2").tobytes())
     return found
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks import MergedBlocks, nearest_cameras
+from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.core.files import copy_file, replacing, write_text
@@ -79,13 +80,18 @@ class Block:
         return self.run.has_file("cloud.ply") or self.run.values.cloud is not None
 
     def cloud_parts(self) -> Iterator[PointCloud]:
-        """Yield parts of the cloud of the largest group: cloud.ply, or else the cloud in the cache; nothing without."""
-        if self.run.has_file("cloud.ply"):
-            yield from open_ply_points(self.run.out / "cloud.ply").cloud_chunks()
-        elif self.run.values.cloud is not None:
+        """Yield parts of the cloud of the largest group: cloud.ply, or else the cloud in the cache; nothing without.
+
+        The one in the cache is also used if the file does not state how many views agree on each point.
+        """
+        in_file = open_ply_points(self.run.out / "cloud.ply") if self.run.has_file("cloud.ply") else None
+        is_whole = in_file is not None and "views" in (in_file.vertices.dtype.names or ())
+        if not is_whole and self.run.values.cloud is not None:
             cloud = self.run.values.cloud.groups()[0]
             for part in chunks(len(cloud)):
                 yield _selected(cloud, part)
+        elif in_file is not None:
+            yield from in_file.cloud_chunks()
 
     def _model_sizes(self) -> dict[str, tuple[int, int]]:
         files = model_files(self.run.out / "colmap" / "sparse" / "0")
@@ -245,9 +251,10 @@ class MergeFiles:
         """Delete files of an earlier merge into the folder that this one has not written: they are in another world."""
         stems = item_stems(earlier.poses.registered)
         maps = (name for view in earlier.views if view.name in stems for name in map_files(stems[view.name]))
-        old = {"cloud.ply", *maps, *earlier.files, *(view.preview for view in earlier.views if view.preview)}
-        for name in old - self.written:
-            if path := file_inside(self.out, name):
+        old = {"cloud.ply", *maps, *(view.preview for view in earlier.views if view.preview)}
+        for name in (old | earlier.files.keys()) - self.written:
+            path = file_inside(self.out, name)
+            if path and (name in old or digest_from_file(path) == earlier.files[name]):  # or else somebody's own
                 path.unlink()
 
     def to_write(self, name: str) -> Path:

@@ -23,7 +23,7 @@ from pano_mvs.algorithms.blocks import (
 )
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import PAIR_SEPARATOR
-from pano_mvs.core.files import OUTPUT_MARK
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned
 from pano_mvs.core.paths import children, exists, is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
@@ -101,6 +101,7 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     to.mkdir(parents=True, exist_ok=True)
     (to / OUTPUT_MARK).touch()
     with output_lock(to):
+        clear_abandoned(to)
         files = MergeFiles(to, blocks, similarities, merged)
         summary = _written(files, alignment, exports_of=blocks[reference].run.summary)
         files.remove_stale(earlier)

@@ -15,13 +15,14 @@ from pano_mvs.algorithms.blocks import nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.io.colmap.writer import write_colmap_model
-from pano_mvs.io.ply import read_ply
+from pano_mvs.io.ply import read_ply, write_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit, StageOutcome
 from pano_mvs.results.run_output import load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Poses
+from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.session.merging.files import MergeFiles, load_blocks
 from pano_mvs.session.merging.merge import MergeResult, merge_outputs
 from tests.algorithms.blocks.walked_blocks import bent, some_world, walk
@@ -425,6 +426,49 @@ def test_stages_of_a_block_cannot_lead_outside(tmp_path: Path) -> None:
     merged = merge_outputs(with_exports(tmp_path, plan), tmp_path / "merged")
     assert "floor_plan/floor_plan.json" in merged.summary.files
     assert not list(tmp_path.rglob("outside*"))
+
+
+def test_exports_need_no_numbers_of_views_in_the_files_of_blocks(tmp_path: Path) -> None:
+    """By default, export.ply writes none."""
+    outs = with_exports(
+        tmp_path,
+        StageOutcome(name="plan", use="export.floor_plan"),
+        StageOutcome(name="mesh", use="export.mesh", params={"depth": 5}),
+    )
+    for out in outs:
+        write_ply(out / "cloud.ply", read_ply(out / "cloud.ply"), file_from_world=z_up_from_world())
+    merged = merge_outputs(outs, tmp_path / "merged")
+    assert {"floor_plan/floor_plan.json", "mesh.ply"} <= merged.summary.files.keys()
+
+
+def test_two_exports_of_the_same_files_are_not_mixed(tmp_path: Path) -> None:
+    plans = [StageOutcome(name=f"plan_{n}", use="export.floor_plan", params={"width_px": 100 * n}) for n in (3, 4)]
+    merged = merge_outputs(with_exports(tmp_path, *plans), tmp_path / "merged")
+    assert (
+        json.loads((tmp_path / "merged/floor_plan/floor_plan.json").read_text())["storeys"][0]["plan_size_px"][0] <= 300
+    )
+    assert any("another export has written floor_plan/" in note for note in merged.summary.notes)
+
+
+def test_what_lies_in_the_way_of_an_export_is_no_error_of_the_merge(tmp_path: Path) -> None:
+    outs = with_exports(tmp_path, StageOutcome(name="plan", use="export.floor_plan"))
+    (tmp_path / "merged").mkdir()
+    (tmp_path / "merged/.pano-mvs-output").touch()
+    (tmp_path / "merged/floor_plan").write_text("mine")
+    merged = merge_outputs(outs, tmp_path / "merged")
+    assert any("export.floor_plan was not repeated for the merged capture" in note for note in merged.summary.notes)
+    assert (tmp_path / "merged/floor_plan").read_text() == "mine"
+
+
+def test_an_exported_file_that_somebody_changed_stays(tmp_path: Path) -> None:
+    plan = StageOutcome(name="plan", use="export.floor_plan", params={"formats": ["svg"]})
+    outs = with_exports(tmp_path, plan)
+    merge_outputs(outs, tmp_path / "merged")
+    (tmp_path / "merged/floor_plan/storey_0.svg").write_text("mine")
+    for out in outs:
+        RunSummary.read(out).model_copy(update={"stages": ()}).write(out)
+    merge_outputs(outs, tmp_path / "merged")
+    assert [path.name for path in (tmp_path / "merged/floor_plan").iterdir()] == ["storey_0.svg"]
 
 
 def test_no_export_is_repeated_without_points(tmp_path: Path) -> None:
