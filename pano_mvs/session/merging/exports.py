@@ -53,7 +53,7 @@ def repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) -> 
             ctx = Context(np.random.default_rng(0), scratch / f"export_{number}")
             try:
                 ctx.scratch.mkdir()
-                made = _export(spec, outcome.params, cloud, files.merged.poses, ctx=ctx)
+                made = _export(spec, outcome.params, (cloud, files.merged.poses), ctx=ctx)
                 if clashes := [target for target in made.files if target in written]:
                     raise InputError(f"another export has written {clashes[0]}")
                 for target, path in made.files.items():
@@ -75,8 +75,9 @@ def _is_repeated(spec: StageSpec) -> bool:
     )
 
 
-def _export(spec: StageSpec, params: Mapping[str, object], cloud: PointCloud, poses: Poses, *, ctx: Context) -> Files:
+def _export(spec: StageSpec, params: Mapping[str, object], merged: tuple[PointCloud, Poses], *, ctx: Context) -> Files:
     extras = {"params": spec.params_type.model_validate(params), "ctx": ctx}
+    cloud, poses = merged
     inputs: dict[str, object] = {port.name: cloud if port.kind is PointCloud else poses for port in spec.ports}
     made = spec.function(**inputs, **{name: extras[role] for name, role in spec.extras.items()})
     assert isinstance(made, Files)
