@@ -31,7 +31,7 @@ from pano_mvs.engine.stages.params import (
     params_from,
     settings_from,
 )
-from pano_mvs.engine.stages.stage import All, Each, Names, Near, One, SourceItem, source, stage
+from pano_mvs.engine.stages.stage import All, Each, Names, Near, One, SourceItem, is_only_planned, source, stage
 from pano_mvs.geometry import (
     Rigid3,
     Similarity3,
@@ -117,6 +117,7 @@ __all__ = [
     "chunks",
     "decode_image",
     "group_file",
+    "is_only_planned",
     "join_groups",
     "lla_from_local",
     "origin_of_frame",

@@ -135,7 +135,7 @@ def make_folder(folder: Path) -> None:
     Raises:
         OSError: if it cannot be created.
     """
-    if folder.is_dir():
+    if is_folder(folder):
         return
     if folder.parent != folder:  # else a drive that does not exist
         make_folder(folder.parent)
@@ -149,7 +149,7 @@ def make_folder(folder: Path) -> None:
         temporary.chmod(0o777 & ~_UMASK | shared | stat.S_ISGID)
         temporary.rename(folder)
     except OSError:
-        if not folder.is_dir():  # or else another process was faster
+        if not is_folder(folder):  # or else another process was faster
             raise
     finally:
         with suppress(OSError):

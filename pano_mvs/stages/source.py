@@ -14,9 +14,19 @@ from pydantic import Field
 from pano_mvs.algorithms.faces.arrangement import arranged_faces
 from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
-from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.api import (
+    NOT_IN_KEY,
+    Context,
+    FilePart,
+    InputError,
+    Panorama,
+    Params,
+    SourceItem,
+    SourcePath,
+    is_only_planned,
+    source,
+)
 from pano_mvs.core.paths import is_folder
-from pano_mvs.engine.stages.stage import is_only_planned
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.images.copies import Copy, find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
