@@ -89,7 +89,7 @@ def _export(spec: StageSpec, params: Mapping[str, object], merged: tuple[PointCl
 def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
     """Yield the cloud in cloud.ply, with its arrays in files, and a folder that is deleted afterwards.
 
-    If no block states how many views agree on its points, or how far they are confirmed, all points count as confirmed.
+    Points of blocks that do not state how many views agree on them count as confirmed.
 
     Raises:
         StoreError: if the arrays cannot be written.
@@ -105,9 +105,9 @@ def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
         except OSError as error:
             raise _cannot_write(out, error) from error
         arrays: dict[str, Any] = grown.arrays()
+        unknown = arrays["view_counts"] == 0
         for array in ("view_counts", "confidence"):
-            if array in arrays and not arrays[array].any():
-                arrays[array][:] = 255
+            arrays[array][unknown] = 255
         yield PointCloud(**arrays), Path(name)
 
 

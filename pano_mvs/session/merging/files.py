@@ -80,18 +80,13 @@ class Block:
         return self.run.has_file("cloud.ply") or self.run.values.cloud is not None
 
     def cloud_parts(self) -> Iterator[PointCloud]:
-        """Yield parts of the cloud of the largest group: cloud.ply, or else the cloud in the cache; nothing without.
-
-        The one in the cache is also used if the file does not state how many views agree on each point.
-        """
-        in_file = open_ply_points(self.run.out / "cloud.ply") if self.run.has_file("cloud.ply") else None
-        is_whole = in_file is not None and "views" in (in_file.vertices.dtype.names or ())
-        if not is_whole and self.run.values.cloud is not None:
+        """Yield parts of the cloud of the largest group: cloud.ply, or else the cloud in the cache; nothing without."""
+        if self.run.has_file("cloud.ply"):
+            yield from open_ply_points(self.run.out / "cloud.ply").cloud_chunks()
+        elif self.run.values.cloud is not None:
             cloud = self.run.values.cloud.groups()[0]
             for part in chunks(len(cloud)):
                 yield _selected(cloud, part)
-        elif in_file is not None:
-            yield from in_file.cloud_chunks()
 
     def _model_sizes(self) -> dict[str, tuple[int, int]]:
         files = model_files(self.run.out / "colmap" / "sparse" / "0")
