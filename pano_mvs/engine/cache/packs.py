@@ -100,8 +100,8 @@ class Packs:
         self.folder = root / "packs"
         self._temporary = root / "tmp"
         self._indexes: dict[Path, tuple[tuple[int, ...], NDArray[Any]]] = {}
-        self._sorted: tuple[list[Path], NDArray[Any]] = [], np.zeros(0, _TABLE)
-        self._highs = np.zeros(0, np.uint64)  # of the table; contiguous, or each search would copy it
+        # The packs, the table, and its first halves of digests: contiguous, or each search would copy them.
+        self._sorted: tuple[list[Path], NDArray[Any], NDArray[Any]] = [], np.zeros(0, _TABLE), np.zeros(0, np.uint64)
         self._seen_ns = -1
 
     def find(self, digest: str, *, refresh: bool = False) -> Packed | None:
@@ -112,9 +112,9 @@ class Packs:
             refresh: list the folder again, which other processes may have changed, even if its time stamp is the same.
         """
         self._refresh(force=refresh)
-        packs, table = self._sorted
+        packs, table, highs = self._sorted
         high, low = _halves(digest)
-        for row in range(int(self._highs.searchsorted(np.uint64(high))), len(table)):
+        for row in range(int(highs.searchsorted(np.uint64(high))), len(table)):
             found_high, found_low, offset, size, pack, kind = table[row].item()
             if found_high != high:
                 break
@@ -237,8 +237,8 @@ class Packs:
             found[pack] = state, _NO_ENTRIES if entries is None else entries
         if found.keys() != self._indexes.keys() or any(found[pack] is not self._indexes[pack] for pack in found):
             self._indexes = found
-            self._sorted = sorted(found), _table([found[pack][1] for pack in sorted(found)])
-            self._highs = self._sorted[1]["high"].copy()
+            table = _table([found[pack][1] for pack in sorted(found)])
+            self._sorted = sorted(found), table, table["high"].copy()
         return True
 
 
