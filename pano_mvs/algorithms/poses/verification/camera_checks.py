@@ -368,12 +368,14 @@ def _doubt_contradicted_parts(model: PlacedModel, found: CameraChecks) -> None:
 def _leave_out_worst(model: PlacedModel, found: CameraChecks, *, fixed: Collection[int], miss_cost: float) -> bool:
     """Remove the camera that is wrong most surely, if that is sure enough, and those that only it holds.
 
-    The others may have been doubted because of it, so they are to be judged again.
+    The others may have been doubted because of it, so they are to be judged again. At least two are kept.
     """
     worst = min(found.p_right.keys() - fixed, key=lambda image: (found.p_right[image], image), default=None)
-    if worst is None or len(model.cameras) <= 2 or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
+    if worst is None or not is_left_out(found.p_right[worst], miss_cost=miss_cost):
         return False
     held = model.held_by([worst])
+    if len(model.cameras) - len(held) <= 2:
+        return False
     found.removed |= {worst: found.doubts[worst]} | dict.fromkeys(
         held, "its pairs are all with images that were left out"
     )
