@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # which imports this module
     from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, ReducedCameras
 
 # The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
-# with so many points, and more than twice as many as any other.
+# with this many points, and more than twice as many as any other.
 _REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
 _MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
 # A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of 20
