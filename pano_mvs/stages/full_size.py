@@ -70,28 +70,30 @@ def full_size(
     settings = arguments_from(refine_range, params)
     windows = {name: settings[name] for name in WindowSettings.__dataclass_fields__}
     for width in widths:
-        reference = _painted(ref.at_width(width), ref)
-        size_hw = reference.shape[0], width
-        if params.rounds == 0 or sharp_halvings(reference) > 0:  # half the size shows as much
+        size_hw = ref.at_width(width).size_hw
+        if params.rounds == 0 or sharp_halvings(_painted(ref.at_width(width), ref)) > 0:  # half the size shows as much
             strips = enlarged_strips(range_map, size_hw)
         else:
             there = [source.at_width(width) for source in near]
+            # Decoding takes twice the memory of a picture, so the reference is decoded again after the sources.
+            grey = sources_in_grey(
+                ((source.load_unmasked(), source.load_mask()) for source in there),
+                sizes_hw=[source.size_hw for source in there],
+                source_from_reference=poses,
+                settings=WindowSettings(**windows),
+            )
             strips = refine_in_strips(
                 range_map,
-                reference,
-                sources_in_grey(
-                    ((source.load_unmasked(), source.load_mask()) for source in there),
-                    sizes_hw=[source.size_hw for source in there],
-                    source_from_reference=poses,
-                    settings=WindowSettings(**windows),
-                ),
+                _painted(ref.at_width(width), ref),
+                grey,
                 source_from_reference=poses,
                 rounds=params.rounds,
                 view_weights=settings["view_weights"],
                 **windows,
             )
+            del grey
         range_map = joined_strips(strips) if width < widths[-1] else _in_files(strips, ctx.scratch)
-        del strips, reference  # large
+        del strips  # large
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("width", widths[-1])
     ctx.metric("sources", len(near))

@@ -66,11 +66,13 @@ def sources_in_grey(
     ends = np.cumsum([(height + 2) * (width + 2) for height, width in sizes_hw])
     starts = np.array([0, *ends[:-1]])
     grey = np.empty(int(ends[-1]), np.uint16)
-    for (picture, mask), start, end in zip(pictures, starts, ends, strict=True):
-        height, width = mask.shape
+    each = iter(pictures)
+    for (height, width), start, end in zip(sizes_hw, starts, ends, strict=True):
+        picture, mask = next(each)
         reach = ceil(settings.reach * height / sizes_hw[0][0])
         votes = mask if mask.all() else pixels_with_valid_window(mask, reach)
         pad_grey(picture, votes, grey[start:end].reshape(height + 2, width + 2))
+        del picture, mask, votes  # before the next ones are loaded
     matrices = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in source_from_reference])
     return grey, starts, shapes, matrices, np.zeros(0, np.uint8), starts
 

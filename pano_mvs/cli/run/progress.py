@@ -57,7 +57,7 @@ class ProgressDisplay:
         self._lock = threading.RLock()  # the display is drawn by a thread of its own
         self._file = cast(TextIO, console.file)
         self._open = ExitStack()
-        self._has_begun = False
+        self._beginning = "starting"  # what is done before any unit
         self._kernels, self._kernels_at = 0, -math.inf
 
     def __enter__(self) -> ProgressDisplay:
@@ -90,9 +90,9 @@ class ProgressDisplay:
         """Show an event."""
         with self._lock:
             self._estimator(event)
+        if not isinstance(event, Warned):
+            self._beginning = "listing the images and looking for copies" if isinstance(event, RunStarted) else ""
         match event:
-            case RunStarted():
-                self._has_begun = True
             case Forecast():
                 self._countdown = Countdown()  # begin with the forecast rather than glide to it
             case KernelsCompiled(kernels=kernels):
@@ -156,8 +156,8 @@ class ProgressDisplay:
         return f"compiling kernels (once): {self._kernels} so far" if is_current else ""
 
     def _left_text(self, left: TimeLeft, shown: str, seconds: float) -> str:
-        if not self._has_begun:
-            return "starting"
+        if self._beginning:
+            return self._beginning
         if self._estimator.is_reporting:
             return f"about {shown} left (writing the report)"
         unknown = shortened_list(map(one_line, left.unknown))

@@ -310,11 +310,7 @@ class Store:
         record = self.read_record(key)
         if record is None:
             return None
-        return record if self.has_blobs(record) else None
-
-    def has_blobs(self, record: UnitRecord) -> bool:
-        """Return whether all blobs of a record exist."""
-        return all(self.blobs.exists(ref) for ref in record.blobs())
+        return record if all(self.blobs.exists(ref) for ref in record.blobs()) else None
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key, whether or not its blobs exist; None if it is missing or damaged."""

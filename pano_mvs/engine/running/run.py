@@ -167,9 +167,7 @@ class Run:
             if unit.key not in self.computed:
                 return None
         last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
-        record = self._planned.pop(unit.key, None)
-        if record is None or not self.store.has_blobs(record):
-            record = self.store.find(unit.key)
+        record = self._planned.pop(unit.key, None) or self.store.find(unit.key)
         return record or self.options.accepted(unit, last, self.store)
 
     def note_planned(self, unit: Unit, record: UnitRecord | None) -> None:

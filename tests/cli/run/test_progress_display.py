@@ -64,7 +64,9 @@ def finished(stage: str, units: int = 1) -> StageFinished:
 def test_the_live_lines_show_what_is_computed_and_count_down() -> None:
     shown = Shown(is_terminal=True)
     assert "starting" in shown.live()[-1]
-    shown.events(STARTED, FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
+    shown.events(STARTED)
+    assert "looking for copies" in shown.live()[-1]
+    shown.events(FORECAST, StageStarted("depth", 4), UnitStarted("depth", "a.jpg"))
     depth, whole = shown.live(1.0)
     assert depth.split() == ["depth", "0", "of", "4", "0:01", "a.jpg"]
     assert whole.endswith("1 %  0:01  about 3:02 left")

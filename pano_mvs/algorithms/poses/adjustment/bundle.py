@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, camera_span, held
+from pano_mvs.algorithms.poses.adjustment.floor_lengths import FloorLengths
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.core.errors import UsageError
@@ -34,6 +35,7 @@ class Bundle:
         sigmas: (T,) standard deviation of each ray relative to a typical one, positive; None if all are equal.
         offsets_m: (T, 3) where each ray starts in its camera's frame, in metres; None if all start at the centre.
         units_per_m: units of the world per metre, by which the offsets are multiplied; 0 ignores them.
+        lengths: expected lengths of baselines between cameras that share points; None if nothing is known.
     """
 
     rotations: FloatArray
@@ -45,6 +47,7 @@ class Bundle:
     sigmas: FloatArray | None = None
     offsets_m: FloatArray | None = None
     units_per_m: float = 0.0
+    lengths: FloorLengths | None = None
 
     @property
     def origins(self) -> FloatArray:
@@ -131,6 +134,7 @@ def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np
         rotations=bundle.rotations[order],
         centers=bundle.centers[order],
         image_idx=place[bundle.image_idx].astype(np.int32),
+        lengths=None if bundle.lengths is None else bundle.lengths.in_order(place),
     )
 
 
@@ -147,13 +151,17 @@ def _adjust_ordered(
         errors: FloatArray = ray_errors(of.rotations, of.centers, of.points, *observed)
         return errors if bundle.sigmas is None else errors / bundle.sigmas
 
+    def cost_of(of: Bundle, errors: FloatArray) -> float:
+        lengths = 0.0 if of.lengths is None else of.lengths.cost(of.centers)
+        return robust_cost(errors, loss=loss, scale_rad=scale_rad) + lengths
+
     errors = scaled_errors_rad(bundle)
-    cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
+    cost, damping = cost_of(bundle, errors), 1e-4
     for _ in range(max_iterations):
         weights = bundle.weights(errors, loss=loss, scale_rad=scale_rad)
-        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera)
+        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera, scale_rad=scale_rad)
         moved_errors = scaled_errors_rad(moved)
-        moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
+        moved_cost = cost_of(moved, moved_errors)
         if not moved_cost < cost:
             damping *= 10
             if damping > _MAX_DAMPING:
@@ -250,11 +258,15 @@ def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, da
     )
 
 
-def _step(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
+def _step(
+    bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float, fixed_camera: int, scale_rad: float
+) -> Bundle:
     """Return the bundle after one damped step."""
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import moved_points
 
     system = _reduced_cameras(bundle, layout, weights, damping=damping)
+    if bundle.lengths is not None:
+        bundle.lengths.add_to(system, bundle.centers, scale_rad=scale_rad)
     # The small constant keeps a camera without observations in place.
     system.band[:, 0] += damping * system.diagonal + 1e-12 * system.diagonal.mean()
     band, gradient = held(system.band, system.gradient, fixed_camera)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.elevation_range import ElevationRange, estimate_elevation_range
+from pano_mvs.algorithms.poses.adjustment.floor_lengths import floor_lengths
 from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
@@ -62,6 +63,9 @@ def refine_poses(
     fixed; if lengths are metres, the cameras as a whole stay in place. The uncertainty of each camera, relative to the
     first camera and first baseline, is in `center_stds` and `rotation_stds_rad`; see `camera_deviations`. Groups are
     adjusted one by one, each in its own world frame.
+
+    If the cameras stand upright, the heights at which pairs of them see the floor below them are expected to be equal,
+    within their spread, which determines lengths where few matches do (see `floor_lengths`).
 
     If the images are given, observations are then refined by aligning patches, each with its precision (see
     `align_tracks`), and everything is adjusted once more. This halves the error if key points are few or coarse.
@@ -222,12 +226,13 @@ def _adjusted(
         # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
         wider = 2 ** (rounds - 1 - round_idx) * widen
         bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)))
+        scale_rad = float(np.deg2rad(settings.loss_scale_deg * wider))
         bundle = adjust_bundle(
-            bundle,
+            replace(bundle, lengths=floor_lengths(bundle, scale_rad=scale_rad)),
             loss=settings.loss,
-            scale_rad=float(np.deg2rad(settings.loss_scale_deg * wider)),
+            scale_rad=scale_rad,
             max_iterations=settings.max_iterations,
-            tolerance=_TOLERANCES[round_idx],
+            tolerance=_TOLERANCES[round_idx - rounds] if widen == 1 else _TOLERANCES[0],
         )
     return _without_outliers(bundle, colors, max_error_rad=max_error_rad)
 

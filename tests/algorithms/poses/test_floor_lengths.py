@@ -1,0 +1,123 @@
+"""Lengths from the floor under upright cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.floor_lengths import floor_lengths
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import rotation_from_rotvec
+
+SCALE_RAD = float(np.deg2rad(0.1))
+ROOMS = ((0.0, 4.0), (6.0, 10.0))  # along x; 4 m along z, with the floor at y = 1.5
+DOOR = np.array([5.0, 0.0, 2.0])
+
+
+def captured(centers: list[FloatArray], rng: np.random.Generator, *, noise_deg: float = 0.02) -> Bundle:
+    """Return two rooms; a camera sees the points of its own room, the one in the door (the first) those of both."""
+    points, point_idx, image_idx = [], [], []
+    for low, high in ROOMS:
+        floor = np.column_stack([rng.uniform(low, high, 60), np.full(60, 1.5), rng.uniform(0, 4, 60)])
+        walls = np.column_stack([rng.uniform(low, high, 60), rng.uniform(-1, 1.4, 60), rng.choice([0.0, 4.0], 60)])
+        seen_by = [0, *(k for k, center in enumerate(centers) if low <= center[0] <= high)]
+        for point in (*floor, *walls):
+            image_idx += seen_by
+            point_idx += [len(points)] * len(seen_by)
+            points.append(point)
+    bundle = Bundle(
+        np.tile(np.eye(3), (len(centers), 1, 1)),
+        np.array(centers),
+        np.array(points),
+        np.array(point_idx, np.int32),
+        np.array(image_idx, np.int32),
+        np.zeros((len(point_idx), 3)),
+    )
+    rays = bundle.rays_in_cam()
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    rays += np.deg2rad(noise_deg) * rng.standard_normal(rays.shape)
+    return replace(bundle, bearings=rays / np.linalg.norm(rays, axis=1)[:, None])
+
+
+def standing(heights: FloatArray, rng: np.random.Generator) -> list[FloatArray]:
+    """Return cameras of which the first is in the door; their heights are relative to 1.5 m."""
+    places = [DOOR, *(np.array([rng.uniform(*room), 0.0, rng.uniform(0.5, 3.5)]) for room in ROOMS for _ in range(4))]
+    return [place + np.array([0, 1.5 - 1.5 * height, 0]) for place, height in zip(places, heights, strict=True)]
+
+
+def longer_second_room(bundle: Bundle, factor: float) -> Bundle:
+    """Return a bundle whose second room has another scale about the door, from where nothing contradicts that."""
+    centers, points = bundle.centers.copy(), bundle.points.copy()
+    for what in (centers, points):
+        second = what[:, 0] > DOOR[0]
+        what[second] = DOOR + factor * (what[second] - DOOR)
+    return replace(bundle, centers=centers, points=points)
+
+
+def adjusted(bundle: Bundle, *, lengths: bool = True) -> Bundle:
+    known = floor_lengths(bundle, scale_rad=SCALE_RAD) if lengths else None
+    return adjust_bundle(replace(bundle, lengths=known), loss="cauchy", scale_rad=SCALE_RAD, max_iterations=200)
+
+
+def size(bundle: Bundle, room: int) -> float:
+    low, high = (1, 5) if room == 0 else (5, 9)
+    return float(np.linalg.norm(np.ptp(bundle.centers[low:high], axis=0)))
+
+
+def test_two_rooms_that_share_one_camera_get_one_scale() -> None:
+    """Rays alone keep any ratio of the scales."""
+    rng = np.random.default_rng(0)
+    true = captured(standing(np.ones(9), rng), rng)
+    start = longer_second_room(true, 1.12)
+    ratio = size(true, 1) / size(true, 0)
+    rays_alone = adjusted(start, lengths=False)
+    assert size(rays_alone, 1) / size(rays_alone, 0) == pytest.approx(1.12 * ratio, rel=0.01)
+    found = adjusted(start)
+    assert size(found, 1) / size(found, 0) == pytest.approx(ratio, rel=0.01)
+
+
+def test_heights_of_two_kinds_are_uncertain() -> None:
+    rng = np.random.default_rng(1)
+    true = captured(standing(np.ones(9), rng), rng)
+    alike, different = (floor_lengths(bundle, scale_rad=SCALE_RAD) for bundle in (true, longer_second_room(true, 1.5)))
+    assert alike is not None
+    assert different is not None
+    assert alike.std < 0.05
+    assert different.std > 0.15
+
+
+def test_cameras_at_many_heights_are_left_where_rays_put_them() -> None:
+    rng = np.random.default_rng(2)
+    true = captured(standing(rng.uniform(0.8, 1.2, 9), rng), rng, noise_deg=0.05)
+    with_lengths, without = adjusted(true), adjusted(true, lengths=False)
+
+    def off(bundle: Bundle) -> float:
+        return max(abs(size(bundle, room) / size(bundle, 0) * size(true, 0) / size(true, room) - 1) for room in (0, 1))
+
+    assert np.linalg.norm(without.centers - with_lengths.centers, axis=1).max() < 0.05
+    assert off(with_lengths) < off(without) + 0.01
+
+
+@pytest.mark.parametrize("what", ["tilted", "no floor", "few pairs"])
+def test_nothing_is_expected_without_evidence(what: str) -> None:
+    rng = np.random.default_rng(3)
+    bundle = captured(standing(np.ones(9), rng), rng)
+    if what == "tilted":
+        turns = rotation_from_rotvec(0.2 * rng.standard_normal((9, 3)))
+        bundle = replace(bundle, rotations=turns @ bundle.rotations)
+    elif what == "no floor":
+        bundle = replace(bundle, points=bundle.points * [1.0, -1.0, 1.0])
+    else:
+        kept = bundle.image_idx < 2
+        points, point_idx = np.unique(bundle.point_idx[kept], return_inverse=True)
+        bundle = replace(
+            bundle,
+            points=bundle.points[points],
+            point_idx=point_idx.astype(np.int32),
+            image_idx=bundle.image_idx[kept],
+            bearings=bundle.bearings[kept],
+        )
+    assert floor_lengths(bundle, scale_rad=SCALE_RAD) is None
