@@ -237,7 +237,7 @@ def _is_rival(
 ) -> bool:
     """Return whether another alignment is more than chance, and explains nearly as many matches of its own.
 
-    It is no rival if pairs decide for the best one: they are as significant as a pair must be, and twice as significant
+    It is not a rival if pairs decide for the best one: they are as significant as a pair must be, and twice as much so
     as those that agree with the other one. Matches without a known point are ignored, since many of them agree with any
     alignment.
     """
