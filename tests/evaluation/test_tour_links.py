@@ -31,6 +31,37 @@ def test_links_are_read_from_the_scenes_of_a_tour(tmp_path: Path) -> None:
         read_links(tmp_path / "app-files/tiles")
 
 
+def test_links_are_read_from_other_configurations(tmp_path: Path) -> None:
+    """As people edit data.js by hand, and as Pannellum stores a tour, with angles in degrees."""
+    scene = "{{id: '{}', name: '{}', levels: [{{size: 16, tileSize: 16}}], linkHotspots: [{}]}}"
+    hall, room = scene.format("hall", "Hall", "{yaw: 0.5, target: 'room'},"), scene.format("room", "Room", "")
+    multires = {
+        "path": "./room/%l/%s%y_%x",
+        "extension": "jpg",
+        "tileResolution": 16,
+        "maxLevel": 1,
+        "cubeResolution": 16,
+    }
+    spots = [{"sceneId": "b", "yaw": 90.0}, {"type": "info", "yaw": 1.0}]
+    stated = {
+        "a": {
+            "title": "Hall",
+            "type": "multires",
+            "multiRes": multires | {"path": "./hall/%l/%s%y_%x"},
+            "hotSpots": spots,
+        },
+        "b": {"title": "Room", "type": "multires", "multiRes": multires, "hotSpots": []},
+    }
+    for name, face in product(("hall", "room"), "frblud"):
+        for tile in (f"marzipano/tiles/{name}/0/{face}/0/0.jpg", f"pannellum/{name}/1/{face}0_0.jpg"):
+            (tmp_path / tile).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / tile).touch()
+    (tmp_path / "marzipano/data.js").write_text(f"var APP_DATA = {{scenes: [{hall}, {room},]}};\n")
+    (tmp_path / "pannellum/tour.json").write_text(json.dumps({"default": {"firstScene": "a"}, "scenes": stated}))
+    assert read_links(tmp_path / "marzipano") == (2, {("Hall", "Room"): 0.5})
+    assert read_links(tmp_path / "pannellum") == (2, {("Hall", "Room"): np.pi / 2})
+
+
 def test_a_link_is_off_by_the_angle_to_the_other_camera() -> None:
     """The room lies in front of the hall, and the hall to the right of the room's camera."""
     turned = rotation_from_rotvec(np.array([0.0, np.pi / 2, 0.0]))

@@ -169,6 +169,20 @@ def verify_pose(
     return pair.judged(pair.evidence(known, sample=0, models=1))
 
 
+def max_log10_false_alarms(p: FloatArray, q: FloatArray, *, learned: bool) -> float:
+    """Return log₁₀ of the most false alarms with which the relative pose of a pair is accepted by itself.
+
+    Args:
+        p: (M, 3) unit rays of the matches that agree with the pose, in the first image.
+        q: (M, 3) in the second image.
+        learned: whether both images have learned key points.
+    """
+    if not learned:
+        return MAX_LOG10_FALSE_ALARMS
+    left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
+    return MAX_LOG10_LEARNED * max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)) ** 3
+
+
 @dataclass(frozen=True, eq=False)
 class _Evidence:
     """A relative pose, |t| = 1, its inliers, and how many of them are independent; falsy if it may be chance."""
@@ -226,15 +240,8 @@ class _Pair:
             models_per_sample=models,
         )
         enough = witnesses >= self.min_inliers
-        return _Evidence(pose, count, witnesses, alarms, enough, self._most(inliers))
-
-    def _most(self, inliers: NDArray[np.bool_]) -> float:
-        """Return the logarithm of the most false alarms with which a pose is accepted."""
-        if not self.learned:
-            return MAX_LOG10_FALSE_ALARMS
-        p, q = self.p[inliers], self.q[inliers]
-        left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
-        return MAX_LOG10_LEARNED * max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)) ** 3
+        most = max_log10_false_alarms(self.p[inliers], self.q[inliers], learned=self.learned)
+        return _Evidence(pose, count, witnesses, alarms, enough, most)
 
     def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
         """Return the geometry of a pose with inliers, and the parallax of each inlier in radians."""

@@ -77,9 +77,9 @@ def stated_scenes(file: Path) -> list[StatedScene]:
         if suffix == ".json":
             return list(_pannellum(json.loads(text))) if '"scenes"' in text else []
         if start := re.search(r"\bAPP_DATA\s*=\s*(?=\{)", text):
-            return list(_marzipano(_javascript_object(text[start.end() :])))
+            return list(_marzipano(javascript_object(text[start.end() :])))
         calls = re.finditer(r"\bpannellum\.viewer\s*\([^{}]{1,200}?(?=\{)", text)
-        return [scene for call in calls for scene in _pannellum(_javascript_object(text[call.end() :]))]
+        return [scene for call in calls for scene in _pannellum(javascript_object(text[call.end() :]))]
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 
@@ -91,7 +91,7 @@ _TOKEN = re.compile(
 )
 
 
-def _javascript_object(text: str) -> Any:
+def javascript_object(text: str) -> Any:
     """Return the value of an object literal at the start of a text; variables in it are None.
 
     Raises:

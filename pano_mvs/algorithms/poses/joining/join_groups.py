@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
+from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, max_log10_false_alarms
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
@@ -23,7 +25,7 @@ _MAX_LOG10_FALSE_ALARMS = -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
 _MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
-_OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # matches that the best alignment explains and a rival does not
+_OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # evidence for the best alignment, such as matches, that a rival does not explain
 _PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
 _NEIGHBOURS = 5  # number of models with which each one is aligned
 
@@ -91,9 +93,11 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | N
     hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
     has_scale = len(second.cameras) > 1
     best = _aligned(matches, hypotheses, has_scale=has_scale)
+    if best is None:
+        return None
+    evidence = _evidence_of_pairs(best, first, second, views=views)
     if (
-        best is None
-        or not _is_significant(best, first, second, views=views)
+        not _is_significant(best, evidence, learned=any(one.learned for one in first.pairs.features.values()))
         or best.rotation_std_deg > _MAX_TURN_STD_DEG
         or best.offset_std_deg > _MAX_OFFSET_STD_DEG
         or best.scale_std > _MAX_SCALE_STD
@@ -104,52 +108,64 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | N
     other = _aligned(rest, hypotheses, has_scale=has_scale)
     if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
         return best
-    return None if _is_rival(best, other, matches) else best
+    others = _evidence_of_pairs(other, first, second, views=views)
+    return None if _is_rival(best, other, matches, evidence=(evidence, others)) else best
 
 
-def _is_significant(
-    alignment: Alignment,
-    first: PlacedModel,
-    second: PlacedModel,
-    *,
-    views: Mapping[Edge, TwoView],
-) -> bool:
-    """Return whether an alignment is more than chance, by the matches with known points or by verified pairs.
+def _is_significant(alignment: Alignment, evidence: _PairEvidence, *, learned: bool) -> bool:
+    """Return whether an alignment is more than chance, by the matches with known points or by pairs.
 
-    The rotation and the direction of a verified pair are more than chance by themselves. What the pair leaves open, the
-    lengths, is determined by another verified pair that agrees, or by the ranges of the matches that are known. The
-    pairs that agree must outweigh those that do not. Learned matches that no verified pair supports must be as
-    significant as those of a pair, because false ones agree with one another.
+    Pairs that agree with it are independent, so that several weak ones together may be as significant as a pair must be
+    by itself. Rotation and direction of one pair leave the lengths open: they are determined by other pairs that agree,
+    or by the ranges of the matches that are known. Either evidence must outweigh the pairs that do not agree.
+    Learned matches without such pairs must be as significant as those of a pair, because false ones agree with one
+    another.
     """
-    agreeing, disagreeing, has_length = _evidence_of_pairs(alignment, first, second, views=views)
-    if sum(agreeing) < sum(disagreeing):
-        return False
-    learned = any(features.learned for features in first.pairs.features.values())
-    limit = MAX_LOG10_LEARNED if learned and not agreeing else _MAX_LOG10_FALSE_ALARMS
-    return alignment.log10_false_alarms <= limit or len(agreeing) > 1 or has_length
+    limit = MAX_LOG10_LEARNED if learned and evidence.agreeing < 1 else _MAX_LOG10_FALSE_ALARMS
+    by_matches = alignment.log10_false_alarms / limit
+    by_pairs = evidence.agreeing if evidence.has_length else 0.0
+    return max(by_matches, by_pairs) >= 1 and max(by_matches, evidence.agreeing) >= evidence.disagreeing
+
+
+class _PairEvidence(NamedTuple):
+    """What the pairs between two models say about an alignment.
+
+    Attributes:
+        agreeing: sum of the significance of those that agree, relative to that which verifies a pair.
+        disagreeing: the same of those that do not agree.
+        has_length: whether the matches of one that agrees determine its length, or others that agree do.
+    """
+
+    agreeing: float
+    disagreeing: float
+    has_length: bool
 
 
 def _evidence_of_pairs(
     alignment: Alignment, first: PlacedModel, second: PlacedModel, *, views: Mapping[Edge, TwoView]
-) -> tuple[list[float], list[float], bool]:
-    """Return the significance of the verified pairs that agree with an alignment, and of those that do not.
-
-    The third value is whether the matches of one that agrees determine its length.
-    """
+) -> _PairEvidence:
+    """Return the evidence of the pairs between two models, verified or not, for and against an alignment."""
     joined = joined_model(first, second, alignment.first_from_second)
-    agreeing: list[float] = []
-    disagreeing: list[float] = []
-    has_length = False
+    agreeing, disagreeing, has_length, alarms = 0.0, 0.0, False, list[float]()
     for (i, j), view in views.items():
-        if view:
-            pose, _ = oriented(view, i, j)
-            relative = joined.cameras[j] @ joined.cameras[i].inverse()
-            turned = geodesic_angle(pose.rotation, relative.rotation)
-            off = angle_between(pose.translation, relative.translation)
-            agrees = bool(turned < _SAME_TURN_RAD and off < _SAME_DIRECTION_RAD)
-            (agreeing if agrees else disagreeing).append(-view.log10_false_alarms)
-            has_length |= agrees and _has_lengths((first, second), (i, j), view, similarity=alignment.first_from_second)
-    return agreeing, disagreeing, has_length
+        geometry = view if view else next(iter(view.alternatives), None)
+        if geometry is None or view.log10_false_alarms >= 0:
+            continue
+        pose, matches = oriented(geometry, i, j)
+        features = [first.pairs.features[first.pairs.names[image]] for image in (i, j)]
+        p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
+        limit = max_log10_false_alarms(p, q, learned=all(one.learned for one in features))
+        relative = joined.cameras[j] @ joined.cameras[i].inverse()
+        turned = geodesic_angle(pose.rotation, relative.rotation)
+        off = angle_between(pose.translation, relative.translation)
+        if turned < _SAME_TURN_RAD and off < _SAME_DIRECTION_RAD:
+            agreeing += view.log10_false_alarms / limit
+            alarms.append(view.log10_false_alarms)
+            has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
+        else:
+            disagreeing += view.log10_false_alarms / limit
+    has_length |= sum(sorted(alarms)[1:]) <= MAX_LOG10_FALSE_ALARMS
+    return _PairEvidence(agreeing, disagreeing, has_length)
 
 
 def _has_lengths(
@@ -216,12 +232,16 @@ def _aligned(
     return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses)
 
 
-def _is_rival(best: Alignment, other: Alignment, matches: CrossMatches) -> bool:
+def _is_rival(
+    best: Alignment, other: Alignment, matches: CrossMatches, *, evidence: tuple[_PairEvidence, _PairEvidence]
+) -> bool:
     """Return whether another alignment is more than chance, and explains nearly as many matches of its own.
 
-    Matches without a known point are ignored, since many of them agree with any alignment.
+    It is not a rival if pairs decide for the best one: they are as significant as a pair must be, and twice as much so
+    as those that agree with the other one. Matches without a known point are ignored, since many of them agree with any
+    alignment.
     """
-    if other.log10_false_alarms > 0:
+    if other.log10_false_alarms > 0 or evidence[0].agreeing >= max(1.0, _OWN_OF_RIVAL * evidence[1].agreeing):
         return False
     explained: NDArray[np.bool_] = match_errors(other.first_from_second, matches) < best.threshold_rad
     own = int((best.inliers & ~explained & matches.known).sum())

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.poses.joining.alignment import Alignment
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
+from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.scene import Features, Poses
-from tests.algorithms.poses.joining.two_rooms import matched, room_features, room_poses
+from tests.algorithms.poses.joining.two_rooms import matched, room_features, room_poses, with_points_of_pairs
 
 
 def _solved(features: dict[str, Features]) -> Poses:
@@ -69,6 +72,62 @@ def test_rooms_that_fit_in_two_places_stay_two_groups() -> None:
     both = {name: _stacked(here[name], there[name], slice(own, own + 2 * door)) for name in truth}
     assert len(_solved(here).worlds) == 1
     assert len(_solved(both).worlds) == 2
+
+
+@pytest.mark.parametrize(("pairs", "groups"), [([("a1", "b1")], 2), ([("a1", "b1"), ("a2", "b2")], 1)])
+def test_learned_pairs_that_are_weak_by_themselves_add_up(pairs: list[tuple[str, str]], groups: int) -> None:
+    truth = room_poses(turned=True)
+    features = with_points_of_pairs(room_features(truth, door=1), truth, pairs, count=32)
+    learned = {name: replace(one, learned=len(one)) for name, one in features.items()}
+    views = matched(learned)
+    assert not any(views[pair] for pair in pairs)
+    poses = solve_scaled_translation(learned, views, rng=np.random.default_rng(0))
+    assert len(poses.worlds) == groups
+    if groups == 1:
+        turn_deg, off = _errors(poses, truth)
+        assert turn_deg < 0.1
+        assert off < 0.03
+
+
+@pytest.mark.parametrize(
+    ("alarms", "agreeing", "disagreeing", "significant"),
+    [(-44, 1.2, 1.7, True), (-12, 1.1, 1.7, False), (-44, 0.0, 5.0, False), (-9, 0.9, 0.0, False)],
+)
+def test_an_alignment_outweighs_the_pairs_that_contradict_it(
+    alarms: float, agreeing: float, disagreeing: float, significant: bool
+) -> None:
+    evidence = _PairEvidence(agreeing, disagreeing, has_length=True)
+    assert _is_significant(_alignment(alarms), evidence, learned=False) == significant
+
+
+@pytest.mark.parametrize(("best", "rival", "is_rival"), [(0.5, 0.0, True), (3.0, 0.0, False), (3.0, 2.0, True)])
+def test_pairs_decide_between_alignments_that_as_many_matches_support(
+    best: float, rival: float, is_rival: bool
+) -> None:
+    evidence = _PairEvidence(best, 0.0, has_length=True), _PairEvidence(rival, 0.0, has_length=True)
+    ray = np.array([0.0, 0.0, 1.0])
+    matches = CrossMatches(
+        cameras=np.zeros((8, 2), np.intp),
+        keypoints=np.zeros((8, 2), np.int32),
+        centers=np.tile(ray - ray, (8, 2, 1)),
+        rays=np.tile(ray, (8, 2, 1)),
+        ranges=np.ones((8, 2)),
+    )
+    assert _is_rival(_alignment(-30.0), _alignment(-4.0), matches, evidence=evidence) == is_rival
+
+
+def _alignment(log10_false_alarms: float) -> Alignment:
+    """Return an alignment of two worlds with the same axes, a unit apart, without matches that agree."""
+    return Alignment(
+        Similarity3(1.0, np.eye(3), np.array([0.0, 0.0, -1.0])),
+        inliers=np.zeros(8, np.bool_),
+        witnesses=0,
+        log10_false_alarms=log10_false_alarms,
+        rotation_std_deg=0.1,
+        offset_std_deg=0.1,
+        scale_std=0.01,
+        threshold_rad=0.01,
+    )
 
 
 def _stacked(first: Features, second: Features, door: slice) -> Features:

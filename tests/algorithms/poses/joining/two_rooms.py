@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +69,29 @@ def room_features(
             size_hw=(512, 1024),
         )
     return features
+
+
+def with_points_of_pairs(
+    features: dict[str, Features], poses: dict[str, Rigid3], pairs: Iterable[tuple[str, str]], *, count: int
+) -> dict[str, Features]:
+    """Return features with `count` more points near the door for each of some pairs, which no other camera sees."""
+    rng = np.random.default_rng(5)
+    found = dict(features)
+    for pair in pairs:
+        points = np.concatenate([_door_points(rng, x, count // 2) for x in (-3.0, 3.0)])
+        descriptors = rng.integers(0, 120, (count, 64)).astype(np.float32)
+        for name in pair:
+            rays = poses[name].apply(points)
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            rays += rng.normal(0, NOISE_RAD, rays.shape)
+            added = {"bearings": rays / np.linalg.norm(rays, axis=1, keepdims=True), "descriptors": descriptors}
+            own = found[name]
+            arrays: dict[str, Any] = {
+                key: np.concatenate([getattr(own, key), added.get(key, getattr(own, key)[:count])])
+                for key in ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
+            }
+            found[name] = replace(own, **arrays)
+    return found
 
 
 def matched(features: dict[str, Features]) -> dict[tuple[str, str], TwoView]:

@@ -1,10 +1,10 @@
 """Real tours against their links: `python -m tests.benchmarks poses.tours.links DIR … --out DIR`.
 
-Each DIR is a virtual tour as Marzipano's editor exports it: cube tiles, and data.js, in which whoever made the tour
-marked in each scene where others lie. Such links are true to some 10°; through doors they mark the door instead, so
-that they may be 30° off. Where a workflow puts both scenes of a link into one group, the direction of the other camera
-is compared with the link. The table shows the links within 20° and beyond 45°, and how many of the latter no doubt
-about one of their cameras explains.
+Each DIR is a virtual tour: cube tiles, and data.js of Marzipano or a JSON file of Pannellum, in which whoever made the
+tour marked in each scene where others lie. Such links are true to some 10°; through doors they mark the door instead,
+so that they may be 30° off. Where a workflow puts both scenes of a link into one group, the direction of the other
+camera is compared with the link. The table shows the links within 20° and beyond 45°, and how many of the latter no
+doubt about one of their cameras explains.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 
 import pano_mvs
+from pano_mvs.io.images.tour_configurations import javascript_object
 from pano_mvs.io.images.tours import list_scenes
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
@@ -42,21 +44,32 @@ class Offset(NamedTuple):
 
 def read_links(tour: Path) -> tuple[int, dict[tuple[str, str], float]]:
     """Return the number of scenes, and the azimuth in radians, to the right, of each link by (scene, target)."""
-    named = {}
-    for scene in list_scenes(tour, []):
-        for path in scene.tiles.values():
-            named[path.relative_to(tour).parts[-5]] = scene.name  # tiles/<id>/<level>/<face>/<row>/<column>.jpg
-    for file in tour.rglob("data.js"):
-        found = re.search(r"APP_DATA\s*=\s*(\{.*\})\s*;", file.read_text(encoding="utf-8"), re.DOTALL)
-        if found:
-            scenes = json.loads(found.group(1))["scenes"]
+    scenes = list_scenes(tour, [])
+    parts = {part: scene.name for scene in scenes for path in scene.tiles.values() for part in path.parts[:-1]}
+    for file in sorted((*tour.rglob("data.js"), *tour.rglob("*.json"))):
+        stated = list(_stated_links(file.read_text(encoding="utf-8")))
+        named = {key: parts[folder] for key, folder, _ in stated if folder in parts}
+        if named:
             return len(scenes), {
-                (named[scene["id"]], named[link["target"]]): float(link["yaw"])
-                for scene in scenes
-                for link in scene["linkHotspots"]
-                if {scene["id"], link["target"]} <= named.keys()
+                (named[key], named[target]): azimuth
+                for key, _, links in stated
+                for target, azimuth in links.items()
+                if {key, target} <= named.keys()
             }
-    raise SystemExit(f"{tour}: no data.js of a Marzipano tour in it")
+    raise SystemExit(f"{tour}: no data.js of a Marzipano tour and no JSON file of a Pannellum tour with tiles in it")
+
+
+def _stated_links(text: str) -> Iterator[tuple[str, str, dict[str, float]]]:
+    """Yield for each scene that a configuration states its key, the folder of its tiles, and the azimuths of links."""
+    if found := re.search(r"APP_DATA\s*=\s*(?=\{)", text):
+        for scene in javascript_object(text[found.end() :])["scenes"]:
+            links = {link["target"]: float(link["yaw"]) for link in scene["linkHotspots"]}
+            yield scene["id"], scene["id"], links
+    elif '"scenes"' in text and '"multiRes"' in text:
+        for key, scene in json.loads(text)["scenes"].items():
+            folder = PurePosixPath(scene["multiRes"]["path"].partition("%")[0]).name
+            links = {spot["sceneId"]: float(np.deg2rad(spot["yaw"])) for spot in scene["hotSpots"] if "sceneId" in spot}
+            yield key, folder, links
 
 
 def offsets(group: Poses, links: dict[tuple[str, str], float]) -> list[Offset]:
