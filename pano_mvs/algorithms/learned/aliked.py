@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
-from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, Array, Networks
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
 from pano_mvs.algorithms.learned.tiles import FOCAL_PX, level_tiles
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -21,6 +21,7 @@ from pano_mvs.scene import Features
 
 # Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
 _RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
+_MOST_BY_COLMAP = 2048  # key points of a view that COLMAP's file describes, its own default
 
 
 @checks_settings
@@ -104,8 +105,16 @@ def described_tile(
         threshold: minimum score.
         networks: the network files and what executes them.
     """
-    planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32)
-    score, *maps = networks.load("aliked_detector.onnx")(image=planes / np.float32(255))
+    planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
+    if extractor := networks.of_colmap("extractor"):
+        places, found, strengths = extractor(
+            image=planes, max_keypoints=np.array(_MOST_BY_COLMAP), min_score=np.array(threshold, np.float32)
+        )
+        # -1 … 1 between the centres of the outermost pixels.
+        pixels = (places[0].astype(np.float64) + 1) * ((TILE_PX - 1) / 2)
+        keep = np.flatnonzero((strengths[0] > threshold) & kept(pixels + 0.5))
+        return DescribedTile(pixels[keep] + 0.5, found[0, keep], strengths[0, keep])
+    score, *maps = networks.load("aliked_detector.onnx")(image=planes)
     pixels, scores = maxima_of_scores(score[0, 0], threshold)
     keep = np.flatnonzero(kept(pixels + 0.5))
     named = {f"features{level}": one for level, one in enumerate(maps)}

@@ -1,7 +1,7 @@
 """The neural networks ALIKED and LightGlue as ONNX files, and their execution by ONNX Runtime.
 
 The files come with the package; `tools/export_networks.py` writes them. Another folder may hold files of the same names
-with the same inputs and outputs, for example with weights of one's own.
+with the same inputs and outputs, for example with weights of one's own, or the two files that COLMAP downloads.
 """
 
 from __future__ import annotations
@@ -37,6 +37,13 @@ DIGESTS: Mapping[str, str] = {
     "lightglue_end.onnx": "03faf1bc8da5de44ea7bab0e8abdf3d309a43a84cce97a44c89831f57524897a",
 }
 _PACKAGED = Path(__file__).parent / "models"
+# Files of COLMAP 4 are recognised by the names and axes of their inputs and outputs, whatever they are called.
+_COLMAP: Mapping[Literal["extractor", "matcher"], str] = {
+    "extractor": "image (4 axes), max_keypoints (0 axes), min_score (0 axes), keypoints (3 axes), "
+    "descriptors (3 axes), scores (2 axes)",
+    "matcher": "kpts0 (3 axes), kpts1 (3 axes), desc0 (3 axes), desc1 (3 axes), image_size0 (2 axes), "
+    "image_size1 (2 axes), matches0 (1 axes), mscores0 (1 axes)",
+}
 _PROVIDERS: Mapping[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
@@ -50,7 +57,7 @@ class Networks:
     """Where the networks are read from and what executes them.
 
     Attributes:
-        models: folder with one's own files, named as in `DIGESTS`; None takes those of the package.
+        models: folder with one's own files, named as in `DIGESTS`, or with COLMAP's; None takes those of the package.
         provider: what ONNX Runtime executes them with.
     """
 
@@ -66,6 +73,36 @@ class Networks:
         path = self._path(file)
         return open_network(path, self.provider)
 
+    def of_colmap(self, part: Literal["extractor", "matcher"]) -> Network | None:
+        """Return COLMAP's network for ALIKED or for LightGlue; None if the folder has none of COLMAP's files.
+
+        Raises:
+            UsageError: if the folder has only one of the two or several of a kind, if its descriptors are not 128
+                numbers, a file is damaged, or the provider is not installed.
+        """
+        if self.models is None or any(is_file(self.models / file) for file in DIGESTS):
+            return None
+        loaded = {path: open_network(path, self.provider) for path in sorted(self.models.glob("*.onnx"))}
+        found = {
+            kind: [path for path, one in loaded.items() if ", ".join(one.interface) == interface]
+            for kind, interface in _COLMAP.items()
+        }
+        if not any(found.values()):
+            return None
+        for kind, paths in found.items():
+            if len(paths) != 1:
+                names = " and ".join(path.name for path in paths) or "none"
+                raise UsageError(
+                    f"{self.models}: needs one {kind} in COLMAP's form, but has {names}. Leave one of COLMAP's "
+                    "aliked-n16rot.onnx and aliked-n32.onnx in the folder, with aliked-lightglue.onnx"
+                )
+        if (width := loaded[found["extractor"][0]].width_of("descriptors")) not in {128, None}:
+            raise UsageError(
+                f"{found['extractor'][0]}: descriptors must have 128 numbers, but have {width}. Take COLMAP's "
+                "aliked-n16rot.onnx or aliked-n32.onnx"
+            )
+        return loaded[found[part][0]]
+
     def check(self) -> None:
         """Check all files and the provider, so that nothing is computed in vain.
 
@@ -73,6 +110,8 @@ class Networks:
             UsageError: if a file is missing, damaged or has other inputs or outputs than that of the package, or the
                 provider is not installed.
         """
+        if self.of_colmap("extractor"):
+            return
         for file in DIGESTS:
             self._path(file)
             if self == PACKAGED:
@@ -87,7 +126,12 @@ class Networks:
     def _path(self, file: str) -> Path:
         path = (_PACKAGED if self.models is None else self.models) / file
         if not is_file(path):
-            remedy = "Install pano-mvs again" if self.models is None else "tools/export_networks.py writes all files"
+            remedy = (
+                "Install pano-mvs again"
+                if self.models is None
+                else "tools/export_networks.py writes all files, or take aliked-n16rot.onnx and "
+                "aliked-lightglue.onnx of COLMAP 4"
+            )
             raise UsageError(f"{path}: this network is missing. {remedy}")
         if self.models is None and _digest(path, path.stat().st_mtime_ns) != DIGESTS[file]:
             raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
@@ -124,6 +168,11 @@ class Network:
         """The names and numbers of axes of the inputs and outputs."""
         ends = (*self._session.get_inputs(), *self._session.get_outputs())
         return [f"{one.name} ({len(one.shape)} axes)" for one in ends]
+
+    def width_of(self, output: str) -> int | None:
+        """Return the size of the last axis of an output; None if it is left open."""
+        size = next(one.shape[-1] for one in self._session.get_outputs() if one.name == output)
+        return size if isinstance(size, int) else None
 
     def picture_input(self) -> tuple[str, list[int | None]]:
         """Return the name and shape of the only input, a picture (1, 3, h, w); None for sizes that are left open.
