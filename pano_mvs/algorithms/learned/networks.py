@@ -30,11 +30,11 @@ DESCRIPTOR_NORM = 512
 
 # By the digests, other files mean other code, so that no result of the old ones is taken from a cache.
 DIGESTS: Mapping[str, str] = {
-    "aliked_detector.onnx": "15ed9b8558d2b2bc28a4a9fb75f0dca5e0b67c25cb2d94913f90bc7fdc1b6583",
-    "aliked_descriptor.onnx": "b3811721d037c420df9bb5c0a63bc670224989d0884d793b5a3b333626243b57",
-    "lightglue_start.onnx": "255a4061f4821ea1cf414c8928644035e0f5c90028ce1268c07b4dd2ce7be19a",
-    "lightglue_layer.onnx": "f937cacf2ac4f5d38d495bfbe6a420f7dc60408e020d4af2996ba4543816010d",
-    "lightglue_end.onnx": "03faf1bc8da5de44ea7bab0e8abdf3d309a43a84cce97a44c89831f57524897a",
+    "aliked_detector.onnx": "e87fa9dee348f3a65f23a02437ad70ea2cc9892fa03acc859069bd749c2d756e",
+    "aliked_descriptor.onnx": "5e82ee63a520132462eb6fefc3eb981d005778e94aca378694044c94529e1605",
+    "lightglue_start.onnx": "b46f3cba24b9203f1414eb57be9132b30371ded81b9b4934ad8030eb2b2018ed",
+    "lightglue_layer.onnx": "9f7d6bbbbb25548d0cff9a0a3628217ea29d589356dfa168aa51c19ebaf5ce6d",
+    "lightglue_end.onnx": "012271bd4a563195958c1fa02761e311b080ae6e5b2c787bcce9efb4e30fd920",
 }
 _PACKAGED = Path(__file__).parent / "models"
 # Files of COLMAP 4 are recognised by the names and axes of their inputs and outputs, whatever they are called.
@@ -211,6 +211,12 @@ def _session(path: Path, _changed_ns: int, provider: Provider) -> Any:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
+    # The last level of ONNX Runtime changes the layout of convolutions, and changes it back for every SELU of ALIKED.
+    options.graph_optimization_level = (
+        runtime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        if path.name == "aliked_detector.onnx"
+        else runtime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    )
     options.enable_mem_pattern = False  # the numbers of key points change with each call: saves a fifth of the memory
     names = list(dict.fromkeys([_PROVIDERS[provider], _PROVIDERS["cpu"]]))
     try:
