@@ -21,7 +21,7 @@ from pano_mvs.scene import Features
 
 # Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
 _RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
-_SHARE = 2  # times the mean number of key points of a view, at most
+_SHARE = 4  # times the mean number of key points of a view, at most
 _MOST_BY_COLMAP = 2048  # key points of a view that COLMAP's file describes, its own default
 
 

@@ -42,7 +42,7 @@ def write_extractor(path: Path, *, width: int = 128) -> None:
         "unit": np.array(1, np.float32),
         "detector": (filters[:1] / 9).astype(np.float32),
     }
-    steps = [
+    steps: list[tuple[str, str, str, dict[str, Any]]] = [
         ("Conv", "image detector", "signed", {"pads": [4] * 4}),
         ("Abs", "signed", "bright", {}),
         ("MaxPool", "bright", "around", {"kernel_shape": [9, 9], "pads": [4] * 4, "strides": [1, 1]}),
@@ -87,7 +87,7 @@ def write_extractor(path: Path, *, width: int = 128) -> None:
 def write_matcher(path: Path) -> None:
     """Write the network that matches the key points of two pictures."""
     constants = {"zero": np.array([0], np.int64), "leading": np.array([0], np.int64)}
-    steps = [
+    steps: list[tuple[str, str, str, dict[str, Any]]] = [
         ("Transpose", "desc1", "turned", {"perm": [0, 2, 1]}),
         ("MatMul", "desc0 turned", "similar", {}),
         ("ArgMax", "similar", "nearest", {"axis": 2, "keepdims": 0}),
