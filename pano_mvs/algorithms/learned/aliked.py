@@ -56,7 +56,9 @@ def extract_aliked(
     found = []
     for number, tile in enumerate(tiles):
 
-        def kept(pixels: FloatArray, scores: Array, number: int = number, tile: PinholeView = tile) -> NDArray[np.intp]:
+        def kept(
+            pixels: FloatArray, scores: Array, *, number: int = number, tile: PinholeView = tile
+        ) -> NDArray[np.intp]:
             bearings = tile.bearings_from_pixels(pixels)
             # Those nearer to the middle of another view are found there.
             nearest = np.argmax([bearings @ other.view_from_cam[2] for other in tiles], axis=0)

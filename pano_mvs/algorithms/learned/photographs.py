@@ -51,7 +51,8 @@ def view_of_photograph(
 
     def strongest(pixels: NDArray[np.float64], scores: Array) -> NDArray[np.intp]:
         order = np.argsort(-scores, kind="stable")
-        return order[inside[tuple(pixels[order].astype(int).T[::-1])]][:max_keypoints]
+        x, y = pixels[order].astype(int).T
+        return np.asarray(order[inside[y, x]][:max_keypoints])
 
     tile = described_tile(square, strongest, threshold=_THRESHOLD, networks=networks)
     pixels = tile.pixels_px

@@ -91,10 +91,10 @@ def by_cosine(first: Found, second: Found) -> NDArray[np.int64]:
     """Return the mutual nearest neighbours (M, 2) whose cosine is .82 or more."""
     matches = match_l2(first.descriptors, second.descriptors, ratio=1)
     cosine = (first.descriptors[matches[:, 0]] * second.descriptors[matches[:, 1]]).sum(axis=1)
-    return matches[cosine >= 0.82].astype(np.int64)
+    return np.asarray(matches[cosine >= 0.82], np.int64)
 
 
-def networks(name: str) -> tuple[Callable[[Any], Found], Callable[[Any, Any], NDArray[Any]]]:
+def networks(name: str) -> tuple[Callable[[Any], Any], Callable[[Any, Any], NDArray[Any]]]:
     """Return the function from a panorama to its key points, and the one from two panoramas' to their matches."""
     if name == "aliked":
         return (
