@@ -59,8 +59,10 @@ class Graph:
 
     def save(self, path: Path, inputs: dict[str, tuple[int, list[Any]]], outputs: dict[str, tuple[str, int]]) -> None:
         """Write the graph; outputs are given as name: (value, number of axes)."""
-        for name, (value, _) in outputs.items():
-            self.nodes.append(helper.make_node("Identity", [value], [name]))
+        named = {value: name for name, (value, _) in outputs.items()}
+        for node in self.nodes:  # an Identity would copy the values
+            node.input[:] = [named.get(value, value) for value in node.input]
+            node.output[:] = [named.get(value, value) for value in node.output]
         graph = helper.make_graph(
             self.nodes,
             path.stem,
@@ -162,19 +164,40 @@ def export_descriptor(net: Any, path: Path, side: int) -> None:
     graph, head = Graph(), net.desc_head
     count = head.n_pos
 
+    sizes = (side, side // 2, side // 8, side // 32)
+    # By rows of 32 numbers that lie together: three times as fast as GridSample, which reads one plane after the other.
+    by_pixel = [
+        graph(
+            "Transpose", graph("Reshape", f"features{number}", graph.exact([DESCRIPTOR // 4, size * size])), perm=[1, 0]
+        )
+        for number, size in enumerate(sizes)
+    ]
+
     def sampled(pixels: str) -> str:
         """Return unit features (N E, 128) in pixels (N, E, 2), zero outside of the tile."""
-        grid = graph("Mul", pixels, graph.exact(2 / (side - 1), np.float32))
-        grid = graph("Add", grid, graph.exact(-1, np.float32))
-        grid = graph("Unsqueeze", grid, graph.exact([0]))
-        taken = [graph("GridSample", f"features{number}", grid, mode="linear", align_corners=1) for number in range(4)]
-        joined = graph("Transpose", graph("Concat", *taken, axis=1), perm=[0, 2, 3, 1])
-        unit = graph("LpNormalization", joined, axis=3, p=2)
-        farthest = graph("ReduceMax", graph("Abs", grid), graph.exact([3]), keepdims=0)
-        inside = graph("Cast", graph("LessOrEqual", farthest, graph.exact(1, np.float32)), to=TensorProto.FLOAT)
-        return graph(
-            "Reshape", graph("Mul", unit, graph("Unsqueeze", inside, graph.exact([3]))), graph.exact([-1, DESCRIPTOR])
+        flat = graph("Reshape", pixels, graph.exact([-1, 2]))
+        bounded = graph("Clip", flat, graph.exact(0, np.float32), graph.exact(side - 1, np.float32))
+        parts = []
+        for row, size in zip(by_pixel, sizes, strict=True):
+            scaled = graph("Mul", bounded, graph.exact((size - 1) / (side - 1), np.float32))
+            corner = graph("Floor", graph("Min", scaled, graph.exact(size - 1.5, np.float32)))
+            x, y = graph("Split", graph("Sub", scaled, corner), axis=1, num_outputs=2, outputs=2)
+            whole = graph("Cast", corner, to=TensorProto.INT64)
+            first = graph("MatMul", whole, graph.exact([1, size]))
+
+            def at(offset: int, row: str = row, first: str = first) -> str:
+                return graph("Gather", row, graph("Add", first, graph.exact(offset)))
+
+            def between(start: str, end: str, share: str) -> str:
+                return graph("Add", start, graph("Mul", graph("Sub", end, start), share))
+
+            upper, lower = (between(at(offset), at(offset + 1), x) for offset in (0, size))
+            parts.append(between(upper, lower, y))
+        unit = graph("LpNormalization", graph("Concat", *parts, axis=1), axis=1, p=2)
+        inside = graph(
+            "ReduceMin", graph("Cast", graph("Equal", flat, bounded), to=TensorProto.FLOAT), graph.exact([1])
         )
+        return graph("Mul", unit, inside)
 
     whole = graph("Unsqueeze", graph("Floor", "pixels"), graph.exact([1]))
     rows, columns = np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij")
@@ -195,7 +218,6 @@ def export_descriptor(net: Any, path: Path, side: int) -> None:
     taken = graph("Reshape", taken, graph.exact([-1, count * DESCRIPTOR]))
     found = graph("MatMul", taken, graph.weight(head.agg_weights.reshape(count * DESCRIPTOR, DESCRIPTOR)))
     found = graph("LpNormalization", found, axis=1, p=2)
-    sizes = (side, side // 2, side // 8, side // 32)
     inputs = {
         f"features{number}": (TensorProto.FLOAT, [1, DESCRIPTOR // 4, size, size]) for number, size in enumerate(sizes)
     }
@@ -229,6 +251,10 @@ class Layer:
     def scaled(self, x: str, factor: float) -> str:
         """Multiply by a number."""
         return self.graph("Mul", x, self.graph.exact(factor, np.float32))
+
+    def softmax(self, x: str) -> str:
+        """Add a softmax over the last axis, without the subnormal numbers that make a product four times as slow."""
+        return self.graph("Add", self.graph("Softmax", x, axis=-1), self.graph.exact(1e-30, np.float32))
 
     def feed_forward(self, x: str, message: str, blocks: list[Any], project: list[Any]) -> str:
         """Add x + ffn([x, W m + b]), the projection W folded into the first linear map."""
@@ -279,7 +305,7 @@ def export_layer(net: Any, path: Path) -> None:
     for query, key, content in zip(
         each(layer.scaled(rotated[0], scale), 1), each(rotated[1], 1), each(value, 1), strict=True
     ):
-        weights = graph("Softmax", graph("MatMul", query, graph("Transpose", key, perm=[0, 2, 1])), axis=-1)
+        weights = layer.softmax(graph("MatMul", query, graph("Transpose", key, perm=[0, 2, 1])))
         messages.append(graph("MatMul", weights, content))
     message = layer.joined(graph("Concat", *messages, axis=1))
     both = layer.feed_forward(both, message, selves, [block.out_proj for block in selves])
@@ -289,9 +315,9 @@ def export_layer(net: Any, path: Path) -> None:
     first_key, second_key = each(layer.scaled(shared, scale**0.5), 1)
     first_value, second_value = each(value, 1)
     similar = graph("MatMul", first_key, graph("Transpose", second_key, perm=[0, 2, 1]))
-    to_first = graph("MatMul", graph("Softmax", similar, axis=-1), second_value)
+    to_first = graph("MatMul", layer.softmax(similar), second_value)
     back = graph("Transpose", similar, perm=[0, 2, 1])
-    to_second = graph("MatMul", graph("Softmax", back, axis=-1), first_value)
+    to_second = graph("MatMul", layer.softmax(back), first_value)
     message = layer.joined(graph("Concat", to_first, to_second, axis=1))
     both = layer.feed_forward(both, message, crosses, [block.to_out for block in crosses])
 

@@ -70,7 +70,7 @@ class NetworkParams(Params):
         default="cpu", description="what the networks run on; others than cpu need another package of ONNX Runtime"
     )
     models: InputPath | None = Field(
-        default=None, description="folder with network files of your own, named as those of the package"
+        default=None, description="folder with network files of your own: named as those of the package, or COLMAP's"
     )
 
     @model_validator(mode="after")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
-from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, Array, Networks
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
 from pano_mvs.algorithms.learned.tiles import FOCAL_PX, level_tiles
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -21,6 +21,8 @@ from pano_mvs.scene import Features
 
 # Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
 _RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
+_SHARE = 4  # times the mean number of key points of a view, at most
+_MOST_BY_COLMAP = 2048  # key points of a view that COLMAP's file describes, its own default
 
 
 @checks_settings
@@ -54,11 +56,15 @@ def extract_aliked(
     found = []
     for number, tile in enumerate(tiles):
 
-        def kept(pixels: FloatArray, number: int = number, tile: PinholeView = tile) -> NDArray[np.bool_]:
+        def kept(
+            pixels: FloatArray, scores: Array, *, number: int = number, tile: PinholeView = tile
+        ) -> NDArray[np.intp]:
             bearings = tile.bearings_from_pixels(pixels)
             # Those nearer to the middle of another view are found there.
             nearest = np.argmax([bearings @ other.view_from_cam[2] for other in tiles], axis=0)
-            return np.asarray(mask[_pixels_of(bearings, size_hw)] & (nearest == number))
+            own = np.flatnonzero(mask[_pixels_of(bearings, size_hw)] & (nearest == number))
+            # A view with more than this is thinned out below, so most of its key points need no descriptor.
+            return own[spread_keypoints(bearings[own], scores[own], max_keypoints=_SHARE * max_keypoints // len(tiles))]
 
         one = described_tile(
             sample_view(image, tile, interpolation=cv2.INTER_LINEAR), kept, threshold=threshold, networks=networks
@@ -91,7 +97,7 @@ class DescribedTile(NamedTuple):
 
 def described_tile(
     picture: NDArray[np.uint8],
-    kept: Callable[[FloatArray], NDArray[np.bool_]],
+    kept: Callable[[FloatArray, Array], NDArray[np.intp]],
     *,
     threshold: float,
     networks: Networks,
@@ -100,14 +106,23 @@ def described_tile(
 
     Args:
         picture: (512, 512, 3) uint8 RGB.
-        kept: says which of the pixels (N, 2) of key points are described and returned.
+        kept: returns the positions of the key points, pixels (N, 2) and scores (N,), that are described and returned.
         threshold: minimum score.
         networks: the network files and what executes them.
     """
-    planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32)
-    score, *maps = networks.load("aliked_detector.onnx")(image=planes / np.float32(255))
+    planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
+    if extractor := networks.of_colmap("extractor"):
+        places, found, strengths = extractor(
+            image=planes, max_keypoints=np.array(_MOST_BY_COLMAP), min_score=np.array(threshold, np.float32)
+        )
+        # -1 … 1 between the centres of the outermost pixels.
+        pixels = (places[0].astype(np.float64) + 1) * ((TILE_PX - 1) / 2)
+        keep = kept(pixels + 0.5, strengths[0])
+        keep = keep[strengths[0, keep] > threshold]
+        return DescribedTile(pixels[keep] + 0.5, found[0, keep], strengths[0, keep])
+    score, *maps = networks.load("aliked_detector.onnx")(image=planes)
     pixels, scores = maxima_of_scores(score[0, 0], threshold)
-    keep = np.flatnonzero(kept(pixels + 0.5))
+    keep = kept(pixels + 0.5, scores)
     named = {f"features{level}": one for level, one in enumerate(maps)}
     descriptors = networks.load("aliked_descriptor.onnx")(**named, pixels=pixels[keep].astype(np.float32))[0]
     return DescribedTile(pixels[keep] + 0.5, descriptors, scores[keep])

@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
+from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Network, Networks
 from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
@@ -70,10 +70,12 @@ class LightGlue:
     """The network, layer by layer."""
 
     def __init__(self, networks: Networks) -> None:
-        """Load its files; see `Networks.load`."""
-        self._start, self._layer, self._end = (
-            networks.load(f"lightglue_{part}.onnx") for part in ("start", "layer", "end")
-        )
+        """Load its files; see `Networks.load` and `Networks.of_colmap`."""
+        self._whole = networks.of_colmap("matcher")
+        if not self._whole:
+            self._start, self._layer, self._end = (
+                networks.load(f"lightglue_{part}.onnx") for part in ("start", "layer", "end")
+            )
 
     def match(
         self, first: Sequence[Array], second: Sequence[Array], *, min_score: float
@@ -85,6 +87,8 @@ class LightGlue:
             second: those of the second view.
             min_score: minimum probability.
         """
+        if self._whole:
+            return _matched_by_colmap(self._whole, first, second, min_score=min_score)
         states = [self._start(descriptors=descriptors, positions=places) for descriptors, places in (first, second)]
         kept = [np.arange(len(features)) for features, _ in states]
         counts = [len(one) for one in kept]
@@ -120,6 +124,27 @@ class LightGlue:
         score = chance[np.arange(len(chance)), nearest]
         mutual = np.flatnonzero((chance.argmax(axis=0)[nearest] == np.arange(len(chance))) & (score > min_score))
         return np.stack([kept[0][mutual], kept[1][nearest[mutual]]], axis=1), score[mutual]
+
+
+def _matched_by_colmap(
+    network: Network, first: Sequence[Array], second: Sequence[Array], *, min_score: float
+) -> tuple[NDArray[np.intp], Array]:
+    """Return what `LightGlue.match` returns, by COLMAP's file, which computes all layers for all key points."""
+    if min(len(first[0]), len(second[0])) == 0:
+        return np.zeros((0, 2), np.intp), np.zeros(0, np.float32)
+    # Pixels whose first one has its centre at (0, 0).
+    inputs = {
+        f"{name}{number}": values[None]
+        for number, (descriptors, places) in enumerate((first, second))
+        for name, values in (
+            ("kpts", (places + 1) * np.float32(TILE_PX / 2) - np.float32(0.5)),
+            ("desc", descriptors),
+            ("image_size", np.full(2, TILE_PX, np.float32)),
+        )
+    }
+    partners, scores = network(**inputs)
+    matched = np.flatnonzero((partners >= 0) & (scores >= min_score))
+    return np.stack([matched, partners[matched].astype(np.intp)], axis=1), scores[matched]
 
 
 @dataclass(frozen=True, eq=False)

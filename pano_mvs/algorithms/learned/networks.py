@@ -1,7 +1,7 @@
 """The neural networks ALIKED and LightGlue as ONNX files, and their execution by ONNX Runtime.
 
 The files come with the package; `tools/export_networks.py` writes them. Another folder may hold files of the same names
-with the same inputs and outputs, for example with weights of one's own.
+with the same inputs and outputs, for example with weights of one's own, or the two files that COLMAP downloads.
 """
 
 from __future__ import annotations
@@ -30,13 +30,20 @@ DESCRIPTOR_NORM = 512
 
 # By the digests, other files mean other code, so that no result of the old ones is taken from a cache.
 DIGESTS: Mapping[str, str] = {
-    "aliked_detector.onnx": "15ed9b8558d2b2bc28a4a9fb75f0dca5e0b67c25cb2d94913f90bc7fdc1b6583",
-    "aliked_descriptor.onnx": "b3811721d037c420df9bb5c0a63bc670224989d0884d793b5a3b333626243b57",
-    "lightglue_start.onnx": "255a4061f4821ea1cf414c8928644035e0f5c90028ce1268c07b4dd2ce7be19a",
-    "lightglue_layer.onnx": "f937cacf2ac4f5d38d495bfbe6a420f7dc60408e020d4af2996ba4543816010d",
-    "lightglue_end.onnx": "03faf1bc8da5de44ea7bab0e8abdf3d309a43a84cce97a44c89831f57524897a",
+    "aliked_detector.onnx": "e87fa9dee348f3a65f23a02437ad70ea2cc9892fa03acc859069bd749c2d756e",
+    "aliked_descriptor.onnx": "5e82ee63a520132462eb6fefc3eb981d005778e94aca378694044c94529e1605",
+    "lightglue_start.onnx": "b46f3cba24b9203f1414eb57be9132b30371ded81b9b4934ad8030eb2b2018ed",
+    "lightglue_layer.onnx": "9f7d6bbbbb25548d0cff9a0a3628217ea29d589356dfa168aa51c19ebaf5ce6d",
+    "lightglue_end.onnx": "012271bd4a563195958c1fa02761e311b080ae6e5b2c787bcce9efb4e30fd920",
 }
 _PACKAGED = Path(__file__).parent / "models"
+# Files of COLMAP 4 are recognised by the names and axes of their inputs and outputs, whatever they are called.
+_COLMAP: Mapping[Literal["extractor", "matcher"], str] = {
+    "extractor": "image (4 axes), max_keypoints (0 axes), min_score (0 axes), keypoints (3 axes), "
+    "descriptors (3 axes), scores (2 axes)",
+    "matcher": "kpts0 (3 axes), kpts1 (3 axes), desc0 (3 axes), desc1 (3 axes), image_size0 (2 axes), "
+    "image_size1 (2 axes), matches0 (1 axes), mscores0 (1 axes)",
+}
 _PROVIDERS: Mapping[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
@@ -50,7 +57,7 @@ class Networks:
     """Where the networks are read from and what executes them.
 
     Attributes:
-        models: folder with one's own files, named as in `DIGESTS`; None takes those of the package.
+        models: folder with one's own files, named as in `DIGESTS`, or with COLMAP's; None takes those of the package.
         provider: what ONNX Runtime executes them with.
     """
 
@@ -66,6 +73,36 @@ class Networks:
         path = self._path(file)
         return open_network(path, self.provider)
 
+    def of_colmap(self, part: Literal["extractor", "matcher"]) -> Network | None:
+        """Return COLMAP's network for ALIKED or for LightGlue; None if the folder has none of COLMAP's files.
+
+        Raises:
+            UsageError: if the folder has only one of the two or several of a kind, if its descriptors are not 128
+                numbers, a file is damaged, or the provider is not installed.
+        """
+        if self.models is None or any(is_file(self.models / file) for file in DIGESTS):
+            return None
+        loaded = {path: open_network(path, self.provider) for path in sorted(self.models.glob("*.onnx"))}
+        found = {
+            kind: [path for path, one in loaded.items() if ", ".join(one.interface) == interface]
+            for kind, interface in _COLMAP.items()
+        }
+        if not any(found.values()):
+            return None
+        for kind, paths in found.items():
+            if len(paths) != 1:
+                names = " and ".join(path.name for path in paths) or "none"
+                raise UsageError(
+                    f"{self.models}: needs one {kind} in COLMAP's form, but has {names}. Leave one of COLMAP's "
+                    "aliked-n16rot.onnx and aliked-n32.onnx in the folder, with aliked-lightglue.onnx"
+                )
+        if (width := loaded[found["extractor"][0]].width_of("descriptors")) not in {128, None}:
+            raise UsageError(
+                f"{found['extractor'][0]}: descriptors must have 128 numbers, but have {width}. Take COLMAP's "
+                "aliked-n16rot.onnx or aliked-n32.onnx"
+            )
+        return loaded[found[part][0]]
+
     def check(self) -> None:
         """Check all files and the provider, so that nothing is computed in vain.
 
@@ -73,6 +110,8 @@ class Networks:
             UsageError: if a file is missing, damaged or has other inputs or outputs than that of the package, or the
                 provider is not installed.
         """
+        if self.of_colmap("extractor"):
+            return
         for file in DIGESTS:
             self._path(file)
             if self == PACKAGED:
@@ -87,7 +126,12 @@ class Networks:
     def _path(self, file: str) -> Path:
         path = (_PACKAGED if self.models is None else self.models) / file
         if not is_file(path):
-            remedy = "Install pano-mvs again" if self.models is None else "tools/export_networks.py writes all files"
+            remedy = (
+                "Install pano-mvs again"
+                if self.models is None
+                else "tools/export_networks.py writes all files, or take aliked-n16rot.onnx and "
+                "aliked-lightglue.onnx of COLMAP 4"
+            )
             raise UsageError(f"{path}: this network is missing. {remedy}")
         if self.models is None and _digest(path, path.stat().st_mtime_ns) != DIGESTS[file]:
             raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
@@ -124,6 +168,11 @@ class Network:
         """The names and numbers of axes of the inputs and outputs."""
         ends = (*self._session.get_inputs(), *self._session.get_outputs())
         return [f"{one.name} ({len(one.shape)} axes)" for one in ends]
+
+    def width_of(self, output: str) -> int | None:
+        """Return the size of the last axis of an output; None if it is left open."""
+        size = next(one.shape[-1] for one in self._session.get_outputs() if one.name == output)
+        return size if isinstance(size, int) else None
 
     def picture_input(self) -> tuple[str, list[int | None]]:
         """Return the name and shape of the only input, a picture (1, 3, h, w); None for sizes that are left open.
@@ -162,6 +211,12 @@ def _session(path: Path, _changed_ns: int, provider: Provider) -> Any:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
+    # The last level of ONNX Runtime changes the layout of convolutions, and changes it back for every SELU of ALIKED.
+    options.graph_optimization_level = (
+        runtime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        if path.name == "aliked_detector.onnx"
+        else runtime.GraphOptimizationLevel.ORT_ENABLE_ALL
+    )
     options.enable_mem_pattern = False  # the numbers of key points change with each call: saves a fifth of the memory
     names = list(dict.fromkeys([_PROVIDERS[provider], _PROVIDERS["cpu"]]))
     try:

@@ -48,14 +48,17 @@ def view_of_photograph(
     square[: size_xy[1], : size_xy[0]] = cv2.resize(picture, size_xy, interpolation=cv2.INTER_AREA)
     inside = np.zeros((TILE_PX, TILE_PX), np.bool_)
     inside[: size_xy[1] - 1, : size_xy[0] - 1] = True
-    tile = described_tile(
-        square, lambda pixels: inside[tuple(pixels.astype(int).T[::-1])], threshold=_THRESHOLD, networks=networks
-    )
-    order = np.argsort(-tile.scores, kind="stable")[:max_keypoints]
-    pixels = tile.pixels_px[order]
+
+    def strongest(pixels: NDArray[np.float64], scores: Array) -> NDArray[np.intp]:
+        order = np.argsort(-scores, kind="stable")
+        x, y = pixels[order].astype(int).T
+        return np.asarray(order[inside[y, x]][:max_keypoints])
+
+    tile = described_tile(square, strongest, threshold=_THRESHOLD, networks=networks)
+    pixels = tile.pixels_px
     back = np.array(picture.shape[1::-1]) / np.array(size_xy)
     places = (pixels / (TILE_PX / 2) - 1).astype(np.float32)
-    return PhotographView(pixels * back, np.rint(DESCRIPTOR_NORM * tile.descriptors[order]).astype(np.float32), places)
+    return PhotographView(pixels * back, np.rint(DESCRIPTOR_NORM * tile.descriptors).astype(np.float32), places)
 
 
 def match_photograph(

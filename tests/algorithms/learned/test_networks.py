@@ -23,6 +23,7 @@ from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features
+from tests.algorithms.learned.colmap_networks import EXTRACTOR, MATCHER
 
 UP = np.array([0.0, -1.0, 0.0])
 SIZE = (512, 1024)
@@ -194,6 +195,51 @@ def test_files_of_ones_own_are_used_and_checked(copied: Path) -> None:
     file.unlink()
     with pytest.raises(UsageError, match=r"lightglue_start\.onnx: this network is missing"):
         Networks(models=copied).check()
+
+
+@pytest.fixture
+def colmap(tmp_path: Path) -> Path:
+    """A folder with small networks in COLMAP's form, under any names."""
+    for source, name in ((EXTRACTOR, "aliked-n16rot.onnx"), (MATCHER, "aliked-lightglue.onnx")):
+        shutil.copy(source, tmp_path / name)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_files_of_colmap_find_and_match_key_points(panorama: NDArray[np.uint8], colmap: Path) -> None:
+    theirs = Networks(models=colmap)
+    theirs.check()
+    rolled, new_from_old = roll_panorama(panorama, 128)
+    mask = np.ones(SIZE, np.bool_)
+    first, second = (
+        extract_aliked(one, mask, up=UP, max_keypoints=1500, networks=theirs) for one in (panorama, rolled)
+    )
+    first.check()
+    matches = match_learned(first, second, networks=theirs, min_score=0.99)
+    off = angle_between(first.bearings[matches[:, 0]] @ new_from_old.T, second.bearings[matches[:, 1]])
+    assert len(matches) > 100
+    assert np.mean(off < np.deg2rad(0.2)) > 0.9  # half a pixel is 0.06°
+    view = PinholeView(np.eye(3), 256.0, np.array([256.0, 256.0]), (TILE_PX, TILE_PX))
+    photograph = view_of_photograph(sample_view(panorama, view), networks=theirs)
+    assert len(match_photograph(photograph, first, networks=theirs)) > 20
+    plain = extract_aliked(np.zeros((*SIZE, 3), np.uint8), mask, up=UP, networks=theirs)
+    assert match_learned(plain, first, networks=theirs).shape == (0, 2)
+
+
+def test_a_folder_with_some_files_of_colmap_is_reported(colmap: Path) -> None:
+    second = shutil.copy(colmap / "aliked-n16rot.onnx", colmap / "aliked-n32.onnx")
+    with pytest.raises(UsageError, match=r"one extractor in COLMAP's form, but has aliked-n16rot.onnx and aliked-n32"):
+        Networks(models=colmap).check()
+    Path(second).unlink()
+    matcher = (colmap / "aliked-lightglue.onnx").rename(colmap / "kept.bin")
+    with pytest.raises(UsageError, match=r"one matcher in COLMAP's form, but has none"):
+        Networks(models=colmap).check()
+    shutil.copy(Path(__file__).parent / "grey.onnx", matcher.with_name("aliked-lightglue.onnx"))
+    with pytest.raises(UsageError, match="has none"):
+        Networks(models=colmap).check()
+    (colmap / "aliked-n16rot.onnx").unlink()
+    with pytest.raises(UsageError, match=r"this network is missing.*or take aliked-n16rot\.onnx"):
+        Networks(models=colmap).check()
 
 
 def test_a_damaged_file_of_the_package_is_reported(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
