@@ -82,7 +82,7 @@ def measure(capture: Capture) -> tuple[list[dict[str, Any]], dict[str, float]]:
     # Half of the captures are solved as users do, half without asking the images, which leaves more cameras wrong. Half
     # of either are also given with a camera in a wrong place, because few cameras are wrong otherwise. Pictures and
     # matches of large captures cost much, so all of these are also solved with half of their images.
-    variants = ("pairs_alone" if number in (1, 2) else "asked",)
+    variants: tuple[str, ...] = ("pairs_alone" if number in (1, 2) else "asked",)
     variants += ("displaced", "halved") if large else ("displaced",) if number >= 2 else ()
     rows: list[dict[str, Any]] = []
     solved: Poses | None = None
