@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,15 @@ def test_families_that_were_left_out_are_calibrated() -> None:
     found = left_out(cameras, signs=CHOSEN)
     assert calibration_error(found, cameras.right) < 0.04
     assert area_under_roc(found, cameras.right) > 0.85
+
+
+def test_all_families_of_a_place_are_left_out_together() -> None:
+    cameras = drawn(600, np.random.default_rng(4))
+    large = (cameras.family == "a") & (np.arange(600) % 2 == 0)
+    cameras = replace(cameras, family=np.where(large, "a/large", cameras.family))
+    others = replace(cameras, right=np.where(large, ~cameras.right, cameras.right))
+    mine = cameras.place == "a"
+    np.testing.assert_array_equal(*(left_out(each, signs=CHOSEN)[mine] for each in (cameras, others)))
 
 
 def test_the_stored_evidence_is_calibrated_and_says_more_than_the_rules(tmp_path: Path) -> None:

@@ -14,9 +14,6 @@ from pathlib import Path
 from tests.benchmarks.belief.families import FAMILIES, draw
 from tests.benchmarks.belief.measuring import measure
 
-LEARNED, LEARNED_EVERY = ("house", "tour", "three"), 4
-"""Families of which one capture in four has learned matches, which take most of the time."""
-
 
 def main() -> None:
     """Measure the captures that the command line asks for."""
@@ -40,7 +37,7 @@ def main() -> None:
                 print(f"{family} {seed}: {error}", flush=True)
                 continue
             drawn_s = time.process_time() - start
-            rows, spent = measure(capture, learned=family in LEARNED and seed % LEARNED_EVERY == 2)
+            rows, spent = measure(capture)
             line = {
                 "family": family,
                 "seed": seed,

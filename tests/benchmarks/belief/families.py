@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,6 +24,9 @@ from tests.synthetic.places import large_plain_room
 
 WIDTH = 384
 SIZE_HW = (WIDTH // 2, WIDTH)
+LARGE, LEARNED = "/large", "/learned"
+"""Ends of the names of families of 12 to 20 views, and of those with learned matches where SIFT is weak."""
+_LEARNED_HW = (320, 640)  # the networks see level views, of which smaller pictures leave too little
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Capture:
     """A drawn capture.
 
     Attributes:
-        family: name of its family.
+        family: name of its family; what comes before a slash is the kind of place.
         seed: of the draw.
         pictures: panoramas by image name.
         truth: true cam_from_world by image name; without copies and cropped images, which have no true pose.
@@ -52,11 +56,20 @@ def draw(family: str, seed: int) -> Capture:
 
 
 Drawn = tuple[Pictures, Cameras, str]
+Views = Callable[[np.random.Generator], int]
 
 
-def _views(rng: np.random.Generator) -> int:
+def _few(rng: np.random.Generator) -> int:
     """Return a number of views: mostly few, because more small captures say more than few large ones."""
     return int(rng.choice([3, 4, 4, 5, 5, 6, 7, 9]))
+
+
+def _many(rng: np.random.Generator) -> int:
+    return int(rng.integers(12, 21))
+
+
+def _some(rng: np.random.Generator) -> int:
+    return int(rng.integers(8, 13))
 
 
 def _of_scene(scene: Scene, note: str = "") -> Drawn:
@@ -64,9 +77,9 @@ def _of_scene(scene: Scene, note: str = "") -> Drawn:
     return pictures, dict(zip(pictures, scene.poses, strict=True)), note or scene.name
 
 
-def _repeating(place: str) -> Callable[[int, np.random.Generator], Drawn]:
+def _repeating(place: str, number: Views = _few) -> Callable[[int, np.random.Generator], Drawn]:
     def drawn(seed: int, rng: np.random.Generator) -> Drawn:
-        views = _views(rng)
+        views = number(rng)
         visit = {
             "seed": seed,
             "views": views,
@@ -81,16 +94,16 @@ def _repeating(place: str) -> Callable[[int, np.random.Generator], Drawn]:
 
 def _plain(seed: int, rng: np.random.Generator) -> Drawn:
     place = (scenes.white_room, scenes.weak_room, large_plain_room)[rng.integers(3)]
-    return _of_scene(place(seed=seed, views=_views(rng), turned=bool(rng.random() < 0.3)))
+    return _of_scene(place(seed=seed, views=_few(rng), turned=bool(rng.random() < 0.3)))
 
 
 def _textured(seed: int, rng: np.random.Generator) -> Drawn:
     place = (scenes.poles, scenes.desk, scenes.corridor)[rng.integers(3)]
-    return _of_scene(place(seed=seed, views=_views(rng), turned=bool(rng.random() < 0.3)))
+    return _of_scene(place(seed=seed, views=_few(rng), turned=bool(rng.random() < 0.3)))
 
 
-def _outdoor(seed: int, rng: np.random.Generator) -> Drawn:
-    return _of_scene(scenes.courtyard(seed=seed, views=_views(rng), exposure=0.1 * rng.random()))
+def _outdoor(seed: int, rng: np.random.Generator, *, views: Views = _few) -> Drawn:
+    return _of_scene(scenes.courtyard(seed=seed, views=views(rng), exposure=0.1 * rng.random()))
 
 
 def _three(seed: int, rng: np.random.Generator) -> Drawn:
@@ -104,27 +117,30 @@ def _three(seed: int, rng: np.random.Generator) -> Drawn:
     )
 
 
-def _house(twins: bool) -> Callable[[int, np.random.Generator], Drawn]:
+def _house(
+    twins: bool, *, rooms: tuple[int, int] = (2, 3), size_hw: tuple[int, int] = SIZE_HW
+) -> Callable[[int, np.random.Generator], Drawn]:
     def drawn(seed: int, rng: np.random.Generator) -> Drawn:
-        house = House(seed=seed, twins=twins, per_room=int(rng.integers(2, 4)), rooms=2)
+        per_room = int(rng.integers(2, 4))
+        house = House(seed=seed, twins=twins, per_room=per_room, rooms=int(rng.integers(*rooms)))
         truth = {f"{idx:03d}.png": pose for idx, pose in enumerate(house.poses())}
-        return {name: house.view(idx, SIZE_HW) for idx, name in enumerate(truth)}, truth, f"{house.rooms} rooms"
+        return {name: house.view(idx, size_hw) for idx, name in enumerate(truth)}, truth, f"{house.rooms} rooms"
 
     return drawn
 
 
-def _walk(seed: int, rng: np.random.Generator) -> Drawn:
+def _walk(seed: int, rng: np.random.Generator, *, views: Views = _few) -> Drawn:
     twins = bool(rng.random() < 0.5)
-    first, count, step = int(rng.integers(0, 150)), _views(rng), int(rng.integers(1, 4))
+    first, count, step = int(rng.integers(0, 150)), views(rng), int(rng.integers(1, 4))
     poses = walk_poses(300, seed=seed)[first : first + step * count : step]
     truth = {f"{idx:03d}.png": pose for idx, pose in enumerate(poses)}
     pictures = {name: walk_view(pose, SIZE_HW, twins=twins, seed=seed) for name, pose in truth.items()}
     return pictures, truth, f"step {step}"
 
 
-def _suite(seed: int, rng: np.random.Generator) -> Drawn:
-    views, step = 20, int(rng.integers(1, 4))
-    poses = suite_poses(views, seed=seed)[::step][: _views(rng)]
+def _suite(seed: int, rng: np.random.Generator, *, number: Views = _few) -> Drawn:
+    views, step = 20, int(rng.integers(1, 4 if number is _few else 2))
+    poses = suite_poses(views, seed=seed)[::step][: number(rng)]
     truth = {f"{idx:03d}.png": pose for idx, pose in enumerate(poses)}
     return (
         {name: suite_view(pose, SIZE_HW, views=views, seed=seed) for name, pose in truth.items()},
@@ -133,7 +149,7 @@ def _suite(seed: int, rng: np.random.Generator) -> Drawn:
     )
 
 
-def _tour(seed: int, rng: np.random.Generator) -> Drawn:
+def _tour(seed: int, rng: np.random.Generator, *, views: Views = _few, size_hw: tuple[int, int] = SIZE_HW) -> Drawn:
     equal = bool(rng.random() < 0.5)
     style = Style(
         float(rng.uniform(6, 10)),
@@ -142,11 +158,11 @@ def _tour(seed: int, rng: np.random.Generator) -> Drawn:
         spacing=float(rng.uniform(1.4, 2.4)),
     )
     boxes, cameras = build(style, seed=1000 + seed)
-    first = int(rng.integers(0, max(1, len(cameras) - 8)))
+    first = int(rng.integers(0, max(1, len(cameras) - (8 if views is _few else 12))))
     house = lit(boxes, seed=seed)
-    chosen = cameras[first : first + _views(rng)]
+    chosen = cameras[first : first + views(rng)]
     truth = {f"{idx:03d}.png": camera.pose for idx, camera in enumerate(chosen)}
-    pictures = {name: panorama(house, pose, size_hw=SIZE_HW, rng=rng, tripod=True) for name, pose in truth.items()}
+    pictures = {name: panorama(house, pose, size_hw=size_hw, rng=rng, tripod=True) for name, pose in truth.items()}
     return pictures, truth, "equal desks" if equal else "rooms"
 
 
@@ -197,4 +213,15 @@ FAMILIES: dict[str, Callable[[int, np.random.Generator], Drawn]] = {
     "tour": _tour,
     "copies": _copies,
     "cropped": _cropped,
+    f"hall{LARGE}": _repeating("tiled_hall", _many),
+    f"colonnade{LARGE}": _repeating("colonnade", _many),
+    f"corridor{LARGE}": _repeating("doors", _many),
+    f"street{LARGE}": _repeating("facade_row", _many),
+    f"outdoor{LARGE}": partial(_outdoor, views=_many),
+    f"house{LARGE}": _house(False, rooms=(6, 7)),
+    f"walk{LARGE}": partial(_walk, views=_many),
+    f"suite{LARGE}": partial(_suite, number=_many),
+    f"tour{LEARNED}": partial(_tour, views=_some, size_hw=_LEARNED_HW),
+    f"house{LEARNED}": _house(False, rooms=(3, 6), size_hw=_LEARNED_HW),
+    f"twin_house{LEARNED}": _house(True, rooms=(3, 6), size_hw=_LEARNED_HW),
 }

@@ -29,8 +29,8 @@ SIGNS = {
 
 OF_IMAGES, OF_PAIRS = {"ratio", "share", "joint_contradicting"}, {*SIGNS} - {"ratio", "share", "joint_contradicting"}
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
-ENOUGH = {"ratio": 0.35}
-"""Values beyond which more of a measurement says nothing more, where families that were left out are predicted better
+ENOUGH = {"ratio": 0.35, "share": 0.25}
+"""Values beyond which more of a measurement says nothing more, where places that were left out are predicted better
 with such a limit than without it."""
 PENALTY = 3.0
 
@@ -52,6 +52,11 @@ class Cameras:
     doubted: NDArray[np.bool_]
     family: NDArray[Any]
     capture: NDArray[Any]
+
+    @property
+    def place(self) -> NDArray[Any]:
+        """The kind of place of each camera (N,), which its family shares with those of other sizes and matches."""
+        return np.array([family.split("/")[0] for family in self.family])
 
     def __getitem__(self, chosen: NDArray[np.bool_]) -> Cameras:
         columns = {name: values[chosen] for name, values in self.columns.items()}
@@ -101,15 +106,13 @@ def write_table(path: Path, cameras: Cameras) -> None:
 def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] = SIGNS) -> Model:
     """Return the model with the largest likelihood less a penalty on the squared losses.
 
-    Knots are quantiles of each measurement. All losses are at least 0, so that each measurement only ever counts the
-    way of its sign, and a missing one is never better than the best. Each camera counts four times: with all that was
-    measured, with the measurements of images alone, with those of pairs alone, and without any, since users may lack
-    either or both.
+    Knots are quantiles of each measurement, up to what is enough of it. All losses are at least 0, so that each
+    measurement only ever counts the way of its sign, and a missing one is never better than the best. Each camera
+    counts four times: with all that was measured, with the measurements of images alone, with those of pairs alone, and
+    without any, since users may lack either or both.
     """
-    cameras = _joined([cameras, *(_only(cameras, names) for names in (OF_IMAGES, OF_PAIRS, set[str]()))])
-    knots = {
-        name: _knots(np.minimum(cameras.columns[name], ENOUGH.get(name, np.inf)), sign) for name, sign in signs.items()
-    }
+    cameras = joined([cameras, *(_only(cameras, names) for names in (OF_IMAGES, OF_PAIRS, set[str]()))])
+    knots = {name: _knots(cameras.columns[name], sign, ENOUGH.get(name)) for name, sign in signs.items()}
     behind = np.hstack([steps_behind(cameras.columns[name], knots[name]) for name in signs])
     target = cameras.right.astype(np.float64)
 
@@ -146,7 +149,8 @@ def _only(cameras: Cameras, names: Set[str]) -> Cameras:
     return replace(cameras, columns=columns)
 
 
-def _joined(parts: Sequence[Cameras]) -> Cameras:
+def joined(parts: Sequence[Cameras]) -> Cameras:
+    """Return the cameras of several tables as one."""
     columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
     return Cameras(
         columns,
@@ -157,12 +161,14 @@ def _joined(parts: Sequence[Cameras]) -> Cameras:
     )
 
 
-def _knots(values: FloatArray, sign: int) -> tuple[float, ...]:
+def _knots(values: FloatArray, sign: int, enough: float | None) -> tuple[float, ...]:
     known = values[np.isfinite(values)]
     if not len(known):
         return (0.0, 1.0) if sign > 0 else (1.0, 0.0)
     quantiles = QUANTILES if sign > 0 else tuple(1 - one for one in QUANTILES)
     found = [float(f"{value:.4g}") for value in np.quantile(known, quantiles)]
+    if enough is not None:  # without a knot so near that the step to it would be a threshold
+        found = [*(value for value in found if value < 0.9 * enough), enough]
     distinct = [found[0]]
     for value in found[1:]:
         if sign * (value - distinct[-1]) > 1e-9:
@@ -181,10 +187,10 @@ def probabilities(model: Model, cameras: Cameras) -> FloatArray:
 
 
 def left_out(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] = SIGNS) -> FloatArray:
-    """Return the probability of each camera by the model that was fitted to all other families, (N,)."""
+    """Return the probability of each camera by the model that was fitted to all other kinds of places, (N,)."""
     found = np.full(len(cameras.right), np.nan)
-    for family in np.unique(cameras.family):
-        mine = cameras.family == family
+    for place in np.unique(cameras.place):
+        mine = cameras.place == place
         found[mine] = probabilities(fit(cameras[~mine], penalty=penalty, signs=signs), cameras[mine])
     return found
 

@@ -2,11 +2,11 @@
 
 Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
 
-FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds; FIT may also be `evidence.csv`, the
-table of the captures that docs/benchmarks.md is about. The script prints, for all families and for each, how many right
-cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model,
-and how many captures without a doubt hold a wrong camera.
-Cameras of FIT are judged by a model without their family, cameras of FRESH by the model of all of FIT. With
+FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds, or tables such as `evidence.csv`, the
+one that docs/benchmarks.md is about; `--table evidence.csv` adds new files to it. The script prints, for all families
+and for each, how many right cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures
+were measured and by the model, and how many captures without a doubt hold a wrong camera.
+Cameras of FIT are judged by a model without their kind of place, cameras of FRESH by the model of all of FIT. With
 `--coefficients pano_mvs/algorithms/poses/verification/belief/coefficients.py`, the model replaces the one in use;
 `--picture FILE` draws the reliability diagram.
 """
@@ -32,6 +32,7 @@ from tests.benchmarks.belief.fitting import (
     calibration_error,
     cameras_of,
     fit,
+    joined,
     left_out,
     probabilities,
     read_table,
@@ -48,15 +49,20 @@ UNDECIDABLE = "twin_house"
 
 
 def read(files: Sequence[Path]) -> Cameras:
-    """Return the cameras of files of measured captures, or of one table."""
-    if files[0].suffix == ".csv":
-        return read_table(files[0])
-    return cameras_of([json.loads(line) for file in files for line in file.read_text().splitlines()])
+    """Return the cameras of files of measured captures and of tables."""
+    return joined(
+        [
+            read_table(file)
+            if file.suffix == ".csv"
+            else cameras_of([json.loads(line) for line in file.read_text().splitlines()])
+            for file in files
+        ]
+    )
 
 
 def decidable(cameras: Cameras) -> Cameras:
     """Return the cameras without those of `UNDECIDABLE`."""
-    return cameras[cameras.family != UNDECIDABLE]
+    return cameras[cameras.place != UNDECIDABLE]
 
 
 def doubted(probability: FloatArray) -> NDArray[np.bool_]:
