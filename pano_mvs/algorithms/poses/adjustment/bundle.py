@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, camera_span, held
-from pano_mvs.algorithms.poses.adjustment.floor_lengths import FloorLengths
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.core.errors import UsageError
@@ -19,6 +18,54 @@ from pano_mvs.geometry import rotation_from_rotvec
 Loss: TypeAlias = Literal["cauchy", "huber"]
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
+_LENGTH_PULL = 3.0  # standard deviations at which an expected length starts to lose influence
+
+
+@dataclass(frozen=True, eq=False)
+class Lengths:
+    """Expected lengths of baselines.
+
+    Attributes:
+        pairs: (K, 2) positions of the cameras of each baseline.
+        lengths: (K,) the expected distances of their centres.
+        std: standard deviation of the logarithm of each.
+        weight: of their squared deviations relative to that of rays, in units of the scale of their loss.
+    """
+
+    pairs: NDArray[np.intp]
+    lengths: FloatArray
+    std: float
+    weight: float
+
+    def in_order(self, place: NDArray[np.intp]) -> Lengths:
+        """Return the lengths after camera n has got position place[n]."""
+        return replace(self, pairs=place[self.pairs])
+
+    def cost(self, centers: FloatArray) -> float:
+        """Return the robust loss, to be added to that of the rays."""
+        deviations, _ = self._deviations(centers)
+        return self.weight * float(np.sum(_LENGTH_PULL**2 * np.log1p((deviations / _LENGTH_PULL) ** 2)))
+
+    def add_to(self, system: ReducedCameras, centers: FloatArray, *, scale_rad: float) -> None:
+        """Add the products of derivatives to a reduced system of cameras, some of whose points both cameras see."""
+        deviations, towards = self._deviations(centers)
+        weights = self.weight * scale_rad**2 / (1 + (deviations / _LENGTH_PULL) ** 2)
+        rows = np.concatenate([towards, -towards], axis=1)  # by the centres of the first and the second camera
+        places = np.concatenate([6 * self.pairs[:, :1] + [3, 4, 5], 6 * self.pairs[:, 1:] + [3, 4, 5]], axis=1)
+        np.add.at(system.gradient, places, (weights * deviations)[:, None] * rows)
+        np.add.at(system.diagonal, places, weights[:, None] * rows**2)
+        row, column = places[:, :, None], places[:, None, :]
+        lower = row >= column
+        products = weights[:, None, None] * rows[:, :, None] * rows[:, None, :]
+        columns = np.broadcast_to(column, lower.shape)[lower]
+        np.add.at(system.band, (columns, (row - column)[lower]), products[lower])
+
+    def _deviations(self, centers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return by how many standard deviations lengths differ, and the derivatives by the first centres (K, 3)."""
+        baselines = centers[self.pairs[:, 0]] - centers[self.pairs[:, 1]]
+        squares = np.sum(baselines**2, axis=1)
+        deviations = (np.log(squares) / 2 - np.log(self.lengths)) / self.std
+        return deviations, baselines / squares[:, None] / self.std
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +94,7 @@ class Bundle:
     sigmas: FloatArray | None = None
     offsets_m: FloatArray | None = None
     units_per_m: float = 0.0
-    lengths: FloorLengths | None = None
+    lengths: Lengths | None = None
 
     @property
     def origins(self) -> FloatArray:

@@ -7,16 +7,11 @@ and cars keep a height within percents.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths
 from pano_mvs.core.arrays import FloatArray
-
-if TYPE_CHECKING:  # which imports this module
-    from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, ReducedCameras
 
 # The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
 # with this many points, and more than twice as many as any other.
@@ -26,58 +21,10 @@ _MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: other
 # panoramas, 33 of 41 are within 1.6 %, the others at 4 to 13 %, all due to wrong lengths.
 _MAX_DIFFERENCE, _MIN_STD, _MIN_PAIRS = 0.25, 0.02, 3
 _STD_OF_ONE = 0.1  # what is known of the spread of heights before any is measured
-_PULL = 3.0  # standard deviations at which a length starts to lose influence
 _MEDIAN_SQUARE = 1.39  # squared median of the length of a 2D normal vector of variance 1 in each direction
 
 
-@dataclass(frozen=True, eq=False)
-class FloorLengths:
-    """Expected lengths of baselines.
-
-    Attributes:
-        pairs: (K, 2) positions of the cameras of each baseline.
-        lengths: (K,) the expected distances of their centres.
-        std: standard deviation of the logarithm of each.
-        weight: of their squared deviations relative to that of rays, in units of the scale of their loss.
-    """
-
-    pairs: NDArray[np.intp]
-    lengths: FloatArray
-    std: float
-    weight: float
-
-    def in_order(self, place: NDArray[np.intp]) -> FloorLengths:
-        """Return the lengths after camera n has got position place[n]."""
-        return replace(self, pairs=place[self.pairs])
-
-    def cost(self, centers: FloatArray) -> float:
-        """Return the robust loss, to be added to that of the rays."""
-        deviations, _ = self._deviations(centers)
-        return self.weight * float(np.sum(_PULL**2 * np.log1p((deviations / _PULL) ** 2)))
-
-    def add_to(self, system: ReducedCameras, centers: FloatArray, *, scale_rad: float) -> None:
-        """Add the products of derivatives to a reduced system of cameras, some of whose points both cameras see."""
-        deviations, towards = self._deviations(centers)
-        weights = self.weight * scale_rad**2 / (1 + (deviations / _PULL) ** 2)
-        rows = np.concatenate([towards, -towards], axis=1)  # by the centres of the first and the second camera
-        places = np.concatenate([6 * self.pairs[:, :1] + [3, 4, 5], 6 * self.pairs[:, 1:] + [3, 4, 5]], axis=1)
-        np.add.at(system.gradient, places, (weights * deviations)[:, None] * rows)
-        np.add.at(system.diagonal, places, weights[:, None] * rows**2)
-        row, column = places[:, :, None], places[:, None, :]
-        lower = row >= column
-        products = weights[:, None, None] * rows[:, :, None] * rows[:, None, :]
-        columns = np.broadcast_to(column, lower.shape)[lower]
-        np.add.at(system.band, (columns, (row - column)[lower]), products[lower])
-
-    def _deviations(self, centers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return by how many standard deviations lengths differ, and the derivatives by the first centres (K, 3)."""
-        baselines = centers[self.pairs[:, 0]] - centers[self.pairs[:, 1]]
-        squares = np.sum(baselines**2, axis=1)
-        deviations = (np.log(squares) / 2 - np.log(self.lengths)) / self.std
-        return deviations, baselines / squares[:, None] / self.std
-
-
-def floor_lengths(bundle: Bundle, *, scale_rad: float) -> FloorLengths | None:
+def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
     """Return the lengths of baselines at which all cameras stand equally high above the floor; None if unknown.
 
     They are uncertain by the spread of the heights that were found, so that they count little where heights differ.
@@ -101,7 +48,7 @@ def floor_lengths(bundle: Bundle, *, scale_rad: float) -> FloorLengths | None:
     std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), _STD_OF_ONE / len(pairs) ** 0.5)
     baselines = np.linalg.norm(bundle.centers[pairs[:, 0]] - bundle.centers[pairs[:, 1]], axis=1)
     weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / _MEDIAN_SQUARE
-    return FloorLengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
+    return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
 
 
 def _heights(bundle: Bundle, down: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
