@@ -237,7 +237,7 @@ class Packs:
         if found.keys() != self._indexes.keys() or any(found[pack] is not self._indexes[pack] for pack in found):
             self._indexes = found
             table = _table([found[pack][1] for pack in sorted(found)])
-            self._sorted = sorted(found), table, memoryview(table["high"].copy())
+            self._sorted = sorted(found), table, table["high"].copy().data
         return True
 
 

@@ -19,7 +19,9 @@ DOOR = np.array([5.0, 0.0, 2.0])
 
 def captured(centers: list[FloatArray], rng: np.random.Generator, *, noise_deg: float = 0.02) -> Bundle:
     """Return two rooms; a camera sees the points of its own room, the one in the door (the first) those of both."""
-    points, point_idx, image_idx = [], [], []
+    points: list[FloatArray] = []
+    point_idx: list[int] = []
+    image_idx: list[int] = []
     for low, high in ROOMS:
         floor = np.column_stack([rng.uniform(low, high, 60), np.full(60, 1.5), rng.uniform(0, 4, 60)])
         walls = np.column_stack([rng.uniform(low, high, 60), rng.uniform(-1, 1.4, 60), rng.choice([0.0, 4.0], 60)])
