@@ -82,11 +82,19 @@ class Networks:
         """
         if self.models is None or any(is_file(self.models / file) for file in DIGESTS):
             return None
-        loaded = {path: open_network(path, self.provider) for path in sorted(self.models.glob("*.onnx"))}
+        loaded: dict[Path, Network] = {}
+        unusable: list[UsageError] = []
+        for path in sorted(self.models.glob("[!.]*.onnx")):
+            try:
+                loaded[path] = open_network(path, self.provider)
+            except UsageError as error:  # of another program, perhaps
+                unusable.append(error)
         found = {
             kind: [path for path, one in loaded.items() if ", ".join(one.interface) == interface]
             for kind, interface in _COLMAP.items()
         }
+        if unusable and not all(found.values()):
+            raise unusable[0]
         if not any(found.values()):
             return None
         for kind, paths in found.items():
@@ -132,6 +140,8 @@ class Networks:
                 else "tools/export_networks.py writes all files, or take aliked-n16rot.onnx and "
                 "aliked-lightglue.onnx of COLMAP 4"
             )
+            own = [name for name in DIGESTS if self.models is not None and is_file(self.models / name)]
+            remedy += f", in a folder without {' and '.join(own)}" if own else ""
             raise UsageError(f"{path}: this network is missing. {remedy}")
         if self.models is None and _digest(path, path.stat().st_mtime_ns) != DIGESTS[file]:
             raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")

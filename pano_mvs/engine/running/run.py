@@ -199,6 +199,7 @@ class Run:
                             f"{text} again and again: check the disk, or choose another cache with --cache DIR"
                         ) from error
                 self._pass.drain()
+                self._planned.clear()  # what they list may be gone
 
     def _remember(self) -> None:
         """Store keys, file digests and times for the next run; the run does not fail if that is impossible."""

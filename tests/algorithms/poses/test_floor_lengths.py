@@ -103,6 +103,17 @@ def test_cameras_at_many_heights_are_left_where_rays_put_them() -> None:
     assert off(with_lengths) < off(without) + 0.01
 
 
+@pytest.mark.parametrize("gap_m", [0.0, 0.001])
+def test_cameras_at_one_place_keep_no_other_in_place(gap_m: float) -> None:
+    """The lengths of tiny baselines would be held at whatever they are."""
+    rng = np.random.default_rng(0)
+    centers = standing(np.ones(9), rng)
+    centers[2] = centers[1] + np.array([gap_m, 0, 0])
+    true = captured(centers, rng)
+    found = adjusted(longer_second_room(true, 1.12))
+    assert size(found, 1) / size(found, 0) == pytest.approx(size(true, 1) / size(true, 0), rel=0.01)
+
+
 @pytest.mark.parametrize("what", ["tilted", "no floor", "few pairs"])
 def test_nothing_is_expected_without_evidence(what: str) -> None:
     rng = np.random.default_rng(3)
