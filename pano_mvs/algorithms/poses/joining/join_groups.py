@@ -15,8 +15,7 @@ from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
-from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, independent_count
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
 from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, max_log10_false_alarms
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
@@ -155,10 +154,9 @@ def _evidence_of_pairs(
         pose, matches = oriented(geometry, i, j)
         features = [first.pairs.features[first.pairs.names[image]] for image in (i, j)]
         p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
-        noise_rad = float(np.sqrt(np.mean(geometry.residuals_rad**2) * len(p) / independent_count(p, q)))
-        if pose_uncertainty(pose, p, q, noise_rad=noise_rad)[1] > _SAME_DIRECTION_RAD:
-            continue  # such as of distant scenery alone
         limit = max_log10_false_alarms(p, q, learned=all(one.learned for one in features))
+        if not view and view.log10_false_alarms <= limit:
+            continue  # it was refused since its direction is open, such as for distant scenery alone
         relative = joined.cameras[j] @ joined.cameras[i].inverse()
         turned = geodesic_angle(pose.rotation, relative.rotation)
         off = angle_between(pose.translation, relative.translation)
