@@ -13,8 +13,8 @@ from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
 from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.scene import Features, Poses
+from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
+from pano_mvs.scene import Features, Poses, TwoView
 from tests.algorithms.poses.joining.two_rooms import matched, room_features, room_poses, with_points_of_pairs
 
 
@@ -50,6 +50,21 @@ def test_rooms_are_joined_by_the_matches_of_all_their_pairs(turned: bool) -> Non
     turn_deg, off = _errors(poses, truth)
     assert turn_deg < 0.5
     assert off < 0.1
+
+
+def test_a_pair_that_only_lacks_a_direction_has_no_vote() -> None:
+    """Such as of distant scenery: it is as significant as a verified one, but its direction is noise."""
+    truth = room_poses(turned=True)
+    features = with_points_of_pairs(room_features(truth, door=8, false=60), truth, [("a1", "b1")], count=60)
+    views = matched(features)
+    known = views["a1", "b1"]
+    wrong = replace(known, direction=rotation_from_rotvec(np.array([0.3, 0.3, 0.3])) @ known.direction)
+    failed = TwoView.failed("its direction is open", candidates=known.candidates)
+    views["a1", "b1"] = replace(failed, log10_false_alarms=known.log10_false_alarms).with_alternatives([wrong])
+    assert known.log10_false_alarms < -20
+    poses = solve_scaled_translation(features, views, rng=np.random.default_rng(0))
+    assert len(poses.worlds) == 1
+    assert _errors(poses, truth)[1] < 0.1
 
 
 def test_unrelated_places_stay_two_groups() -> None:
