@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.paths import is_file
+from pano_mvs.core.paths import children, is_file
 
 Provider: TypeAlias = Literal["cpu", "cuda", "coreml", "directml"]
 Array: TypeAlias = NDArray[np.float32]
@@ -84,7 +84,7 @@ class Networks:
             return None
         loaded: dict[Path, Network] = {}
         unusable: list[UsageError] = []
-        for path in sorted(self.models.glob("[!.]*.onnx")):
+        for path in children(self.models, "[!.]*.onnx"):
             try:
                 loaded[path] = open_network(path, self.provider)
             except UsageError as error:  # of another program, perhaps
