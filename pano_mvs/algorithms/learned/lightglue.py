@@ -13,8 +13,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.learned.aliked import size_rad
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Network, Networks
-from pano_mvs.algorithms.learned.tiles import level_tiles
+from pano_mvs.algorithms.learned.tiles import SCALES
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -23,6 +24,8 @@ from pano_mvs.scene import Features
 LAYERS = 9
 # Of the network, as published: shares of confident key points at which it stops, and of hopeless ones that it drops.
 _DEPTH_CONFIDENCE, _WIDTH_CONFIDENCE = 0.95, 0.99
+# Only pairs with some, but not many matches in their first pairs of views get further ones.
+_FIRST_VIEWS, _FEW, _ENOUGH = 8, 100, 500
 
 
 @checks_settings
@@ -32,8 +35,8 @@ def match_learned(
     *,
     min_score: Annotated[float, Setting("minimum probability of a match", ge=0, le=1)] = 0.1,
     max_views: Annotated[
-        int, Setting("number of pairs of views that are compared, those most alike", ge=1, le=256)
-    ] = 8,
+        int, Setting("maximum number of pairs of views that are compared, those most alike", ge=1, le=784)
+    ] = 20,
     networks: Networks = PACKAGED,
 ) -> NDArray[np.int32]:
     """Match the ALIKED key points of two panoramas.
@@ -42,7 +45,7 @@ def match_learned(
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
         min_score: minimum probability of a match.
-        max_views: how many of the 256 pairs of views are compared, those with the most similar descriptors.
+        max_views: how many of the 784 pairs of views are compared at most, those with the most similar descriptors.
         networks: the network files and what executes them.
 
     Returns:
@@ -58,7 +61,9 @@ def match_learned(
     sides = [Side.of(features) for features in (first, second)]
     glue = LightGlue(networks)
     best: dict[tuple[int, int], float] = {}
-    for one, other in _alike(sides[0], sides[1], max_views):
+    for number, (one, other) in enumerate(_alike(sides[0], sides[1], max_views)):
+        if number >= _FIRST_VIEWS and not _FEW <= len(best) < _ENOUGH:
+            break  # hardly anything in common, or enough
         (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
         matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
         for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
@@ -153,7 +158,7 @@ class Side:
 
     Attributes:
         descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
-        places: (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them.
+        places: (V, N, 2) positions in the views of their own scale, −1 … 1 from edge to edge; NaN elsewhere.
     """
 
     descriptors: Array
@@ -163,10 +168,14 @@ class Side:
     def of(cls, features: Features) -> Side:
         """Return the learned key points of a panorama."""
         learned = slice(len(features) - features.learned, None)
-        tiles = level_tiles(np.array(features.up))
-        places = [tile.pixels_from_rays(features.bearings[learned]) / (TILE_PX / 2) - 1 for tile in tiles]
-        inside = [tile.contains((place + 1) * (TILE_PX / 2)) for tile, place in zip(tiles, places, strict=True)]
-        views = [np.where(seen[:, None], place, np.nan) for seen, place in zip(inside, places, strict=True)]
+        bearings, sizes = features.bearings[learned], features.sizes_rad[learned]
+        nearest = np.argmin([np.abs(sizes - size_rad(scale)) for scale in SCALES], axis=0)
+        views = []
+        for number, scale in enumerate(SCALES):
+            for tile in scale.level_tiles(np.array(features.up)):
+                pixels = tile.pixels_from_rays(bearings)
+                seen = (nearest == number) & tile.contains(pixels)
+                views.append(np.where(seen[:, None], pixels / (TILE_PX / 2) - 1, np.nan))
         return cls(features.descriptors[learned].astype(np.float32), np.array(views, np.float32))
 
     def inside(self, view: int) -> tuple[NDArray[np.intp], Array, Array]:
