@@ -185,12 +185,18 @@ class Side:
 
 
 def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
-    """Return the pairs of views with the most descriptors that are each other's nearest."""
+    """Return pairs of views with the most descriptors that are each other's nearest; those seen before count half."""
     nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
     seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
-    counts = seen[0].astype(np.int64) @ seen[1].astype(np.int64).T
-    order = np.argsort(-counts, axis=None, kind="stable")[:most]
-    return [(int(one), int(other)) for one, other in zip(*np.unravel_index(order, counts.shape), strict=True)]
+    weights = np.ones(len(nearest))
+    pairs: list[tuple[int, int]] = []
+    while len(pairs) < min(most, len(seen[0]) * len(seen[1])):
+        counts = (seen[0] * weights) @ seen[1].T.astype(np.float64)
+        counts[tuple(np.array(pairs, np.intp).reshape(-1, 2).T)] = -1.0
+        one, other = (int(each) for each in np.unravel_index(np.argmax(counts), counts.shape))
+        pairs.append((one, other))
+        weights[seen[0][one] & seen[1][other]] *= 0.5
+    return pairs
 
 
 def _one_to_one(scores: dict[tuple[int, int], float], offsets: list[int]) -> NDArray[np.int32]:
