@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -28,8 +29,8 @@ from tests.benchmarks.belief.families import LARGE, LEARNED, Capture
 from tests.benchmarks.poses.placements import judge_placements
 
 Views = dict[tuple[str, str], TwoView]
-VARIANTS = ("pairs_alone", "asked", "displaced", "halved", "thinned")
-"""Poses were solved by the pairs alone or with the images, given with one camera in a wrong place, or solved without
+VARIANTS = ("asked", "displaced", "pairs_alone", "halved", "thinned")
+"""Poses were solved with the images, given with one camera in a wrong place, or solved by the pairs alone or without
 every second or third image."""
 _LEFT_OUT = {"halved": 2, "thinned": 3}
 _LEARNED_KEYPOINTS, _LEARNED_VIEWS = 3000, 4
@@ -87,7 +88,7 @@ def measure(capture: Capture) -> tuple[list[dict[str, Any]], dict[str, float]]:
     variants: tuple[str, ...] = ("pairs_alone" if number in (1, 2) else "asked",)
     variants += ("displaced", "halved") if large else ("displaced",) if number >= 2 else ()
     variants = VARIANTS if learned else variants
-    rows: list[dict[str, Any]] = []
+    groups: list[list[dict[str, Any]]] = []
     solved: Poses | None = None
     for variant in variants:
         start = time.process_time()
@@ -106,9 +107,19 @@ def measure(capture: Capture) -> tuple[list[dict[str, Any]], dict[str, float]]:
         for group_number, group in enumerate(split_groups(poses)):
             if len(group.names) > 1:
                 found = verified_group(group, load, features=features, two_views=views, correct=not given)
-                rows += _rows(capture, variant, found, group=group_number, learned=learned)
+                rows = _rows(capture, variant, found, group=group_number, learned=learned)
+                if not any(_is_same(rows, known) for known in groups):
+                    groups.append(rows)
         spent[variant] = time.process_time() - start
-    return rows, spent
+    return [row for rows in groups for row in rows], spent
+
+
+def _is_same(rows: Sequence[Mapping[str, Any]], known: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether a group has the cameras of one that was measured in another way, and the same evidence."""
+    if [row["name"] for row in rows] != [row["name"] for row in known]:
+        return False
+    values, others = (np.array([list(row["evidence"].values()) for row in each], np.float64) for each in (rows, known))
+    return np.allclose(values, others, rtol=0.01, atol=1e-3, equal_nan=True)
 
 
 def matched(capture: Capture, *, learned: bool) -> tuple[dict[str, Features], Views]:
