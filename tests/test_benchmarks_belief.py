@@ -41,7 +41,7 @@ def drawn(count: int, rng: np.random.Generator) -> Cameras:
     return Cameras(columns, right, np.zeros(count, np.bool_), family, family)
 
 
-TABLE = Path(__file__).parent / "benchmarks" / "belief" / "evidence.csv"
+TABLE, LEARNED = (Path(__file__).parent / "benchmarks" / "belief" / name for name in ("evidence.csv", "learned.csv"))
 CHOSEN = {"ratio": 1, "place_rival": -1, "repeats": -1}
 
 
@@ -75,6 +75,15 @@ def test_the_stored_evidence_is_calibrated_and_says_more_than_the_rules(tmp_path
     assert model.right_doubted < 0.7 * rules.right_doubted
     assert model.wrong_silent < 0.8 * rules.wrong_silent
     assert FITTED.probability({}) == pytest.approx(cameras.right.mean(), abs=0.02)
+
+
+def test_cameras_with_learned_matches_are_judged_as_well_though_none_was_fitted() -> None:
+    cameras = read_table(LEARNED)
+    found = probabilities(FITTED, cameras)
+    assert area_under_roc(found, cameras.right) > 0.93
+    outcome = Outcome.of(cameras.right, doubted(found))
+    assert outcome.right_doubted < 0.25 * outcome.right
+    assert outcome.wrong_silent < 0.1 * outcome.wrong
 
 
 def test_a_measurement_only_counts_the_way_of_its_sign() -> None:

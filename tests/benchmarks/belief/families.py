@@ -26,7 +26,7 @@ WIDTH = 384
 SIZE_HW = (WIDTH // 2, WIDTH)
 LARGE, LEARNED = "/large", "/learned"
 """Ends of the names of families of 12 to 20 views, and of those with learned matches where SIFT is weak."""
-_LEARNED_HW = (320, 640)  # the networks see level views, of which smaller pictures leave too little
+_LEARNED_HW = (512, 1024)  # the networks see level views, of which smaller pictures leave too little
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,8 @@ def _suite(seed: int, rng: np.random.Generator, *, number: Views = _few) -> Draw
 
 
 def _tour(seed: int, rng: np.random.Generator, *, views: Views = _few, size_hw: tuple[int, int] = SIZE_HW) -> Drawn:
-    equal = bool(rng.random() < 0.5)
+    small = size_hw == SIZE_HW
+    equal = bool(rng.random() < (0.5 if small else 0.3))
     style = Style(
         float(rng.uniform(6, 10)),
         equal=equal,
@@ -162,7 +163,9 @@ def _tour(seed: int, rng: np.random.Generator, *, views: Views = _few, size_hw: 
     house = lit(boxes, seed=seed)
     chosen = cameras[first : first + views(rng)]
     truth = {f"{idx:03d}.png": camera.pose for idx, camera in enumerate(chosen)}
-    pictures = {name: panorama(house, pose, size_hw=size_hw, rng=rng, tripod=True) for name, pose in truth.items()}
+    pictures = {
+        name: panorama(house, pose, size_hw=size_hw, rng=rng, tripod=True, fine=small) for name, pose in truth.items()
+    }
     return pictures, truth, "equal desks" if equal else "rooms"
 
 

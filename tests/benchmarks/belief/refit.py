@@ -2,10 +2,11 @@
 
 Run it with `python -m tests.benchmarks.belief.refit FIT --fresh FRESH`.
 
-FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds, or tables such as `evidence.csv`, the
-one that docs/benchmarks.md is about; `--table evidence.csv` adds new files to it. The script prints, for all families
-and for each, how many right cameras are doubted and how many wrong ones are not, by `poses.verify` when the captures
-were measured and by the model, and how many captures without a doubt hold a wrong camera.
+FIT and FRESH are files of `tests.benchmarks.belief.collect` with different seeds, or tables: docs/benchmarks.md is
+about `evidence.csv`, which is fitted, and `learned.csv`, captures with learned matches, which is not. `--table
+evidence.csv` adds new files to the first one. The script prints, for all families and for each, how many right cameras
+are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model, and how
+many captures without a doubt hold a wrong camera.
 Cameras of FIT are judged by a model without their kind of place, cameras of FRESH by the model of all of FIT. With
 `--coefficients pano_mvs/algorithms/poses/verification/belief/coefficients.py`, the model replaces the one in use;
 `--picture FILE` draws the reliability diagram.

@@ -7,15 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.belief.verdict import MISS_COST
 from pano_mvs.algorithms.poses.verification.camera_checks import CameraChecks, correct_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
-from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, MIN_MATCHES
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -105,8 +102,7 @@ def verified_group(
     if checks.moved or checks.removed:
         moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
         poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in checks.removed.items()})
-    checked = with_camera_checks(poses, pairs, checks)
-    return VerifiedGroup(with_unconfirmed_doubts(checked, features, inside), model, checks, confirmation)
+    return VerifiedGroup(with_camera_checks(poses, pairs, checks), model, checks, confirmation)
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
@@ -144,50 +140,3 @@ def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Pose
         right_probabilities=of_each(checks.p_right),
         doubts={pairs.names[idx]: why for idx, why in sorted(checks.doubts.items())},
     )
-
-
-def with_unconfirmed_doubts(
-    poses: Poses, features: Mapping[str, Features], two_views: Mapping[tuple[str, str], TwoView]
-) -> Poses:
-    """Return poses of one group with doubts about cameras that weak or learned matches with a single image place.
-
-    Networks also match equal doors, posters and windows of different rooms, and a false pair looks as good as a true
-    one. Where matches are so few that networks are asked too, and find nothing, other pairs are often false as well: of
-    17 such pairs in a real tour and six rendered houses, four were, and most in a house of equal offices. If removing
-    such a pair divides the group, no third image confirms it; the smaller part is doubtful, or both parts of equal
-    size.
-
-    Args:
-        poses: the poses.
-        features: key points by image name.
-        two_views: verified pairs of the group.
-    """
-    position = {name: idx for idx, name in enumerate(poses.names)}
-    pairs = [pair for pair, view in two_views.items() if view and {*pair} <= {*position}]
-    doubts = dict(poses.doubts)
-    for pair in pairs:
-        kind = _kind_of_weakness(two_views[pair], features[pair[0]], features[pair[1]])
-        if not kind:
-            continue
-        edges = np.array([[position[name] for name in other] for other in pairs if other != pair]).reshape(-1, 2)
-        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(position),) * 2)
-        part = connected_components(links, directed=False)[1]
-        sides = [np.flatnonzero(part == part[position[name]]) for name in pair]
-        if part[position[pair[0]]] == part[position[pair[1]]]:
-            continue
-        fewest = min(map(len, sides))
-        for side, other in zip(sides, reversed(pair), strict=True):
-            for idx in side if len(side) == fewest else ():
-                reason = f"only {kind} matches with {other} place it, and no third image confirms them"
-                name = poses.names[idx]
-                doubts[name] = "; ".join(filter(None, (doubts.get(name), reason)))
-    return replace(poses, doubts={name: doubts[name] for name in poses.names if name in doubts})
-
-
-def _kind_of_weakness(view: TwoView, first: Features, second: Features) -> str:
-    """Return "learned" if a pair has too few other matches to verify it, "few" if learned ones do not; else ""."""
-    own = np.array([len(first) - first.learned, len(second) - second.learned])
-    others = int((view.matches_idx < own).all(axis=1).sum())
-    if others < min(MIN_MATCHES, len(view.matches_idx)):
-        return "learned"
-    return "few" if first.learned and second.learned and view.log10_false_alarms > MAX_LOG10_LEARNED else ""

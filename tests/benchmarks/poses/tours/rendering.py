@@ -85,11 +85,20 @@ def lit(boxes: Boxes, *, seed: int) -> Lit:
 
 
 def panorama(
-    house: Lit, cam_from_world: Rigid3, *, size_hw: tuple[int, int], rng: np.random.Generator, tripod: bool
+    house: Lit,
+    cam_from_world: Rigid3,
+    *,
+    size_hw: tuple[int, int],
+    rng: np.random.Generator,
+    tripod: bool,
+    fine: bool = True,
 ) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) uint8 RGB with the exposure, the noise and the tripod of a camera."""
+    """Return a picture (H, W, 3) uint8 RGB with the exposure, the noise and the tripod of a camera.
+
+    Four rays are traced for each pixel, or two if it is not to be `fine`.
+    """
     height, width = size_hw
-    offsets = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    offsets = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[:: 1 if fine else 3]
     image = np.zeros((height, width, 3))
     for offset in offsets:
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + offset
