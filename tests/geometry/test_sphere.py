@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -116,8 +117,9 @@ def test_a_picture_of_one_row_or_column_is_one(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("size", [(0, 4), (4, 0), (-1, 4)])
 def test_no_camera_has_a_size_without_pixels(size: tuple[int, int]) -> None:
-    cameras = [partial(ray_from_pixel, (1, 1)), partial(pixel_from_ray, (1, 1, 1))]
-    for call in (*cameras, ray_grid, pixel_solid_angle):
+    calls: list[Callable[[tuple[int, int]], object]] = [ray_grid, pixel_solid_angle]
+    calls += [partial(ray_from_pixel, (1, 1)), partial(pixel_from_ray, (1, 1, 1))]
+    for call in calls:
         with pytest.raises(UsageError, match=f"{size[1]}×{size[0]} pixels has no pixels"):
             call(size)
 
