@@ -13,7 +13,7 @@ from pano_mvs.api import sweep
 from pano_mvs.cli.plugins.new import KINDS, rendered
 
 PLUGINS = Path(__file__).parents[1] / "plugins"
-FILES = sorted(path for path in PLUGINS.glob("pano_mvs_*/pano_mvs_*/**/*.py"))
+FILES = sorted([*PLUGINS.glob("pano_mvs_*/pano_mvs_*/**/*.py"), *PLUGINS.glob("examples/*.py")])
 ALLOWED = {"pano_mvs.api", "pano_mvs.api.sweep"}
 
 
@@ -43,7 +43,7 @@ def test_new_plugins_import_the_api_alone(kind: str) -> None:
 
 
 def test_there_are_plugins_and_other_imports_are_seen() -> None:
-    assert {path.parent.name for path in FILES} >= {"pano_mvs_example", "pano_mvs_las", "pano_mvs_torch"}
+    assert {path.parent.name for path in FILES} >= {"examples", "pano_mvs_example", "pano_mvs_las", "pano_mvs_torch"}
     assert list(imported("import pano_mvs.io\nfrom pano_mvs.scene import Poses\nimport pano_mvs_las")) == [
         "pano_mvs.io",
         "pano_mvs.scene",

@@ -6,11 +6,13 @@ import html
 import inspect
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from pano_mvs.cli.plugins.new import rendered
 
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Raises|Yields|Frames|Pixels|Sphere|Range|Borders|Units):?$")
 _PLUGIN = re.compile(r"<!-- plugin: (\w+) (\w+) -->\n")
+_FILE = re.compile(r"<!-- file: (\S+) -->\n")
 _ENTRY = re.compile(r"^(\*{0,2}[\w., ]+?)(?: \(.*?\))?: (.*)$")
 
 
@@ -68,5 +70,7 @@ def _entry(entry: str) -> str:
 
 
 def with_plugins(markdown: str) -> str:
-    """Return a page with the plugin that `plugin new` writes in place of each comment `plugin: KIND NAME`."""
-    return _PLUGIN.sub(lambda found: f"```python\n{rendered(found[1], found[2])[0]}```\n", markdown)
+    """Return a page with code in place of `file: PATH`, and of `plugin: KIND NAME`, which `plugin new` writes."""
+    root = Path(__file__).parents[2]
+    text = _FILE.sub(lambda found: f"```python\n{(root / found[1]).read_text(encoding='utf-8')}```\n", markdown)
+    return _PLUGIN.sub(lambda found: f"```python\n{rendered(found[1], found[2])[0]}```\n", text)

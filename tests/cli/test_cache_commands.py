@@ -45,15 +45,7 @@ def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:
 def run(toy: Toy, out: str, *options: str) -> tuple[int, str]:
     result = CliRunner().invoke(
         app,
-        [
-            "run",
-            str(toy.folder / "wf.yaml"),
-            "--cache",
-            str(toy.folder / "cache"),
-            "--out",
-            str(toy.folder / out),
-            *options,
-        ],
+        [*f"run {toy.folder / 'wf.yaml'} --cache {toy.folder / 'cache'} --out {toy.folder / out}".split(), *options],
     )
     return result.exit_code, " ".join(result.output.split())
 

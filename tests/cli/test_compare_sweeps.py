@@ -37,14 +37,8 @@ def test_two_sweeps_side_by_side(pano_mvs: Command, rendered: Path) -> None:
     Path("fixed.yaml").write_text(FIXED.replace("TRUTH", truth), encoding="utf-8")
     Path("both.yaml").write_text(KNOWN, encoding="utf-8")
     arguments = (
-        "--images",
-        rendered / "images",
-        "--cache",
-        "cache",
-        "--set",
-        "depth.planes=32",
-        "--set",
-        "features.max_keypoints=1500",
+        *f"--images {rendered / 'images'} --cache cache --set depth.planes=32".split(),
+        *["--set", "features.max_keypoints=1500"],
         *ALIKE,
     )
     result = pano_mvs("run", "both.yaml", *arguments, *SAD, "--out", "both")
@@ -64,16 +58,7 @@ def test_two_sweeps_side_by_side(pano_mvs: Command, rendered: Path) -> None:
     assert {"sad/cloud.ply", "sad/range/000.tiff", "sad/confidence/000.png", "sad/preview/000.jpg"} <= files
     assert summary["views"][0]["preview"] == "preview/000.jpg"
 
-    known_poses = pano_mvs(
-        "run",
-        "known_poses",
-        *known(rendered),
-        *ALIKE[:4],
-        "--cache",
-        "cache",
-        "--out",
-        "alone",
-    )
+    known_poses = pano_mvs("run", "known_poses", *known(rendered), *ALIKE[:4], *["--cache", "cache", "--out", "alone"])
     assert known_poses.code == 0, known_poses.text
     alone = {stage["name"]: stage["run"] for stage in run_json(Path("alone"))["stages"]}
     assert alone == dict.fromkeys(alone, 0), "the same stages have the same keys, whatever is beside them"

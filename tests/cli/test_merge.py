@@ -41,14 +41,6 @@ def test_merge_names_an_image_that_it_lacks(pano_mvs: Command, tmp_path: Path) -
     assert "1 of 21 panoramas has no pose" in (tmp_path / "both/report.html").read_text(encoding="utf-8")
 
 
-def test_merge_of_blocks_without_overlap_ends_with_the_reason(pano_mvs: Command, tmp_path: Path) -> None:
-    write_block(tmp_path / "one", list(range(10)), some_world(1))
-    write_block(tmp_path / "two", list(range(10, 20)), some_world(2))
-    result = pano_mvs("merge", tmp_path / "one", tmp_path / "two", "--out", tmp_path / "both")
-    assert result.code == 2
-    assert "3 are needed" in " ".join(result.text.split())
-
-
 @pytest.fixture
 def merged(pano_mvs: Command, tmp_path: Path) -> Path:
     """Two merged blocks."""

@@ -152,22 +152,9 @@ def test_what_an_interrupted_run_had_made_is_shown(
     write_capture(tmp_path / "capture", default_room(), capture_poses(2, spread=0.4), size_hw=(32, 64))
     truth = tmp_path / "capture" / "truth"
     result = pano_mvs(
-        "run",
-        "known_poses",
-        "--images",
-        tmp_path / "capture" / "images",
-        "--out",
-        "out",
-        "--cache",
-        "c",
-        "--set",
-        f"poses.path={truth / 'poses.json'}",
-        "--set",
-        f"scores.truth={truth}",
-        "--set",
-        "depth.planes=8",
-        "--set",
-        "features.max_keypoints=200",
+        *f"run known_poses --images {tmp_path / 'capture' / 'images'} --out out --cache c".split(),
+        *f"--set poses.path={truth / 'poses.json'} --set scores.truth={truth} --set depth.planes=8".split(),
+        *["--set", "features.max_keypoints=200"],
     )
     assert result.code == 130
     summary = run_json(Path("out"))

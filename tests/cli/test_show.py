@@ -13,7 +13,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.resolve import _static_identity
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.session.session import Session, open_session, presets_folder
-from tests.cli.conftest import SMALL, Command
+from tests.cli.conftest import Command
 from tests.engine.conftest import Toy
 
 PRESETS = sorted(path.stem for path in presets_folder().glob("*.yaml"))
@@ -90,19 +90,6 @@ def test_a_resolved_workflow_depends_on_no_other_file_and_computes_nothing_again
     again = pano_mvs("run", "all.yaml", *options)
     assert again.code == 0
     assert "(nothing to compute)" in again.text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["quickstart", "known_poses"])
-def test_a_resolved_preset_computes_nothing_after_the_preset(
-    pano_mvs: Command, capture: Path, tmp_path: Path, preset: str
-) -> None:
-    small = SMALL if preset == "quickstart" else (*SMALL[:2], "--set", f"poses.path={capture / 'truth' / 'poses.json'}")
-    options = ["--cache", tmp_path / "cache", "--out", tmp_path / "out", "--executor", "serial"]
-    images = ["--images", capture / "images", *small]
-    assert pano_mvs("run", preset, *images, *options).code in (0, 3)
-    (tmp_path / "all.yaml").write_text(pano_mvs("show", preset, *images, "--resolved").text)
-    assert "(nothing to compute)" in pano_mvs("run", tmp_path / "all.yaml", *options).text
 
 
 def test_without_resolved_the_files_are_shown_as_they_are(pano_mvs: Command, toy: Toy) -> None:

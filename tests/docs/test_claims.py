@@ -103,7 +103,7 @@ def commands(command: Any, words: str = "") -> dict[str, dict[str, TyperOption]]
 
 
 COMMANDS = commands(get_command(app))
-TABLES = {"share": "share", "viewer": "view", "running": "run", "large_captures": "run"}
+TABLES = {"running": "run", "large_captures": "run"}
 """Page to the command whose options its tables list."""
 
 

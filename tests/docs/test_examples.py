@@ -135,11 +135,11 @@ def folder(tmp_path: Path) -> Path:
         (tmp_path / name).touch()
     write_tour(tmp_path / "tour", "Marzipano")
     shutil.copy(GREY_NETWORK, tmp_path / "network.onnx")
+    for path in ROOT.glob("plugins/examples/*.py"):
+        shutil.copy(path, tmp_path)
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:
-        for name, text in re.findall(r"<!-- plugin: (\w+) -->\n```python\n(.*?)```", page.read_text(), re.DOTALL):
-            (tmp_path / f"{name}.py").write_text(text)
         for name, text in re.findall(r"Save this\s+as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
             (tmp_path / name).write_text(text)
     return tmp_path

@@ -30,13 +30,6 @@ def test_every_way_to_metres_is_accepted(tmp_path: Path, line: str) -> None:
     assert result.exit_code == 0, result.output
 
 
-@pytest.mark.parametrize("command", block("commands").splitlines())
-def test_commands_run(command: str) -> None:
-    program, *arguments = command.split()
-    assert program == "pano-mvs"
-    assert CliRunner().invoke(app, arguments).exit_code == 0
-
-
 def test_every_choice_of_evidence_is_explained() -> None:
     from pano_mvs.stages.frame import LevelParams, ScaleParams
 

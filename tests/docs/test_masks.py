@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -15,20 +16,14 @@ from pano_mvs.testing.conformance import stage_contract_tests
 from tests.cli.conftest import Command, capture, pano_mvs, rendered  # noqa: F401  # fixtures
 from tests.stored import read_picture
 
-PAGE = (Path(__file__).parents[2] / "docs" / "masks.md").read_text(encoding="utf-8")
-
-
-def block(mark: str, language: str) -> str:
-    found = re.search(rf"<!-- {mark} -->\n```{language}\n(.*?)```", PAGE, re.DOTALL)
-    assert found, mark
-    return found.group(1)
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "masks.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture
 def plugin(tmp_path: Path) -> Path:
-    path = tmp_path / "vests.py"
-    path.write_text(block("plugin: vests", "python"), encoding="utf-8")
-    return path
+    (place,) = re.findall(r"<!-- file: (\S+) -->", PAGE)
+    return Path(shutil.copy(ROOT / place, tmp_path))
 
 
 def test_the_mask_on_the_page_keeps_the_contract(plugin: Path) -> None:
@@ -49,7 +44,8 @@ def test_nothing_of_a_bearer_is_left_in_any_output(pano_mvs: Command, capture: P
         picture[bearer] = (np.array([225, 95, 5]) + pattern * (1, 0.4, 0.1))[bearer].astype(np.uint8)
         cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     workflow = plugin.with_name("masked.yaml")
-    workflow.write_text(block("workflow", "yaml").replace("photos", str(capture / "images")), encoding="utf-8")
+    (text,) = re.findall(r"<!-- workflow -->\n```yaml\n(.*?)```", PAGE, re.DOTALL)
+    workflow.write_text(text.replace("photos", str(capture / "images")), encoding="utf-8")
     result = pano_mvs(
         "run", workflow, "--out", "out", "--set", "depth.planes=32", "--set", "features.max_keypoints=1500"
     )

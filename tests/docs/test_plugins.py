@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
-PAGE = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
 PLUGINS = dict(re.findall(r"<!-- plugin: (\w+) (\w+) -->\n", PAGE))
 
 
@@ -60,9 +62,8 @@ def test_the_test_on_the_page_is_what_is_written() -> None:
 
 @pytest.fixture
 def solver(tmp_path: Path) -> Path:
-    path = tmp_path / "directions.py"
-    path.write_text(block("solver"), encoding="utf-8")
-    return path
+    (place,) = re.findall(r"<!-- file: (\S+) -->", PAGE)
+    return Path(shutil.copy(ROOT / place, tmp_path))
 
 
 def test_the_pose_solver_keeps_the_contract_and_finds_the_cameras(solver: Path) -> None:
@@ -102,7 +103,7 @@ def test_the_pose_solver_names_images_without_pairs_and_refuses_a_line(solver: P
 
 @pytest.mark.slow
 def test_the_pose_solver_runs_in_its_workflow(solver: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = re.search(r"```yaml\n(pano_mvs: 1\nplugins: \[directions.py\]\n.*?)```", PAGE, re.DOTALL)
+    found = re.search(r"```yaml\n(pano_mvs: 1\nextends: .*?directions.py.*?)```", PAGE, re.DOTALL)
     assert found
     (tmp_path / "mine.yaml").write_text(found[1])
     write_capture(tmp_path / "room", default_room(), capture_poses(4, spread=0.4), size_hw=(160, 320))

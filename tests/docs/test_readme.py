@@ -41,21 +41,3 @@ def test_quickstart_command_names_a_workflow_that_is_there() -> None:
     workflow = re.search(r"pano-mvs run (\S+)", block("command: run"))
     assert workflow
     assert (README.parent / workflow.group(1)).is_file()
-
-
-def test_every_command_and_setting_that_is_named_exists() -> None:
-    text = README.read_text(encoding="utf-8")
-    runner = CliRunner()
-    for command in sorted(set(re.findall(r"pano-mvs (?:stage )?([a-z]+)", text))):
-        name = ["stage", "show"] if command == "show" else [command]
-        assert runner.invoke(app, [*name, "--help"]).exit_code == 0, command
-    for stage_name in sorted(set(re.findall(r"stage show (\S+?)`", text.replace("\n", " ")))):
-        assert runner.invoke(app, ["stage", "show", stage_name]).exit_code == 0
-    settings = [f"{name}=8" for name in re.findall(r"--set ([a-z]+\.[a-z_]+)=", text) if name != "poses.path"]
-    overrides = [argument for setting in settings for argument in ("--set", setting)]
-    assert runner.invoke(app, ["check", "quickstart", *overrides]).exit_code == 0
-
-
-@pytest.mark.parametrize("link", re.findall(r"\]\((?!http)([^)]+)\)", README.read_text(encoding="utf-8")))
-def test_links_lead_somewhere(link: str) -> None:
-    assert (README.parent / link.partition("#")[0]).exists()

@@ -149,5 +149,7 @@ def test_every_page_is_in_the_navigation() -> None:
 
 
 def test_the_site_shows_the_plugins_that_are_written() -> None:
-    page = hook("markdown_text").with_plugins("Text:\n\n<!-- plugin: filter cut -->\nMore.\n")
-    assert page == f"Text:\n\n```python\n{rendered('filter', 'cut')[0]}```\nMore.\n"
+    name = "plugins/examples/vests.py"
+    page = hook("markdown_text").with_plugins(f"Text:\n\n<!-- plugin: filter cut -->\n<!-- file: {name} -->\nMore.\n")
+    written, kept = rendered("filter", "cut")[0], (ROOT / name).read_text(encoding="utf-8")
+    assert page == f"Text:\n\n```python\n{written}```\n```python\n{kept}```\nMore.\n"

@@ -20,7 +20,6 @@ PLACEHOLDERS = {"OUT", "MODEL"}
 EXPECTED = {
     "docs/share.md": {"lobby"},
     "docs/viewer.md": {"out/quickstart"},
-    "docs/tutorials/colmap.md": {"out/two_solvers"},
     "docs/tutorials/sweep.md": {"quickstart"},
 }
 SIZE_HW = (160, 320)

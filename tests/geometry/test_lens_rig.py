@@ -158,14 +158,14 @@ def test_newton_finds_angles_where_the_radius_hardly_grows_any_more() -> None:
     assert lens.angle_from_radius(lens.radius_from_angle(angles)) == pytest.approx(angles, abs=1e-9)
 
 
-def test_a_distortion_that_folds_back_within_the_field_of_view_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"stops growing 104\.6° from the axis, but the field of view reaches 105\.0°"):
-        FisheyeLens((100, 100), (20.0, 20.0), (50.0, 50.0), (-0.1, 0.0, 0.0, 0.0), np.radians(105))
-
-
 @pytest.mark.parametrize(
-    ("focal", "angle", "message"), [((0.0, 20.0), 1.0, "must be positive"), ((20.0, 20.0), 3.2, "at most 360°")]
+    ("focal", "k1", "angle_deg", "message"),
+    [
+        (0.0, 0.0, 60, "must be positive"),
+        (20.0, 0.0, 183, "at most 360°"),
+        (20.0, -0.1, 105, r"stops growing 104\.6° from the axis, but the field of view reaches 105\.0°"),
+    ],
 )
-def test_impossible_lenses_are_refused(focal: tuple[float, float], angle: float, message: str) -> None:
+def test_impossible_lenses_are_refused(focal: float, k1: float, angle_deg: float, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        FisheyeLens((100, 100), focal, (50.0, 50.0), (0.0, 0.0, 0.0, 0.0), angle)
+        FisheyeLens((100, 100), (focal, 20.0), (50.0, 50.0), (k1, 0.0, 0.0, 0.0), np.radians(angle_deg))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
@@ -34,11 +33,6 @@ SHARES = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.5, 1.0, 1e-12, 1 - 1
 )
 def test_the_frame_is_x_right_y_down_z_forward(pixel: tuple[int, int], ray: tuple[int, int, int], what: str) -> None:
     assert ray_from_pixel(pixel, (4, 8)) == pytest.approx(np.array(ray), abs=1e-15), what
-
-
-def test_the_camera_frame_is_right_handed() -> None:
-    right, down, ahead = (ray_from_pixel(pixel, (4, 8)) for pixel in ((6, 2), (4, 4), (4, 2)))
-    assert np.cross(right, down) == pytest.approx(ahead, abs=1e-15)
 
 
 def test_the_first_pixels_centre_is_at_one_half() -> None:
@@ -116,12 +110,6 @@ def test_angle_between_keeps_the_digits_that_acos_loses() -> None:
     assert angle_between((1, 0, 0), (-1, 1e-11, 0)) == pytest.approx(np.pi - 1e-11, abs=1e-15)
 
 
-@pytest.mark.parametrize("call", [ray_grid, pixel_solid_angle])
-def test_a_size_without_pixels_is_refused(call: Callable[..., Any]) -> None:
-    with pytest.raises(UsageError, match=re.escape("0×4 pixels has no pixels")):
-        call((4, 0))
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1)])
 def test_a_picture_of_one_row_or_column_is_one(size: tuple[int, int]) -> None:
     assert ray_grid(size)[0, 0] == pytest.approx(ray_from_pixel((0.5, 0.5), size))
@@ -129,9 +117,11 @@ def test_a_picture_of_one_row_or_column_is_one(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("size", [(0, 4), (4, 0), (-1, 4)])
 def test_no_camera_has_a_size_without_pixels(size: tuple[int, int]) -> None:
-    for call in (ray_from_pixel, pixel_from_ray):
-        with pytest.raises(UsageError, match="has no pixels"):
-            call((1, 1, 1), size)
+    calls: list[Callable[[tuple[int, int]], object]] = [ray_grid, pixel_solid_angle]
+    calls += [partial(ray_from_pixel, (1, 1)), partial(pixel_from_ray, (1, 1, 1))]
+    for call in calls:
+        with pytest.raises(UsageError, match=f"{size[1]}×{size[0]} pixels has no pixels"):
+            call(size)
 
 
 def test_the_public_names_are_those_that_exist() -> None:

@@ -302,10 +302,9 @@ def test_nerfstudio_reads_the_same_points(room: Path, variant: str) -> None:
 
 
 def test_the_code_of_the_documentation_gives_points_on_the_walls(room: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text(encoding="utf-8")
-    _, _, rest = page.partition("<!-- splat bundle -->\n```python\n")
+    code = (Path(__file__).parents[2] / "plugins" / "examples" / "splat_points.py").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
-    exec(rest.partition("```")[0].replace("lobby/splat_bundle", room.as_posix()), names)
+    exec(code.replace("lobby/splat_bundle", room.as_posix()), names)
     expected = points_of(room, names["view"])
     np.testing.assert_allclose(names["in_world"], expected[np.isfinite(expected).all(axis=-1)], atol=1e-9)
 

@@ -55,21 +55,10 @@ def test_cropped_and_masked_panoramas_from_files_to_cloud(pano_mvs: Command, cap
     cv2.imwrite(str(capture / "drawn" / "000.png.png"), of_picture)
     cv2.imwrite(str(capture / "drawn" / "001.png"), of_sphere)
     result = pano_mvs(
-        "run",
-        "known_poses",
-        "--images",
-        capture / "images",
-        "--out",
-        "out",
+        *f"run known_poses --images {capture / 'images'} --out out".split(),
         *SMALL,
-        "--set",
-        "depth.planes=64",
-        "--set",
-        f"poses.path={capture / 'truth' / 'poses.json'}",
-        "--set",
-        f"scores.truth={capture / 'truth'}",
-        "--set",
-        f"images.masks={capture / 'drawn'}",
+        *f"--set depth.planes=64 --set poses.path={capture / 'truth' / 'poses.json'}".split(),
+        *f"--set scores.truth={capture / 'truth'} --set images.masks={capture / 'drawn'}".split(),
     )
     assert result.code == 0, result.text
     assert "fields count the original's pixels" in result.flat

@@ -34,18 +34,10 @@ def test_all_executors_give_the_same_bytes(rendered: Path, tmp_path: Path) -> No
     for name, options in WAYS.items():
         command = [
             sys.executable,
-            "-m",
-            "pano_mvs",
-            "run",
-            "quickstart",
-            "--images",
-            str(rendered),
+            *f"-m pano_mvs run quickstart --images {rendered}".split(),
             *SMALL,
             *options,
-            "--out",
-            str(tmp_path / f"out-{name}"),
-            "--cache",
-            str(tmp_path / f"cache-{name}"),
+            *f"--out {tmp_path / f'out-{name}'} --cache {tmp_path / f'cache-{name}'}".split(),
         ]
         done = subprocess.run(command, env=unbound, capture_output=True, text=True, check=False, timeout=600)
         assert done.returncode == 0, done.stdout + done.stderr

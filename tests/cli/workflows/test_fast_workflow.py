@@ -16,16 +16,8 @@ from tests.cli.conftest import Command, run_json
 def test_fast_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = pano_mvs(
-        "run",
-        "fast",
-        "--images",
-        rendered / "images",
-        "--out",
-        out,
-        "--set",
-        f"scores.truth={rendered / 'truth'}",
-        "--set",
-        "features.max_keypoints=1500",
+        *f"run fast --images {rendered / 'images'} --out {out} --set scores.truth={rendered / 'truth'}".split(),
+        *["--set", "features.max_keypoints=1500"],
     )
     assert result.code == 0, result.text
     assert {stage["name"]: stage["run"] for stage in run_json(out)["stages"]}["depth"] == 4

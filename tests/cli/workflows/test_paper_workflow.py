@@ -23,14 +23,7 @@ def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
     def call(*overrides: str, out: str = "out") -> dict[str, Any]:
         options = [part for override in overrides for part in ("--set", override)]
         result = pano_mvs(
-            "run",
-            "paper",
-            "--images",
-            rendered / "images",
-            "--out",
-            out,
-            "--set",
-            f"scores.truth={rendered / 'truth'}",
+            *f"run paper --images {rendered / 'images'} --out {out} --set scores.truth={rendered / 'truth'}".split(),
             *SMALL,
             *options,
         )

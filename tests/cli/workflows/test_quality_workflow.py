@@ -28,16 +28,8 @@ def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
     for preset in ("quickstart", "quality"):
         out = tmp_path / preset
         result = pano_mvs(
-            "run",
-            preset,
-            "--images",
-            rendered / "images",
-            "--out",
-            out,
-            "--cache",
-            "cache",
-            "--set",
-            f"scores.truth={rendered / 'truth'}",
+            *f"run {preset} --images {rendered / 'images'} --out {out} --cache cache".split(),
+            *f"--set scores.truth={rendered / 'truth'}".split(),
             *SMALL,
         )
         assert result.code == 0, result.text

@@ -29,19 +29,10 @@ PLAIN_RANGES = (
 def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = (
-        "splat",
-        "--images",
-        rendered / "images",
-        "--out",
-        out,
-        "--executor",
-        "serial",
+        *f"splat --images {rendered / 'images'} --out {out} --executor serial".split(),
         *SMALL,
         *PLAIN_RANGES,
-        "--set",
-        f"scores.truth={rendered / 'truth'}",
-        "--set",
-        "images.nadir_deg=20",
+        *f"--set scores.truth={rendered / 'truth'} --set images.nadir_deg=20".split(),
     )
     result = pano_mvs("run", *arguments)
     assert result.code == 0, result.text

@@ -39,16 +39,8 @@ def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     result = CliRunner().invoke(
         app,
         [
-            "run",
-            "quickstart",
-            "--images",
-            str(rendered / "images"),
-            "--out",
-            str(out / "out"),
-            "--cache",
-            str(out / "cache"),
-            "--set",
-            f"scores.truth={rendered / 'truth'}",
+            *f"run quickstart --images {rendered / 'images'} --out {out / 'out'} --cache {out / 'cache'}".split(),
+            *f"--set scores.truth={rendered / 'truth'}".split(),
             *SMALL,
         ],
     )

@@ -62,12 +62,7 @@ class Disk:
 
 def run(toy: Toy, *options: str) -> tuple[int, str]:
     command = [
-        "run",
-        str(toy.folder / "wf.yaml"),
-        "--cache",
-        str(toy.folder / "cache"),
-        "--out",
-        str(toy.folder / "out"),
+        *f"run {toy.folder / 'wf.yaml'} --cache {toy.folder / 'cache'} --out {toy.folder / 'out'}".split(),
         *options,
     ]
     result = CliRunner().invoke(app, command)

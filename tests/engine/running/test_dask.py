@@ -48,13 +48,8 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
     }
     command = [
         sys.executable,
-        "-m",
-        "distributed.cli.dask_scheduler",
-        "--port",
-        "0",
-        "--no-dashboard",
-        "--scheduler-file",
-        str(address_file),
+        *["-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"],
+        *f"--scheduler-file {address_file}".split(),
     ]
     processes = [subprocess.Popen(command, **quiet)]
     try:
@@ -64,13 +59,8 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
         for _ in range(workers):
             command = [
                 sys.executable,
-                "-m",
-                "distributed.cli.dask_worker",
-                "--scheduler-file",
-                str(address_file),
-                "--nthreads",
-                "1",
-                "--no-dashboard",
+                *f"-m distributed.cli.dask_worker --scheduler-file {address_file}".split(),
+                *["--nthreads", "1", "--no-dashboard"],
             ]
             processes.append(subprocess.Popen(command, **quiet))
         address = json.loads(address_file.read_text())["address"]

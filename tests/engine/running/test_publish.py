@@ -15,16 +15,29 @@ from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.scene import Files
 
 
-def test_item_is_the_name_without_extension_and_name_all_of_it(tmp_path: Path) -> None:
+@pytest.fixture
+def publisher(tmp_path: Path) -> Publisher:
+    return Publisher(tmp_path / "out", Store(tmp_path / "cache"))
+
+
+def delivered(publisher: Publisher, item: str, *targets: str, to: str = "") -> Mapping[str, str]:
+    path = publisher.out.with_name("text.txt")
+    path.write_text(item)
+    return publisher.publish("toy", item, publisher.store.put_value(Files(dict.fromkeys(targets, path))), to=to)
+
+
+def files_in(out: Path) -> dict[str, str]:
+    files = (path for path in out.rglob("*") if path.is_file() and path.name != OUTPUT_MARK)
+    return {path.relative_to(out).as_posix(): path.read_text() for path in files}
+
+
+def test_item_is_the_name_without_extension_and_name_all_of_it(publisher: Publisher) -> None:
     """Two images that differ in their extensions alone keep them in both."""
-    store, publisher = Store(tmp_path / "cache"), Publisher(tmp_path / "out", Store(tmp_path / "cache"))
     names = ["a/1.jpg", "b/{name}.png", "2.jpg", "2.png"]
     publisher.name_items(names)
     for name in names:
-        path = tmp_path / "text.txt"
-        path.write_text(name)
-        publisher.publish("toy", name, store.put_value(Files({"short/{item}.txt": path, "long/{name}.txt": path})))
-    assert {path: (tmp_path / "out" / path).read_text() for path in publisher.written} == {
+        delivered(publisher, name, "short/{item}.txt", "long/{name}.txt")
+    assert files_in(publisher.out) == {
         "short/a/1.txt": "a/1.jpg",
         "long/a/1.jpg.txt": "a/1.jpg",
         "short/2.jpg.txt": "2.jpg",
@@ -55,18 +68,17 @@ def test_folders_that_stale_files_leave_empty_go_with_them(tmp_path: Path) -> No
     assert out.is_dir()
 
 
-def test_an_incomplete_run_deletes_only_files_of_images_that_are_gone(tmp_path: Path) -> None:
+def test_an_incomplete_run_deletes_only_files_of_images_that_are_gone(publisher: Publisher) -> None:
     """A capture with one image that is never registered kept the files of renamed images for ever."""
-    out, store = tmp_path / "out", Store(tmp_path / "cache")
+    out = publisher.out
     names = ["range/a.tiff", "range/b.tiff", "range/b.old.tiff", "range/gone.tiff", "range/x/gone.tiff", "cloud.ply"]
     for name in names:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text(name)
-    publisher = Publisher(out, store)
-    earlier = {name: store.stat_cache.digest(out / name) for name in names}
+    earlier = {name: publisher.store.stat_cache.digest(out / name) for name in names}
     publisher.name_items(["a.png", "b.png"])
     publisher.begin_pass()
-    delivered(tmp_path, publisher, store, "a.png", "range/{item}.tiff")
+    delivered(publisher, "a.png", "range/{item}.tiff")
     assert publisher.remove_stale(earlier, complete=False) == ["range/gone.tiff", "range/x/gone.tiff"]
     assert publisher.remove_stale(earlier) == ["range/b.tiff", "range/b.old.tiff", "cloud.ply"]
 
@@ -86,79 +98,64 @@ def test_a_linked_folder_and_what_it_leads_to_stay(tmp_path: Path) -> None:
     assert (outside / "1.txt").is_file()
 
 
-def delivered(tmp_path: Path, publisher: Publisher, store: Store, item: str, *targets: str) -> Mapping[str, str]:
-    path = tmp_path / "text.txt"
-    path.write_text(item)
-    return publisher.publish("toy", item, store.put_value(Files(dict.fromkeys(targets, path))))
-
-
-def files_in(out: Path) -> dict[str, str]:
-    files = (path for path in out.rglob("*") if path.is_file() and path.name != OUTPUT_MARK)
-    return {path.relative_to(out).as_posix(): path.read_text() for path in files}
-
-
 @pytest.mark.parametrize("order", list(permutations(["1.jpg", "2.jpg", "10.jpg"])))
-def test_of_two_units_with_one_file_the_first_of_the_capture_has_it(tmp_path: Path, order: tuple[str, ...]) -> None:
+def test_of_two_units_with_one_file_the_first_of_the_capture_has_it(
+    publisher: Publisher, order: tuple[str, ...]
+) -> None:
     """Whichever was computed first: the output is the same with any number of workers."""
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
     publisher.name_items(["1.jpg", "2.jpg", "10.jpg"])
     failed: dict[str, str] = {}
     for item in order:
         own = {"2.jpg": "b.txt", "1.jpg": "fixed.txt", "10.jpg": "fixed.txt"}[item]
         try:
-            failed |= delivered(tmp_path, publisher, store, item, own, f"more/{item}.txt")
+            failed |= delivered(publisher, item, own, f"more/{item}.txt")
         except NameClashError as error:
             failed[item] = str(error)
     assert failed.keys() == {"10.jpg"}
     assert "fixed.txt is delivered for 1.jpg too. Rename one of the images" in failed["10.jpg"]
     expected = {"fixed.txt": "1.jpg", "more/1.jpg.txt": "1.jpg", "b.txt": "2.jpg", "more/2.jpg.txt": "2.jpg"}
-    assert files_in(tmp_path / "out") == expected
+    assert files_in(publisher.out) == expected
     assert publisher.published.keys() == expected.keys() == set(publisher.written)
 
 
 @pytest.mark.parametrize("order", list(permutations("abcd")))
 def test_who_delivers_of_a_chain_of_clashes_does_not_depend_on_the_order(
-    tmp_path: Path, order: tuple[str, ...]
+    publisher: Publisher, order: tuple[str, ...]
 ) -> None:
     """`c` came back if it was computed after `a` had taken `b` away, and did not if it was computed before."""
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
     publisher.name_items("abcd")
     targets = {"a": ["ab", "a"], "b": ["ab", "bc"], "c": ["bc", "c/d"], "d": ["d"]}
     failed: set[str] = set()
     for item in order:
         try:
-            losers = delivered(tmp_path, publisher, store, item, *targets[item])
+            losers = delivered(publisher, item, *targets[item])
         except NameClashError as error:
             failed.add(item)
             losers = error.losers
         assert not failed & losers.keys()
         failed |= losers.keys()
     assert failed == {"b", "c"}
-    assert files_in(tmp_path / "out") == {"ab": "a", "a": "a", "d": "d"}
+    assert files_in(publisher.out) == {"ab": "a", "a": "a", "d": "d"}
     assert publisher.published.keys() == {"ab", "a", "d"} == set(publisher.written)
     causes = publisher.refusals()
     assert causes.keys() == {("toy", "b"), ("toy", "c")}
     assert "ab is delivered for a too" in causes["toy", "b"]
     assert "bc is delivered for b too" in causes["toy", "c"]
     publisher.begin_pass()  # in which `a` has vanished
-    assert not delivered(tmp_path, publisher, store, "b", *targets["b"])
+    assert not delivered(publisher, "b", *targets["b"])
 
 
 @pytest.mark.parametrize("order", [["a", "b"], ["b", "a"]])
-def test_a_file_where_another_unit_needs_a_folder_costs_that_unit(tmp_path: Path, order: list[str]) -> None:
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
+def test_a_file_where_another_unit_needs_a_folder_costs_that_unit(publisher: Publisher, order: list[str]) -> None:
     publisher.name_items(["a", "b"])
     targets, why = {"a": "x.tiff", "b": "x.tiff/y.tiff"}, ""
     for item in order:
         try:
-            why += delivered(tmp_path, publisher, store, item, targets[item]).get("b", "")
+            why += delivered(publisher, item, targets[item]).get("b", "")
         except NameClashError as error:
             why += str(error)
     assert "x.tiff, as a file and as a folder, is delivered for a too" in why
-    assert files_in(tmp_path / "out") == {"x.tiff": "a"}
+    assert files_in(publisher.out) == {"x.tiff": "a"}
 
 
 @pytest.mark.parametrize(
@@ -169,24 +166,22 @@ def test_a_file_where_another_unit_needs_a_folder_costs_that_unit(tmp_path: Path
         (("b", "b/c.txt"), r"it delivers b as a file and b/c\.txt inside of it"),
     ],
 )
-def test_a_unit_that_names_a_file_twice_delivers_nothing(tmp_path: Path, targets: tuple[str, str], what: str) -> None:
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
+def test_a_unit_that_names_a_file_twice_delivers_nothing(
+    publisher: Publisher, targets: tuple[str, str], what: str
+) -> None:
     publisher.name_items(["a.png"])
     with pytest.raises(NameClashError, match=what):
-        delivered(tmp_path, publisher, store, "a.png", *targets)
-    assert files_in(tmp_path / "out") == {}
+        delivered(publisher, "a.png", *targets)
+    assert files_in(publisher.out) == {}
 
 
-def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(tmp_path: Path) -> None:
+def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(publisher: Publisher) -> None:
     """`000.png` beside `000.tiff/x.png`: a run that wrote TIFF files ended with a message about something else."""
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
     names = ["000.png", "000.tiff/x.png", "001.png", "b/2.v1.png", "b/2.png/y.png"]
     publisher.name_items(names)
     for name in names:
-        assert not delivered(tmp_path, publisher, store, name, "range/{item}.tiff")
-    assert files_in(tmp_path / "out") == {
+        assert not delivered(publisher, name, "range/{item}.tiff")
+    assert files_in(publisher.out) == {
         "range/000.png.tiff": "000.png",
         "range/000.tiff/x.tiff": "000.tiff/x.png",
         "range/001.tiff": "001.png",
@@ -208,16 +203,11 @@ def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(tmp_path: Pat
         "run.json/x",
     ],
 )
-def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> None:
-    store = Store(tmp_path / "cache")
-    publisher = Publisher(tmp_path / "out", store)
+def test_what_is_the_runs_own_is_not_delivered(publisher: Publisher, target: str) -> None:
     publisher.name_items(["report.html.png"])
-    path = tmp_path / "text.txt"
-    path.write_text("x")
-    files = store.put_value(Files({"a.txt": path, target: path}))
     with pytest.raises(ContractError, match="which the run itself writes"):
-        publisher.publish("toy", "report.html.png", files)
+        delivered(publisher, "report.html.png", "a.txt", target)
     assert publisher.written == []
     if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder
-        publisher.publish("toy", "report.html.png", files, to="results")
+        delivered(publisher, "report.html.png", "a.txt", target, to="results")
         assert len(publisher.written) == 2

@@ -19,27 +19,10 @@ NAMES = ["000", "001", "002", "003"]
 def test_colmap_dense_writes_models_masks_and_a_workspace_that_fuses(pano_mvs: Command, rendered: Path) -> None:
     out = Path("out")
     arguments = (
-        "run",
-        "colmap_dense",
-        "--images",
-        rendered / "images",
-        "--out",
-        out,
+        *f"run colmap_dense --images {rendered / 'images'} --out {out}".split(),
         *SMALL,
-        "--set",
-        "scores=null",
-        "--set",
-        "previews=null",
-        "--set",
-        "cloud=null",
-        "--set",
-        "ply=null",
-        "--set",
-        "smooth=null",
-        "--set",
-        "views.sources=2",
-        "--set",
-        "tracked.count=2000",
+        *[word for name in ("scores", "previews", "cloud", "ply", "smooth") for word in ("--set", f"{name}=null")],
+        *["--set", "views.sources=2", "--set", "tracked.count=2000"],
     )
     result = pano_mvs(*arguments)
     assert result.code == 0, result.text
