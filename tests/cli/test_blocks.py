@@ -30,11 +30,12 @@ from pano_mvs.session.planning import reference_times
 from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished, Warned
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.algorithms.blocks.walked_blocks import some_world
 from tests.algorithms.blocks.walked_blocks import walk as walked
 from tests.cli.conftest import Command, Outcome, deliverables, run_json
 from tests.session.merging.written_blocks import write_block
+from tests.synthetic.capture_files import write_capture
 
 BLOCKS = ("--block-size", "12", "--block-overlap", "5")
 """26 images in three blocks."""

@@ -35,11 +35,11 @@ from pano_mvs.scene import Features, Poses, RangeMap
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.poses_localise import LocaliseParams, localise
 from pano_mvs.testing.room import colors_along
-from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.stored import write_npz
 from tests.synthetic.photograph import render_photograph
+from tests.synthetic.scenes import SCENES, Scene
 
 PHOTO_WH = (800, 600)
 SOFT_WH = (480, 360)
