@@ -18,10 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
-from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality
-from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
-from pano_mvs.algorithms.panoramas import filtered
-from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality, surface_view, vertex_normals
+from pano_mvs.algorithms.panoramas import filtered, sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, is_folder, problem_of
 from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
-from pano_mvs.io.images.stereo import stereo_layout
-from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye
+from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye, stereo_layout
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace FFmpeg's messages
 
