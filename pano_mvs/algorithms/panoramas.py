@@ -1,4 +1,4 @@
-"""Panoramas as arrays: windows across the seam and the poles, sums over isotropic ones, smaller copies, and sharpness."""
+"""Panoramas as arrays: windows across seam and poles, sums over isotropic ones, smaller copies, and sharpness."""
 
 from __future__ import annotations
 

@@ -41,7 +41,6 @@ def run_decided(
     """Run a workflow, in blocks if that was decided, print progress and a summary, and return the exit code.
 
     Args:
-        session: the session.
         execution: how units are computed.
         decision: whether the capture is divided.
         as_json: print events instead.
@@ -159,7 +158,6 @@ def show_blocks(
         session: over the whole capture.
         decision: with a division.
         console: where to print.
-        show: prints the plan of a block.
 
     Raises:
         UsageError: if the session cannot be run in blocks.

@@ -208,7 +208,6 @@ class RunView:
 
         Args:
             at: its time, in seconds since 1970.
-            event: the event.
         """
         self._now = self._latest = at
         match event:

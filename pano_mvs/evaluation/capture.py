@@ -184,7 +184,6 @@ def evaluate_run(out: Path | str, truth: Path | str) -> RunEvaluation:
     """Compare the poses, the range maps and the cloud in an output folder with the truth, as far as both are there.
 
     Args:
-        out: the output folder of a run.
         truth: a folder with poses.json and depth.npz, or a part of that.
 
     Raises:

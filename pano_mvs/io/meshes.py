@@ -79,7 +79,6 @@ def write_glb_parts(
     """Write a glTF document with its binary parts as one GLB file; part n is buffer view n.
 
     Args:
-        path: the file to write.
         document: the document without `buffers` and `bufferViews`.
         parts: the contents of the buffer views.
         views: further properties of each buffer view, such as its target.

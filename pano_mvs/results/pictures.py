@@ -1,4 +1,4 @@
-"""Images embedded in a page: which are chosen, and JPEG files of limited size, as data URIs, and their colours from bad to good."""
+"""Images embedded in a page: which are chosen, JPEG files of limited size as data URIs, and colours of figures."""
 
 from __future__ import annotations
 

@@ -118,7 +118,6 @@ def run_in_blocks(session: Session, execution: Execution, decision: BlockDecisio
     If the run of a block ends early, its output is returned.
 
     Args:
-        session: the session.
         execution: how units are computed.
         decision: with a division.
         progress: receives the events.

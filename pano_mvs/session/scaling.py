@@ -93,7 +93,6 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
         run: the output of a run.
         first: name of a registered image, or coordinates `x,y,z`, as the viewer and other programs show them.
         second: the other end.
-        metres: the distance.
         group: the group of poses in which points were measured; images state theirs.
 
     Raises:
@@ -173,7 +172,6 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     ranges and clouds. A run that is in metres already is corrected: its factor changes.
 
     Args:
-        run: the output of a run.
         known: the length.
         cache: folder of the cache; None for that of the run.
 

@@ -185,7 +185,6 @@ def poses_summary(
     """Return the summary of poses.
 
     Args:
-        poses: the poses.
         rejected: image without a pose to the reason.
         doubts: registered image whose pose is doubtful to the reason.
         links: the pairs that were matched.

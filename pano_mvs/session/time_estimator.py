@@ -105,7 +105,6 @@ class StageProgress:
         The forecast counts like one finished unit of this run.
 
         Args:
-            now: the time.
             speed: factor for the forecast, see `TimeEstimator`.
         """
         longest_s = max((now - began for began in self.running.values()), default=0.0)
@@ -270,7 +269,6 @@ class Countdown:
         """Return the time to show for an estimate at a time.
 
         Args:
-            seconds_left: the estimate.
             now: the time in seconds, which must not decrease.
         """
         if math.isnan(self._shown_s):

@@ -23,7 +23,6 @@ class Room:
         surfaces: in any order.
         texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
             "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
-        seed: seed of the texture.
         lamp: position of the light; the shading is diffuse, without shadows.
         textures: texture of each surface, if they differ; empty: all have `texture`.
         sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
@@ -81,7 +80,6 @@ def render(
     """Render a panorama of the room and its ranges.
 
     Args:
-        room: the room to render.
         cam_from_world: any pose.
         size_hw: (height, width) of the panorama.
         supersample: number of rays per pixel along each side, averaged for the colour.
@@ -111,7 +109,6 @@ def colors_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatAr
     """Return the colours (N, 3) in [0, 1] that a camera at a point (3,) sees along unit rays (N, 3).
 
     Args:
-        room: the room.
         origin_in_world: centre of the camera.
         rays_in_world: directions.
         pixel_rad: width of a pixel in radians, over which fine texture fades.

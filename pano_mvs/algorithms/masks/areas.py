@@ -115,7 +115,6 @@ def areas_of_color(
 
     Args:
         picture: (H, W, 3) uint8 RGB, the full sphere.
-        color_rgb: the colour.
 
     Raises:
         UsageError: if the image is not an (H, W, 3) uint8 array, or a setting is out of bounds.

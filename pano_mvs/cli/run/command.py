@@ -28,7 +28,6 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
     """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code.
 
     Args:
-        session: the session.
         execution: how units are computed.
         as_json: print events instead.
         advise: whether to print the commands that can follow.
@@ -48,7 +47,6 @@ def run_with_events(run: Callable[[Progress], RunOutput], watch: Progress = igno
     """Call a function that runs something with a callback for events, print these, and return its output.
 
     Args:
-        run: the function.
         watch: receives the events as well.
     """
     stream = apart(sys.stdout)
@@ -70,7 +68,6 @@ def run_shown(session: Session, execution: Execution, console: Console, *, advis
     """Run a workflow, print progress and a summary, and return it.
 
     Args:
-        session: the session.
         execution: how units are computed.
         console: where to print.
         advise: whether to print the commands that can follow.

@@ -79,7 +79,6 @@ def describe_video(path: Path, stereo: StereoSetting = "auto") -> VideoInfo:
     """Return the header of a video after checking that its frames may be panoramas.
 
     Args:
-        path: the video.
         stereo: how its frames show both eyes; "auto": as its metadata say, else if square frames, or frames four times
             as wide as high, have two halves that are nearly equal.
 
