@@ -37,8 +37,8 @@ from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojec
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.pairs_and_views import pair_name
 from pano_mvs.scene.scores import NO_TRUTH
+from pano_mvs.scene.two_view import pair_name
 
 MAX_SUGGESTIONS = 12
 """Suggestions that the page shows."""

@@ -27,13 +27,12 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.session.event_log import EventLog
-from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
 from pano_mvs.session.session import Session, check_output
 from pano_mvs.session.spans import Spans
 from pano_mvs.session.sudden_exit import exit_text
-from pano_mvs.session.summarise import summarise
+from pano_mvs.session.summarise import chain_of, latest, summarise
 from pano_mvs.session.time_estimator import EventObserver
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"

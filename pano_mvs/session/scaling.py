@@ -26,11 +26,11 @@ from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView, TwoViews
-from pano_mvs.scene.pairs_and_views import Pairs, Views
 from pano_mvs.scene.panorama import StaticMasks
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.session.final_stages import chain_of
+from pano_mvs.scene.two_view import Pairs, Views
 from pano_mvs.session.session import Session, open_session
+from pano_mvs.session.summarise import chain_of
 
 WORKFLOW_FILE = "metres.yaml"
 """The workflow with the scale, in the output folder."""
