@@ -46,7 +46,6 @@ _LINE_EVERY_S = 30.0
 _SILENT_S = 60.0
 _SHOWN_FAILURES = 5
 _SHOWN_WARNINGS = 3
-_BAR_WIDTH = 20
 _KILLED = 1
 
 View = TypeVar("View", bound="RunView | BlocksView")
@@ -287,7 +286,7 @@ class RunView:
     def _stages(self) -> Table:
         table = Table("stage", "", "done", "running", "failed", "time", box=None, pad_edge=False, padding=(0, 2, 0, 0))
         for name, stage in self._estimator.stages.items():
-            bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=_BAR_WIDTH)
+            bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=20)
             running = str(len(stage.running) or "")
             failed = Text(str(self._unsuccessful[name] or ""), style="red")
             time_text = clock_text(stage.own_s(self._now)) if stage.units is not None else ""

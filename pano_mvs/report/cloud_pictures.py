@@ -31,7 +31,6 @@ VERSION = 2
 _SIZE_HW = (600, 960)
 _MAX_POINTS = 800_000
 MAX_BYTES = 300_000
-_TIMEOUT_S = 120.0
 _COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_pictures")
 
 Arrays = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]
@@ -119,7 +118,7 @@ def _drawn_apart(arrays: Arrays, seen_from: Sequence[Viewpoint], command: Sequen
         write_scene(folder, arrays, seen_from, size_hw=_SIZE_HW)
         try:
             done = subprocess.run(  # noqa: S603  # our own interpreter and module
-                [*command, name], stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_S, check=False
+                [*command, name], stdin=subprocess.DEVNULL, capture_output=True, timeout=120.0, check=False
             )
         except (OSError, subprocess.TimeoutExpired):
             return []

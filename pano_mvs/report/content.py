@@ -157,7 +157,6 @@ def date_in_words(started: str) -> str:
 MAX_THUMBNAILS = 1000
 MAX_MEASURED = 1000
 MAX_BYTES = 6_000
-_WIDTH = 160
 _THREADS = 2
 _VERSION = 2
 
@@ -196,7 +195,7 @@ def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept:
     if known is not None:
         return known
     panels = preview_panels(out_dir, view.preview, small=True)
-    return picture(np.vstack(panels), width=_WIDTH, most_bytes=MAX_BYTES, key=key) if panels else None
+    return picture(np.vstack(panels), width=160, most_bytes=MAX_BYTES, key=key) if panels else None
 
 
 MAX_ROWS = 5000

@@ -18,8 +18,7 @@ from pano_mvs.algorithms.patchmatch.full_size import (
     sources_in_grey,
     widths_between,
 )
-from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_range
-from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale, refine_plain_surfaces
+from pano_mvs.algorithms.patchmatch.refine import WindowSettings, refine_at_scale, refine_plain_surfaces, refine_range
 from pano_mvs.algorithms.scales import coarser_levels, enlarged_range_map, ranges_of_levels, reduced, sharp_halvings
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping

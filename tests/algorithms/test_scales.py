@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale
+from pano_mvs.algorithms.patchmatch.refine import refine_at_scale, refine_range
 from pano_mvs.algorithms.scales import (
     coarser_levels,
     enlarged_range_map,
