@@ -16,7 +16,6 @@ from pano_mvs.algorithms.fusion.view import (
     FusionSettings,
     FusionView,
     ViewWindow,
-    confident_view,
     held_rays,
     nearest_views,
 )
@@ -39,18 +38,6 @@ _SUPPORT_RADIUS = 2
 _MAX_SUPPORT_STEP = 0.03
 
 
-def fuse_views(views: Sequence[FusionView], settings: FusionSettings | None = None, *, threads: int = 1) -> PointCloud:
-    """Fuse views into a cloud of the points on which they agree.
-
-    `views`: the views; see `fuse_stream` for many views. `settings`: settings of the fusion; None: the defaults.
-    `threads`: number of threads; the result does not depend on it.
-
-    Raises:
-        UsageError: if a view's arrays disagree.
-    """
-    return fuse_stream([view.pose for view in views], views.__getitem__, settings, threads=threads)
-
-
 def fuse_stream(
     poses: Sequence[Rigid3],
     load: Callable[[int], FusionView],
@@ -61,16 +48,24 @@ def fuse_stream(
 ) -> PointCloud:
     """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory, and the cloud.
 
-    Each view in turn is the reference of `fuse_reference`, with its neighbours as sources. The clouds are joined in the
-    order of the views, merged by voxels if `voxel_size` is set, and smoothed (`smooth_surfaces`). The result does not
-    depend on what is cached.
+    Each view in turn is a reference, with its neighbours as sources. A pixel becomes a point if `min_views` views agree
+    on it, by the test of `check_consistency`, unless more views whose own pixel is consistent see through it than
+    agree, which means that it is in free space. A pixel that lacks a single view is accepted by the support of its
+    surface (`min_support`), unless a consistent pixel contradicts it. Points that another agreeing view sees clearly
+    better are left to that view. A point is the mean of the positions in all agreeing views, weighted by 1 / (σ r)²
+    (`merge_within`), where σ is the relative uncertainty of the range, or 1; its colour is their mean weighted by
+    cos / r², the inverse of the area that a pixel covers; its confidence is the largest of theirs, its uncertainty the
+    smallest, because views that confirm each other share their errors.
+
+    The clouds are joined in the order of the views and of their pixels, merged by voxels if `voxel_size` is set, and
+    smoothed (`smooth_surfaces`). The result does not depend on what is cached.
 
     `poses`: cam_from_world of all views. `load`: position of a view to the view; called again if it was dropped from
-    the cache. `settings`: as in `fuse_views`. `threads`: as in `fuse_views`. `join`: joins the clouds of all views,
-    such as into files; None: `join_clouds`.
+    the cache. `settings`: settings of the fusion; None: the defaults. `threads`: number of threads; the result does not
+    depend on it. `join`: joins the clouds of all views, such as into files; None: `join_clouds`.
 
     Raises:
-        UsageError: as `fuse_views`.
+        UsageError: if a view's arrays disagree.
     """
     chosen = settings or FusionSettings()
     window = ViewWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
@@ -90,42 +85,6 @@ def fuse_stream(
     if not chosen.smooth:
         return cloud
     return smooth_surfaces(cloud, np.array([pose.center for pose in poses]), threads=threads)
-
-
-def fuse_reference(
-    reference: FusionView,
-    earlier: Sequence[FusionView],
-    later: Sequence[FusionView],
-    *,
-    settings: FusionSettings | None = None,
-    threads: int = 1,
-) -> PointCloud:
-    """Return the points that one view contributes to the cloud.
-
-    A pixel becomes a point if `min_views` views agree on it, by the test of `check_consistency`, unless more views
-    whose own pixel is consistent see through it than agree, which means that it is in free space. A pixel that lacks a
-    single view is accepted by the support of its surface (`min_support`), unless a consistent pixel contradicts it.
-    Points that another agreeing view sees clearly better are left to that view. A point is the mean of the positions in
-    all agreeing views, weighted by 1 / (σ r)² (`merge_within`), where σ is the relative uncertainty of the range, or 1;
-    its colour is their mean weighted by cos / r², the inverse of the area that a pixel covers; its confidence is the
-    largest of theirs, its uncertainty the smallest, because views that confirm each other share their errors. The
-    result is not smoothed.
-
-    `reference`: the view that contributes the points. `earlier`: neighbouring views that come before it. `later`:
-    neighbouring views that come after it. `settings`: as in `fuse_views`; `neighbours` and `voxel_size` are ignored.
-    `threads`: as in `fuse_views`.
-
-    Returns:
-        The points in the world frame, in the order of the reference's pixels.
-
-    Raises:
-        UsageError: as `fuse_views`.
-    """
-    chosen = settings or FusionSettings()
-    views = [*earlier, *later]
-    window = ViewWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
-    sources = [(window, idx, _tie(is_earlier=idx < len(earlier))) for idx in range(len(views))]
-    return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads=threads)
 
 
 def join_clouds(clouds: Iterable[PointCloud]) -> PointCloud:
@@ -315,24 +274,6 @@ def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArra
 _MIN_WAITING = 1_000_000
 
 
-def thin_by_voxels(cloud: PointCloud, voxel_size: float) -> PointCloud:
-    """Thin a cloud to one point per occupied voxel, in the order in which voxels first appear.
-
-    Positions and colours are averages over the voxel, weighted by the number of views; normals are averaged and
-    normalised, or the first one if they cancel; the numbers of views and the confidences are maxima, the uncertainties
-    minima.
-
-    `cloud`: N points. `voxel_size`: edge of a voxel in scene units; voxels are aligned with the world's axes and its
-    origin.
-
-    Raises:
-        UsageError: if the voxel size is not positive.
-    """
-    grid = VoxelGrid(voxel_size)
-    grid.add(cloud)
-    return grid.cloud()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Voxels:
     """Voxels in the order in which they first appeared.
@@ -350,7 +291,13 @@ class _Voxels:
 
 
 class VoxelGrid:
-    """Adds clouds one at a time, and keeps one point per occupied voxel; memory grows with the number of voxels."""
+    """Adds clouds one at a time, and keeps one point per occupied voxel; memory grows with the number of voxels.
+
+    The points are in the order in which voxels first appear. Positions and colours are averages over the voxel,
+    weighted by the number of views; normals are averaged and normalised, or the first one if they cancel; the numbers
+    of views and the confidences are maxima, the uncertainties minima. Voxels are aligned with the world's axes and its
+    origin.
+    """
 
     def __init__(self, voxel_size: float) -> None:
         """Create an empty grid.

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.fusion import fuse
-from pano_mvs.algorithms.fusion.fuse import fuse_reference, fuse_stream, fuse_views, join_clouds, thin_by_voxels
+from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces, surface_heights
@@ -21,6 +21,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec, sines_of_grid
 from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along
+from tests.algorithms.fusion.whole import fuse_reference, fuse_views, thin_by_voxels
 from tests.algorithms.range_scenes import as_map, box_range, room_range
 from tests.known import known
 from tests.oracles import fusion as fusion_oracle
