@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
 from pano_mvs.testing.paint import Pattern, Texture, albedo_at, sky_color
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 
 _RAYS_AT_ONCE = 1 << 17
 
@@ -105,23 +105,6 @@ def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArr
     return _first_hit(room, origin_in_world, rays_in_world)[0]
 
 
-def colors_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray, *, pixel_rad: float) -> FloatArray:
-    """Return the colours (N, 3) in [0, 1] that a camera at a point (3,) sees along unit rays (N, 3).
-
-    Args:
-        origin_in_world: centre of the camera.
-        rays_in_world: directions.
-        pixel_rad: width of a pixel in radians, over which fine texture fades.
-    """
-    colors = np.zeros_like(rays_in_world)
-    for start in range(0, len(rays_in_world), _RAYS_AT_ONCE):
-        block = slice(start, start + _RAYS_AT_ONCE)
-        rays = rays_in_world[block]
-        hits = _first_hit(room, origin_in_world, rays)
-        colors[block] = _shaded(room, origin_in_world, rays, hits=hits, pixel_rad=pixel_rad)
-    return colors
-
-
 def _traced(
     room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], *, offset_px: tuple[float, float], shaded: bool = True
 ) -> tuple[FloatArray, FloatArray]:
@@ -146,13 +129,10 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        if isinstance(surface, Bounded):
-            rows = surface.towards(origin, rays)
-            distance, normal = surface.surface.hit(origin, rays[rows])
-            nearer = distance < best[rows]
-        else:
-            rows, (distance, normal) = np.arange(len(rays)), surface.hit(origin, rays)
-            nearer = distance < best
+        towards = getattr(surface, "towards", None)  # large scenes have surfaces that say which rays come near them
+        rows = np.arange(len(rays)) if towards is None else towards(origin, rays)
+        distance, normal = surface.hit(origin, rays[rows])
+        nearer = distance < best[rows]
         on = rows[nearer]
         best[on], which[on], normals[on] = distance[nearer], idx, normal[nearer]
     return best, which, normals

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
+from tests.synthetic.bounded import Bounded
 from tests.synthetic.rod import Rod
 from tests.synthetic.scenes import Painted, Scene, painted, placed
 

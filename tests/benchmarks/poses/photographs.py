@@ -33,11 +33,11 @@ from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from
 from pano_mvs.scene import Features, Poses, RangeMap
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.poses_localise import LocaliseParams, localise
-from pano_mvs.testing.room import colors_along
 from tests.algorithms.fusion.whole import fuse_views
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.stored import write_npz
+from tests.synthetic.colors import colors_along
 from tests.synthetic.photograph import render_photograph
 from tests.synthetic.scenes import SCENES, Scene
 
