@@ -26,10 +26,11 @@ from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import clock_text, duration_text, one_line, plural
 from pano_mvs.engine.running.output_lock import is_run_gone
 from pano_mvs.results.summary import BLOCKS
-from pano_mvs.session.event_log import EVENTS_FILE, EventReader
 from pano_mvs.session.progress import (
+    EVENTS_FILE,
     BlockStarted,
     Event,
+    EventReader,
     RunFinished,
     RunStarted,
     StageStarted,

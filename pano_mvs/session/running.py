@@ -26,9 +26,8 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
-from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.planning import forecast_run, remember_report
-from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
+from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted, ignore
 from pano_mvs.session.session import Session, check_output
 from pano_mvs.session.spans import Spans
 from pano_mvs.session.sudden_exit import exit_text

@@ -25,9 +25,8 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.event_log import EventReader
 from pano_mvs.session.planning import reference_times
-from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished, Warned
+from pano_mvs.session.progress import BlockStarted, Divided, Event, EventReader, RunFinished, Warned
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
 from pano_mvs.testing.room import capture_poses, default_room

@@ -11,11 +11,13 @@ import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.results.records import Finding, Tile, Verdict
-from pano_mvs.session.event_log import EVENTS_FILE, EventLog, EventReader, event_from_line, line_from_event
 from pano_mvs.session.progress import (
+    EVENTS_FILE,
     BlockStarted,
     Divided,
     Event,
+    EventLog,
+    EventReader,
     Forecast,
     KernelsCompiled,
     RunFinished,
@@ -28,7 +30,9 @@ from pano_mvs.session.progress import (
     UnitStarted,
     Warned,
     WorkersChanged,
+    event_from_line,
     ignore,
+    line_from_event,
 )
 
 VERDICT = Verdict("fair", "Finished", "Usable.", "4 units.", (Tile("images", "4"),), (Finding("fair", "blurred"),))

@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import UsageError
-from pano_mvs.session.event_log import EventReader
 from pano_mvs.session.progress import (
     Event,
+    EventReader,
     RunFinished,
     RunStarted,
     StageFinished,

@@ -17,10 +17,11 @@ from pano_mvs.cli.watch_command import BlocksView, RunView, _updated, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.session.event_log import EventLog, EventReader
 from pano_mvs.session.progress import (
     BlockStarted,
     Event,
+    EventLog,
+    EventReader,
     Forecast,
     RunFinished,
     RunStarted,
@@ -168,7 +169,7 @@ def test_killed_run_is_noticed(tmp_path: Path) -> None:
 import os, sys
 from pathlib import Path
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.session.event_log import EventLog
+from pano_mvs.session.progress import EventLog
 from pano_mvs.session.progress import Warned, ignore
 log, out = EventLog(ignore), Path(sys.argv[1])
 with output_lock(out):
