@@ -24,6 +24,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import clock_text, duration_text, one_line, plural
+from pano_mvs.engine.running.events import StageStarted, UnitFailed, UnitFinished, Warned
 from pano_mvs.engine.running.output_lock import is_run_gone
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.progress import (
@@ -33,11 +34,7 @@ from pano_mvs.session.progress import (
     EventReader,
     RunFinished,
     RunStarted,
-    StageStarted,
     TimeLeft,
-    UnitFailed,
-    UnitFinished,
-    Warned,
     WorkersChanged,
 )
 from pano_mvs.session.time_estimator import StageProgress, TimeEstimator

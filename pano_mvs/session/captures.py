@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError, PanoMvsError
 from pano_mvs.engine.planning.plan import RunOptions
+from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED
 from pano_mvs.session.merging.automatic import BlockDecision, decision_of
@@ -23,7 +24,7 @@ from pano_mvs.session.merging.block_runs import (
     remember_division,
 )
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.progress import BlockStarted, Divided, EventLog, Progress, RunFinished, Warned, ignore
+from pano_mvs.session.progress import BlockStarted, Divided, EventLog, Progress, RunFinished
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session, open_session

@@ -25,8 +25,41 @@ from pydantic import TypeAdapter, ValidationError
 from pano_mvs.core.text import json_without_controls
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.running.dispatcher import LOG_FOLDER
-from pano_mvs.engine.running.events import UnitStatus
+from pano_mvs.engine.running.events import (
+    RunEvent,
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    UnitStarted,
+    Warned,
+)
 from pano_mvs.results.records import Verdict
+
+__all__ = [
+    "EVENTS_FILE",
+    "SCHEMA",
+    "BlockStarted",
+    "Divided",
+    "Event",
+    "EventLog",
+    "EventReader",
+    "Forecast",
+    "KernelsCompiled",
+    "Progress",
+    "RunFinished",
+    "RunStarted",
+    "StageFinished",
+    "StageStarted",
+    "TimeLeft",
+    "UnitFailed",
+    "UnitFinished",
+    "UnitStarted",
+    "Warned",
+    "WorkersChanged",
+    "event_from_line",
+    "line_from_event",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,95 +144,6 @@ class WorkersChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class StageStarted:
-    """A stage begins; it has this number of units of work."""
-
-    kind: ClassVar[str] = "stage_started"
-    stage: str
-    units: int
-
-
-@dataclass(frozen=True, slots=True)
-class UnitStarted:
-    """A unit begins to be computed; `item` is empty if the stage has one unit."""
-
-    kind: ClassVar[str] = "unit_started"
-    stage: str
-    item: str
-
-
-@dataclass(frozen=True, slots=True)
-class UnitFailed:
-    """A unit failed; `UnitFinished` follows.
-
-    Attributes:
-        stage: name of the stage in the workflow.
-        item: the image, pair or view; empty if the stage has one unit.
-        cause: what went wrong and what to do about it.
-        consequence: what the result lacks because of it.
-        log: file with what the unit printed; empty if it printed nothing.
-        said: the last lines that it printed.
-    """
-
-    kind: ClassVar[str] = "unit_failed"
-    stage: str
-    item: str
-    cause: str
-    consequence: str = ""
-    log: str = ""
-    said: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class UnitFinished:
-    """A unit is done, after this time; outcomes are "run" (computed), "cached", "failed" and "blocked"."""
-
-    kind: ClassVar[str] = "unit_finished"
-    stage: str
-    item: str
-    outcome: UnitStatus
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class StageFinished:
-    """A stage is done.
-
-    Attributes:
-        stage: its name in the workflow.
-        use: the registered stage, such as `depth.sweep`.
-        units: number of units.
-        run: of these computed.
-        cached: taken from the cache.
-        failed: without a result.
-        blocked: not run, because an input failed.
-        seconds: time during which at least one of its units was being computed.
-        unit_seconds: sum over its computed units.
-        metrics: mean over its units of each figure that the stage reports.
-    """
-
-    kind: ClassVar[str] = "stage_finished"
-    stage: str
-    use: str
-    units: int
-    run: int
-    cached: int
-    failed: int
-    blocked: int
-    seconds: float
-    unit_seconds: float
-    metrics: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Warned:
-    """Something unexpected that does not stop the run."""
-
-    kind: ClassVar[str] = "warning"
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class Divided:
     """The capture is run in blocks although nobody asked for it; `reason` states in one line how and why."""
 
@@ -262,22 +206,13 @@ Event = (
     | Forecast
     | KernelsCompiled
     | WorkersChanged
-    | StageStarted
-    | UnitStarted
-    | UnitFailed
-    | UnitFinished
-    | StageFinished
+    | RunEvent
     | TimeLeft
-    | Warned
     | Divided
     | BlockStarted
     | RunFinished
 )
 Progress = Callable[[Event], None]
-
-
-def ignore(_event: Event) -> None:
-    """Do nothing with an event."""
 
 
 SCHEMA = 1

@@ -10,6 +10,15 @@ from typing import get_args
 import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.engine.running.events import (
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    UnitStarted,
+    Warned,
+    ignore,
+)
 from pano_mvs.results.records import Finding, Tile, Verdict
 from pano_mvs.session.progress import (
     EVENTS_FILE,
@@ -22,16 +31,9 @@ from pano_mvs.session.progress import (
     KernelsCompiled,
     RunFinished,
     RunStarted,
-    StageFinished,
-    StageStarted,
     TimeLeft,
-    UnitFailed,
-    UnitFinished,
-    UnitStarted,
-    Warned,
     WorkersChanged,
     event_from_line,
-    ignore,
     line_from_event,
 )
 

@@ -15,9 +15,10 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
+from pano_mvs.engine.running.events import ignore
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.progress import Event, Progress, ignore, line_from_event
+from pano_mvs.session.progress import Event, Progress, line_from_event
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session

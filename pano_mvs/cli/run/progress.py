@@ -20,16 +20,8 @@ from rich.text import Text
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.streams import apart
 from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
-from pano_mvs.session.progress import (
-    Event,
-    Forecast,
-    KernelsCompiled,
-    RunStarted,
-    StageFinished,
-    TimeLeft,
-    UnitFailed,
-    Warned,
-)
+from pano_mvs.engine.running.events import StageFinished, UnitFailed, Warned
+from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
 _COMPILING_S = 20.0
