@@ -13,7 +13,6 @@ from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap, Record
-from pano_mvs.testing.scenes import weak_room, white_room, write_scene
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.benchmarks.depth import ablation
@@ -24,6 +23,7 @@ from tests.benchmarks.depth.scores import completeness, kept_at_precision, score
 from tests.benchmarks.tables import reported
 from tests.benchmarks.uncertainty import coverage, halved_truth
 from tests.synthetic.places import window_room
+from tests.synthetic.scenes import weak_room, white_room, write_scene
 
 ROOM = Place("weak_room", 64, 2, arguments=(("seed", 1),))
 SMALL = "depth.planes=16 depth.near=1.0 depth.far=6.0"

@@ -14,8 +14,8 @@ from quickstart_pictures import IMAGES
 from pano_mvs.algorithms.stitching import stitch_lenses
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.testing.room import render
-from pano_mvs.testing.scenes import poles
 from tests.synthetic.fisheye_rig import example_rig, render_rig
+from tests.synthetic.scenes import poles
 
 SIZE_HW = (640, 1280)
 ROWS, COLUMNS = slice(220, 380), slice(890, 1030)  # around the seam on the right

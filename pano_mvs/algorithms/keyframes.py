@@ -21,7 +21,7 @@ REDUCED_HW = (128, 256)
 _PAD = 24  # columns that are repeated on each side of the seam
 _MAX_POINTS, _MIN_DISTANCE, _QUALITY = 160, 6, 0.005
 _MAX_LATITUDE_DEG = 50.0
-_WINDOW, _LEVELS = (11, 11), 3
+_WINDOW = (11, 11)
 _MAX_RETURN_PX = 0.7
 _LARGE_TURN_RAD = float(np.radians(3))
 _ROUNDS = 3
@@ -144,7 +144,7 @@ def _flow(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the positions (N, 2) of points of one image in another one, and which were found."""
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, points, guess, winSize=_WINDOW, maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        first, second, points, guess, winSize=_WINDOW, maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     return found, status.ravel() > 0
 

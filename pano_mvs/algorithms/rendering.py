@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 
 _OUTSIDE_AZIMUTH_RAD, _OUTSIDE_ELEVATION_RAD = np.deg2rad(35.0), np.deg2rad(42.0)
-_OUTSIDE_FOV_DEG, _INSIDE_FOV_DEG = 36.0, 90.0
+_OUTSIDE_FOV_DEG = 36.0
 _AWAY = -0.05  # cosine: surfaces seen nearly edge-on stay, because noisy normals would tear them
 
 
@@ -88,7 +88,7 @@ def _inside(centers: FloatArray, middle: FloatArray, up: FloatArray, *, place: s
     length = float(np.linalg.norm(towards))
     direction = towards / length if length > 1e-6 * (1 + float(np.abs(eye).max())) else forward
     title = f"From inside, where {place} was taken" if place else "From inside"
-    return Viewpoint(title, eye, eye + direction, up, fov_deg=_INSIDE_FOV_DEG)
+    return Viewpoint(title, eye, eye + direction, up, fov_deg=90.0)
 
 
 _PAPER = (238, 241, 244)

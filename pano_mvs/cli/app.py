@@ -287,7 +287,7 @@ def tour(
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the page in a browser.")] = False,
 ) -> None:
     """Make a page to walk through from panoramas: run a workflow, write the page, and open it in a browser."""
-    from pano_mvs.cli.tour_command import TourWanted, make_tour
+    from pano_mvs.cli.page_commands import TourWanted, make_tour
 
     wanted = TourWanted(images, out, workflow, tuple(overrides or ()), cache)
     raise typer.Exit(make_tour(wanted, Console(), opens=not no_open))

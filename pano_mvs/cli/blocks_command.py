@@ -16,13 +16,14 @@ from pano_mvs.cli.plan_commands import show_dry_run
 from pano_mvs.cli.run.command import interrupted_by_termination, run_shown, run_with_events, run_workflow
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.text import plural
+from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
 from pano_mvs.session.commands import run_command
 from pano_mvs.session.merging.automatic import BlockDecision
 from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, split_images
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.progress import Divided, Event, RunFinished, Warned
+from pano_mvs.session.progress import Divided, Event, RunFinished
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
@@ -41,7 +42,6 @@ def run_decided(
     """Run a workflow, in blocks if that was decided, print progress and a summary, and return the exit code.
 
     Args:
-        session: the session.
         execution: how units are computed.
         decision: whether the capture is divided.
         as_json: print events instead.
@@ -159,7 +159,6 @@ def show_blocks(
         session: over the whole capture.
         decision: with a division.
         console: where to print.
-        show: prints the plan of a block.
 
     Raises:
         UsageError: if the session cannot be run in blocks.

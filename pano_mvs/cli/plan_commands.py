@@ -51,7 +51,6 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
     """Print for each stage the units that are cached and that would or may run, with reasons, times and sizes.
 
     Args:
-        session: the session.
         console: where to print.
         workers: number of units at a time, for the times; 0 for the default.
         threads: of each worker; 0 for the default.
@@ -208,7 +207,6 @@ def show_status(
         out: output folder of a workflow; None for the default.
         overrides: settings.
         images: folder of panoramas.
-        cache: folder of the cache.
         console: where to print.
 
     Raises:

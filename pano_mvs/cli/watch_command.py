@@ -24,19 +24,17 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import clock_text, duration_text, one_line, plural
+from pano_mvs.engine.running.events import StageStarted, UnitFailed, UnitFinished, Warned
 from pano_mvs.engine.running.output_lock import is_run_gone
 from pano_mvs.results.summary import BLOCKS
-from pano_mvs.session.event_log import EVENTS_FILE, EventReader
 from pano_mvs.session.progress import (
+    EVENTS_FILE,
     BlockStarted,
     Event,
+    EventReader,
     RunFinished,
     RunStarted,
-    StageStarted,
     TimeLeft,
-    UnitFailed,
-    UnitFinished,
-    Warned,
     WorkersChanged,
 )
 from pano_mvs.session.time_estimator import StageProgress, TimeEstimator
@@ -46,7 +44,6 @@ _LINE_EVERY_S = 30.0
 _SILENT_S = 60.0
 _SHOWN_FAILURES = 5
 _SHOWN_WARNINGS = 3
-_BAR_WIDTH = 20
 _KILLED = 1
 
 View = TypeVar("View", bound="RunView | BlocksView")
@@ -208,7 +205,6 @@ class RunView:
 
         Args:
             at: its time, in seconds since 1970.
-            event: the event.
         """
         self._now = self._latest = at
         match event:
@@ -288,7 +284,7 @@ class RunView:
     def _stages(self) -> Table:
         table = Table("stage", "", "done", "running", "failed", "time", box=None, pad_edge=False, padding=(0, 2, 0, 0))
         for name, stage in self._estimator.stages.items():
-            bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=_BAR_WIDTH)
+            bar = ProgressBar(total=max(1, stage.units or 1), completed=stage.done, width=20)
             running = str(len(stage.running) or "")
             failed = Text(str(self._unsuccessful[name] or ""), style="red")
             time_text = clock_text(stage.own_s(self._now)) if stage.units is not None else ""

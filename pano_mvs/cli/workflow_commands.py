@@ -25,7 +25,6 @@ def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None
     """Write the text of a workflow and of the files that it extends, or one file with all settings.
 
     Args:
-        session: the workflow.
         out: the file; None for the standard output.
         resolved: whether to write one file with all settings.
 

@@ -101,7 +101,6 @@ def file_inside(folder: Path, name: str, *, through_links: bool = False) -> Path
     """Return the path of a file below a folder, whose name a file states; None if there is no such file below it.
 
     Args:
-        folder: the folder.
         name: of the file, with forward slashes.
         through_links: whether links may lead out of the folder, as in folders of images.
     """

@@ -95,7 +95,6 @@ def children(folder: Path, pattern: str = "*") -> list[Path]:
     """Return the entries of a folder, sorted by name; none if it cannot be listed.
 
     Args:
-        folder: the folder.
         pattern: of the names to return, such as "*.yaml".
     """
     try:

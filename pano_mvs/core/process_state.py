@@ -146,7 +146,6 @@ class _Holder:
     """A module or a class of a library, and what it holds.
 
     Attributes:
-        owner: the module or the class.
         values: all its values, in their order.
         guarded: those of its values by name that may not be replaced.
         codes: its functions that are written in Python, with their code.
@@ -219,7 +218,6 @@ class _Libraries:
 
     Attributes:
         modules: the modules by name.
-        holders: the modules and their classes.
         views: the values of each, as they are at any time.
         values: the values of all, in this order, when this was recorded.
         functions: the functions that are written in Python.

@@ -1,9 +1,10 @@
-"""Make text of files, plugins and exceptions safe to print: not too long, and without control characters."""
+"""Make text of files, plugins and exceptions safe to print: not too long, and without control characters; XML."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from xml.etree import ElementTree
 
 MAX_CHARACTERS = 2000
 """Maximum length of a message."""
@@ -92,3 +93,18 @@ def json_without_controls(line: str) -> str:
 
 def _escaped(sign: str) -> str:
     return f"\\x{ord(sign):02x}" if ord(sign) < 256 else f"\\u{ord(sign):04x}"
+
+
+def xml_root(data: bytes) -> ElementTree.Element:
+    """Return the root of an XML document.
+
+    Raises:
+        ValueError: if it is not well-formed, or declares entities, which could expand without limit.
+    """
+    plain = data.replace(b"\0", b"").upper()  # of UTF-16, too
+    if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
+        raise ValueError("it declares XML entities")
+    try:
+        return ElementTree.fromstring(data)  # noqa: S314  # without entities
+    except (ElementTree.ParseError, LookupError) as error:  # LookupError: an encoding that nobody knows
+        raise ValueError(f"not an XML file ({error})") from error

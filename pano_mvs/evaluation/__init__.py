@@ -4,9 +4,10 @@ Four functions compare and return records; nothing here prints. `summary()` of a
 figures as text, `to_json()` as JSON values.
 
 Layout: `inputs` finds estimates and truth and pairs them; `poses`, `ranges` and `clouds` score them, each without the
-others' results (`ranges` and `clouds` use `poses.alignment`); `capture` and `run` combine them.
+others' results (`ranges` and `clouds` use `poses.alignment`); `capture` combines them.
 """
 
+from pano_mvs.evaluation.capture import RunEvaluation, evaluate_run
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation, evaluate_cloud
 from pano_mvs.evaluation.clouds.pictures import write_error_clouds, write_overview
 from pano_mvs.evaluation.poses import PoseEvaluation, evaluate_poses
@@ -14,7 +15,6 @@ from pano_mvs.evaluation.ranges.error_picture import write_depth_pictures
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.evaluation.ranges.tables import depth_summary, write_depth_csv, write_depth_scores
 from pano_mvs.evaluation.ranges.view_scores import BadLimit, ScoreSettings
-from pano_mvs.evaluation.run import RunEvaluation, evaluate_run
 
 __all__ = [
     "BadLimit",

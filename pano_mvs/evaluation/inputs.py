@@ -143,7 +143,6 @@ class RangeFile:
     """The range map of one image in a file.
 
     Attributes:
-        path: the file.
         key: name of the array in an NPZ file; "" for the only array, or the one named range or depth.
         unit: factor from the file's numbers to the unit that `read` returns.
         confidence_path: an 8-bit PNG with the confidence, or None.

@@ -13,7 +13,6 @@ class TextTable:
 
     Attributes:
         headings: one per column.
-        rows: the cells of each row.
         baselines: a second line of each row, such as the scores of a constant; empty without.
     """
 

@@ -141,8 +141,6 @@ class LensRig:
     """Two fisheye lenses that are fixed to each other, and the distance at which they are stitched.
 
     Attributes:
-        names: names of the lenses.
-        lenses: the lenses.
         lens_from_rig: pose of each lens, in metres; the mean of their centres is the origin of the rig.
         stitch_distance_m: D, may be inf.
         blend_deg: width of the strip around the seam in which the panorama mixes both pictures.

@@ -1,4 +1,4 @@
-"""The arrays of a textured mesh, as writers take them."""
+"""Textured meshes as GLB, OBJ and USDZ files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene import FilePart
 
 
 class TexturedArrays(NamedTuple):
@@ -79,7 +80,6 @@ def write_glb_parts(
     """Write a glTF document with its binary parts as one GLB file; part n is buffer view n.
 
     Args:
-        path: the file to write.
         document: the document without `buffers` and `bufferViews`.
         parts: the contents of the buffer views.
         views: further properties of each buffer view, such as its target.
@@ -132,6 +132,79 @@ def _document(mesh: TexturedArrays, mime_type: str) -> dict[str, Any]:
             {"bufferView": 2, "componentType": _UINT32, "count": mesh.faces.size, "type": "SCALAR"},
         ],
     }
+
+
+_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), _UINT32: np.dtype("<u4"), _FLOAT: np.dtype("<f4")}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+
+
+def read_glb(path: Path) -> tuple[TexturedArrays, NDArray[np.uint8]]:
+    """Return the mesh and the texture, (H, W, 3) RGB, of a GLB file as `write_glb` writes it.
+
+    Raises:
+        InputError: if the file cannot be read or has another layout.
+    """
+    data = FilePart(path).read_bytes()
+    try:
+        document, binary = _chunks(data)
+        (primitive,) = document["meshes"][0]["primitives"]
+        arrays = [
+            _accessor(document, binary, number)
+            for number in (
+                primitive["attributes"]["POSITION"],
+                primitive["attributes"]["TEXCOORD_0"],
+                primitive["indices"],
+            )
+        ]
+        material = document["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
+        image = document["images"][document["textures"][material["index"]]["source"]]
+        encoded = np.frombuffer(_view(document, binary, image["bufferView"]), np.uint8)
+        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        faces = arrays[2].reshape(-1, 3).astype(np.int32)
+        fits = len(arrays[0]) == len(arrays[1]) and (not faces.size or int(faces.max()) < len(arrays[0]))
+    except (ValueError, KeyError, IndexError, TypeError, struct.error, cv2.error) as error:
+        raise InputError(
+            f"{path}: not a textured mesh of pano-mvs in GLB ({error!r}). Run the workflow again"
+        ) from error
+    if picture is None or not fits:
+        raise InputError(f"{path}: its texture or its triangles are damaged. Run the workflow again")
+    texture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+    return TexturedArrays(arrays[0].astype(np.float32), arrays[1].astype(np.float32), faces), texture
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the description and the binary part of a GLB file."""
+    magic, version, length = struct.unpack_from("<III", data)
+    if (magic, version, length) != (_MAGIC, _VERSION, len(data)):
+        raise ValueError("its header is not that of a complete GLB file, version 2")
+    chunks: dict[int, bytes] = {}
+    offset = 12
+    while offset < len(data):
+        size, kind = struct.unpack_from("<II", data, offset)
+        chunks[kind] = data[offset + 8 : offset + 8 + size]
+        offset += 8 + size
+    document: dict[str, Any] = json.loads(chunks[_JSON])
+    return document, chunks[_BINARY]
+
+
+def _view(document: dict[str, Any], binary: bytes, number: int) -> bytes:
+    view = document["bufferViews"][number]
+    start = view.get("byteOffset", 0)
+    if view.get("byteStride"):
+        raise ValueError("interleaved arrays")
+    return binary[start : start + view["byteLength"]]
+
+
+def _accessor(document: dict[str, Any], binary: bytes, number: int) -> NDArray[Any]:
+    accessor = document["accessors"][number]
+    width = _WIDTHS[accessor["type"]]
+    values = np.frombuffer(
+        _view(document, binary, accessor["bufferView"]),
+        _TYPES[accessor["componentType"]],
+        accessor["count"] * width,
+        accessor.get("byteOffset", 0),
+    )
+    return values.reshape(-1, width) if width > 1 else values
 
 
 _LINES_AT_ONCE = 1 << 16

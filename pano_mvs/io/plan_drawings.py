@@ -20,7 +20,6 @@ class PlanDrawing:
     """A plan of one storey, in its own coordinates: x right, y up.
 
     Attributes:
-        title: of the drawing.
         walls: (N, 2, 2) ends of the wall lines.
         cameras: name to (x, y).
         box: ((left, bottom), (right, top)).

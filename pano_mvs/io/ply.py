@@ -215,7 +215,6 @@ class PlyPoints:
     """The vertices of a PLY file, which need not fit in memory.
 
     Attributes:
-        path: the file.
         count: number of vertices.
         has_normals: whether they have nx, ny, nz.
         vertices: (N,) with a field for each property, memory-mapped if the file is binary; as in the file.

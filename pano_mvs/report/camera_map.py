@@ -99,7 +99,6 @@ class CameraMap:
     Attributes:
         title: the caption, which names the direction of view.
         text: description for screen readers.
-        size_wh: of the view box.
         links: in drawing order: rejected links, then weak ones, then strong ones.
         cameras: (x, y, name, position of the label or None).
         doubtful: (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others.

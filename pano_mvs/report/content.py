@@ -37,8 +37,8 @@ from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojec
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
-from pano_mvs.scene.pairs_and_views import pair_name
 from pano_mvs.scene.scores import NO_TRUTH
+from pano_mvs.scene.two_view import pair_name
 
 MAX_SUGGESTIONS = 12
 """Suggestions that the page shows."""
@@ -157,7 +157,6 @@ def date_in_words(started: str) -> str:
 MAX_THUMBNAILS = 1000
 MAX_MEASURED = 1000
 MAX_BYTES = 6_000
-_WIDTH = 160
 _THREADS = 2
 _VERSION = 2
 
@@ -196,7 +195,7 @@ def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept:
     if known is not None:
         return known
     panels = preview_panels(out_dir, view.preview, small=True)
-    return picture(np.vstack(panels), width=_WIDTH, most_bytes=MAX_BYTES, key=key) if panels else None
+    return picture(np.vstack(panels), width=160, most_bytes=MAX_BYTES, key=key) if panels else None
 
 
 MAX_ROWS = 5000

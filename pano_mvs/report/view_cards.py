@@ -226,7 +226,6 @@ def view_cards(
     Args:
         out_dir: the output folder, whose previews replace values that are not in the cache.
         views: of the run.
-        results: the values.
         kept: the earlier page's.
         groups: number of the group of each image; the views of a group share a colour scale, those of different groups
             do not, because their units of length differ. None: one group.

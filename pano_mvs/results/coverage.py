@@ -77,7 +77,6 @@ def coverage(values: StoredValues, names: Sequence[str]) -> dict[str, ViewCovera
     """Return what some views of a run see; each is compared with its eight nearest cameras that have a range map.
 
     Args:
-        values: of the run.
         names: of the views; those without a range map or a pose are left out.
     """
     poses = values.poses

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -157,11 +158,8 @@ def _beside_constant(values: Mapping[str, Any], metric: str) -> str:
 
 def median(values: list[Any]) -> float | None:
     """Return the median of the finite values, or None."""
-    numbers = sorted(float(value) for value in values if _is_number(value))
-    if not numbers:
-        return None
-    middle = len(numbers) // 2
-    return numbers[middle] if len(numbers) % 2 else (numbers[middle - 1] + numbers[middle]) / 2
+    numbers = [float(value) for value in values if _is_number(value)]
+    return statistics.median(numbers) if numbers else None
 
 
 def _is_number(value: Any) -> bool:

@@ -28,7 +28,6 @@ class CameraGroup:
     """The cameras of a group, with what is known of their surroundings.
 
     Attributes:
-        number: of the group.
         poses: of the group; the centres of all cameras are known.
         centers: (N, 3), N > 1.
         neighbours: (N, K) up to six nearest other cameras, nearest first.

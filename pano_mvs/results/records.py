@@ -42,7 +42,6 @@ class WorkflowSummary(Entry):
     """The workflow that ran.
 
     Attributes:
-        name: of the workflow.
         path: its file; empty if it was not read from one.
         overrides: settings that were changed, as `STAGE.PARAM=VALUE`.
     """

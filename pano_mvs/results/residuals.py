@@ -22,9 +22,7 @@ class Histogram:
     """Counts over bins of equal width, the last of which includes all larger values.
 
     Attributes:
-        counts: of each bin.
         upper_deg: nominal end of the last bin.
-        median_deg: of all values.
         p95_deg: 95 % are smaller.
         total: number of values.
     """

@@ -293,7 +293,6 @@ def load(out: str | Path, *, cache: str | Path | None = None) -> RunOutput:
     ('Finished', (512, 1024, 3))
 
     Args:
-        out: the output folder.
         cache: folder of the cache that the run used; None for $PANO_MVS_CACHE, or else the one that run.json names. It
             need not exist: exported files are read in its place.
 

@@ -63,7 +63,6 @@ class StoredValues:
         Args:
             out: the output folder.
             summary: its run.json.
-            store: the cache that the run used.
 
         Raises:
             StoreError: if the list of runs is damaged.

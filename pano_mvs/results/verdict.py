@@ -32,7 +32,6 @@ def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_wi
     """Return the verdict on a run; unknown figures are left out.
 
     Args:
-        summary: of the run.
         residuals: of the points, if known.
         image_width: of the panoramas in pixels, if known.
     """
@@ -171,7 +170,6 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
     """Return what is wrong or doubtful in a run, the worst first.
 
     Args:
-        summary: of the run.
         residual_px: median reprojection residual in pixels of the panoramas, if known.
     """
     found = [

@@ -3,13 +3,12 @@
 from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features, GlobalDescriptor, WeakImage, WeakImages
 from pano_mvs.scene.files import Files
-from pano_mvs.scene.pairs_and_views import Pairs, Views
 from pano_mvs.scene.panorama import Panorama
 from pano_mvs.scene.poses import Pose, Poses
 from pano_mvs.scene.range_map import RangeMap
 from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
 from pano_mvs.scene.scores import Scores
-from pano_mvs.scene.two_view import TwoView, TwoViews
+from pano_mvs.scene.two_view import Pairs, TwoView, TwoViews, Views
 
 __all__ = [
     "Axis",

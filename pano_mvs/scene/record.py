@@ -32,7 +32,6 @@ class FilePart:
     """A native file that is part of a record.
 
     Attributes:
-        path: the file.
         external: True for a user's own file, of which the store only has the digest; False for a file that a stage
             wrote to its scratch folder, which the store takes over.
         digest: digest of the bytes, which the engine sets when it passes the part to a stage.

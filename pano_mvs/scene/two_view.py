@@ -1,4 +1,4 @@
-"""Two-view geometry: verified matches of two panoramas and their relative pose."""
+"""Pairs of images, views with their neighbours, and two-view geometry: verified matches and a relative pose."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
-from pano_mvs.scene.record import Axis, Part, Parts, Record, require_array
+from pano_mvs.core.file_names import PAIR_SEPARATOR
+from pano_mvs.scene.record import Axis, Part, Parts, Record, require, require_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,3 +192,58 @@ class TwoViews(Record):
                 own[int(number)][array] = part
         views = [TwoView.from_parts(one) for one in own]
         return cls(dict(zip(map(pair_from_name, meta["pairs"]), views, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs(Record):
+    """The pairs of images to match: the index of the pair axis.
+
+    Attributes:
+        pairs: (first, second) image names, first before second in the capture's order; no pair twice.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+
+    pairs: tuple[tuple[str, str], ...]
+
+    def check(self) -> None:
+        """Raise ContractError if a pair is listed twice or an image is paired with itself."""
+        require(len({frozenset(pair) for pair in self.pairs}) == len(self.pairs), self, "a pair is listed twice")
+        require(all(first != second for first, second in self.pairs), self, "an image is paired with itself")
+
+    def units(self) -> Mapping[str, tuple[str, ...]]:
+        """Return the pair axis: unit name to its two images."""
+        return {pair_name(first, second): (first, second) for first, second in self.pairs}
+
+
+@dataclass(frozen=True, eq=False)
+class Views(Record):
+    """The reference images to sweep, each with its source images, best first: the index of the view axis.
+
+    Attributes:
+        neighbours: reference image name to the names of its source images.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+
+    neighbours: dict[str, tuple[str, ...]]
+
+    def check(self) -> None:
+        """Raise ContractError if an image is its own neighbour."""
+        for reference, sources in self.neighbours.items():
+            require(reference not in sources, self, f"{reference} is its own neighbour")
+
+    def units(self) -> Mapping[str, tuple[str, ...]]:
+        """Return the view axis: reference to its neighbours in order."""
+        return {reference: tuple(sources) for reference, sources in self.neighbours.items()}
+
+
+def pair_name(first: str, second: str) -> str:
+    """Return the name of the unit of two images."""
+    return f"{first}{PAIR_SEPARATOR}{second}"
+
+
+def pair_from_name(name: str) -> tuple[str, str]:
+    """Return the two images of a unit of the pair axis."""
+    first, _, second = name.partition(PAIR_SEPARATOR)
+    return first, second

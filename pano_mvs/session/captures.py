@@ -9,9 +9,9 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError, PanoMvsError
 from pano_mvs.engine.planning.plan import RunOptions
+from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED
-from pano_mvs.session.event_log import EventLog
 from pano_mvs.session.merging.automatic import BlockDecision, decision_of
 from pano_mvs.session.merging.block_runs import (
     BlockRun,
@@ -24,7 +24,7 @@ from pano_mvs.session.merging.block_runs import (
     remember_division,
 )
 from pano_mvs.session.merging.merge import merge_outputs
-from pano_mvs.session.progress import BlockStarted, Divided, Progress, RunFinished, Warned, ignore
+from pano_mvs.session.progress import BlockStarted, Divided, EventLog, Progress, RunFinished
 from pano_mvs.session.python_calls import names_arguments, overrides_from_settings
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.session import Session, open_session
@@ -118,7 +118,6 @@ def run_in_blocks(session: Session, execution: Execution, decision: BlockDecisio
     If the run of a block ends early, its output is returned.
 
     Args:
-        session: the session.
         execution: how units are computed.
         decision: with a division.
         progress: receives the events.

@@ -20,7 +20,6 @@ def run_command(session: Session, *options: str) -> str:
     It can be pasted in the current folder.
 
     Args:
-        session: the session.
         options: further options.
     """
     name, is_preset = _workflow_word(session)

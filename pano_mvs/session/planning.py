@@ -129,7 +129,6 @@ def plan_session(session: Session, *, workers: int = 0, threads: int = 0) -> Run
     """Return what the run of an open session would compute.
 
     Args:
-        session: the session.
         workers: number of units at a time, for the estimate; 0 for the default.
         threads: of each worker; 0 for the default.
     """

@@ -1,4 +1,4 @@
-"""Events of a run, as typed records for a callback.
+"""Events of a run, as typed records for a callback, and as JSON lines in the file `logs/events.jsonl`.
 
 A run reports `RunStarted` and `Forecast`, then events of its stages and units, and now and then `KernelsCompiled` and
 `TimeLeft`, then `RunFinished`, which is always the last. Stages overlap. If a damaged file is found in the cache, the
@@ -10,14 +10,56 @@ run, and at last `RunFinished` with its own output folder.
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, BinaryIO, ClassVar, get_args
 
+from pydantic import TypeAdapter, ValidationError
+
+from pano_mvs.core.text import json_without_controls
 from pano_mvs.engine.planning.forecast import StageForecast
-from pano_mvs.engine.running.events import UnitStatus
+from pano_mvs.engine.running.dispatcher import LOG_FOLDER
+from pano_mvs.engine.running.events import (
+    RunEvent,
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    UnitStarted,
+    Warned,
+)
 from pano_mvs.results.records import Verdict
+
+__all__ = [
+    "EVENTS_FILE",
+    "SCHEMA",
+    "BlockStarted",
+    "Divided",
+    "Event",
+    "EventLog",
+    "EventReader",
+    "Forecast",
+    "KernelsCompiled",
+    "Progress",
+    "RunFinished",
+    "RunStarted",
+    "StageFinished",
+    "StageStarted",
+    "TimeLeft",
+    "UnitFailed",
+    "UnitFinished",
+    "UnitStarted",
+    "Warned",
+    "WorkersChanged",
+    "event_from_line",
+    "line_from_event",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,95 +144,6 @@ class WorkersChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class StageStarted:
-    """A stage begins; it has this number of units of work."""
-
-    kind: ClassVar[str] = "stage_started"
-    stage: str
-    units: int
-
-
-@dataclass(frozen=True, slots=True)
-class UnitStarted:
-    """A unit begins to be computed; `item` is empty if the stage has one unit."""
-
-    kind: ClassVar[str] = "unit_started"
-    stage: str
-    item: str
-
-
-@dataclass(frozen=True, slots=True)
-class UnitFailed:
-    """A unit failed; `UnitFinished` follows.
-
-    Attributes:
-        stage: name of the stage in the workflow.
-        item: the image, pair or view; empty if the stage has one unit.
-        cause: what went wrong and what to do about it.
-        consequence: what the result lacks because of it.
-        log: file with what the unit printed; empty if it printed nothing.
-        said: the last lines that it printed.
-    """
-
-    kind: ClassVar[str] = "unit_failed"
-    stage: str
-    item: str
-    cause: str
-    consequence: str = ""
-    log: str = ""
-    said: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class UnitFinished:
-    """A unit is done, after this time; outcomes are "run" (computed), "cached", "failed" and "blocked"."""
-
-    kind: ClassVar[str] = "unit_finished"
-    stage: str
-    item: str
-    outcome: UnitStatus
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class StageFinished:
-    """A stage is done.
-
-    Attributes:
-        stage: its name in the workflow.
-        use: the registered stage, such as `depth.sweep`.
-        units: number of units.
-        run: of these computed.
-        cached: taken from the cache.
-        failed: without a result.
-        blocked: not run, because an input failed.
-        seconds: time during which at least one of its units was being computed.
-        unit_seconds: sum over its computed units.
-        metrics: mean over its units of each figure that the stage reports.
-    """
-
-    kind: ClassVar[str] = "stage_finished"
-    stage: str
-    use: str
-    units: int
-    run: int
-    cached: int
-    failed: int
-    blocked: int
-    seconds: float
-    unit_seconds: float
-    metrics: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Warned:
-    """Something unexpected that does not stop the run."""
-
-    kind: ClassVar[str] = "warning"
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class Divided:
     """The capture is run in blocks although nobody asked for it; `reason` states in one line how and why."""
 
@@ -253,13 +206,8 @@ Event = (
     | Forecast
     | KernelsCompiled
     | WorkersChanged
-    | StageStarted
-    | UnitStarted
-    | UnitFailed
-    | UnitFinished
-    | StageFinished
+    | RunEvent
     | TimeLeft
-    | Warned
     | Divided
     | BlockStarted
     | RunFinished
@@ -267,5 +215,101 @@ Event = (
 Progress = Callable[[Event], None]
 
 
-def ignore(_event: Event) -> None:
-    """Do nothing with an event."""
+SCHEMA = 1
+EVENTS_FILE = f"{LOG_FOLDER}/events.jsonl"
+
+
+def line_from_event(event: Event) -> str:
+    """Return an event, with the present time, as a line of JSON."""
+    fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
+    if isinstance(event, RunStarted):
+        fields["schema"] = SCHEMA
+    fields |= {field.name: getattr(event, field.name) for field in dataclasses.fields(event)}
+    if isinstance(event, RunFinished) and event.verdict is None:
+        del fields["verdict"], fields["doubts"]
+    return json_without_controls(json.dumps(fields, ensure_ascii=False, allow_nan=False, default=_json_value)) + "\n"
+
+
+def _json_value(value: Any) -> Any:
+    """Return what JSON does not know as a JSON value: records as objects, all else as text."""
+    is_record = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    return dataclasses.asdict(value) if is_record else str(value)
+
+
+def event_from_line(line: str | bytes) -> tuple[float, Event] | None:
+    """Return an event and its time; None if the line is not an event that this version knows."""
+    try:
+        fields = json.loads(line)
+        return float(fields["time"]), _adapters()[fields["event"]].validate_python(fields)
+    except (ValueError, KeyError, TypeError, ValidationError):
+        return None
+
+
+@cache
+def _adapters() -> dict[str, TypeAdapter[Any]]:
+    return {kind.kind: TypeAdapter(kind) for kind in get_args(Event)}
+
+
+class EventLog:
+    """A progress callback that passes events on, and appends them to the file; a run does not fail if that fails."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._stream: BinaryIO | None = None
+        self._held: bytes | None = b""  # before the file is opened
+
+    def __call__(self, event: Event) -> None:
+        """Write an event, and pass it on; the last one closes the file."""
+        self._write(event)
+        if isinstance(event, RunFinished):
+            self._close()
+        self._progress(event)
+
+    def open(self, out: Path) -> None:
+        """Begin a new file, with the events so far; another run in this folder must not be writing."""
+        path, held, self._held = out / EVENTS_FILE, self._held, None
+        try:
+            path.parent.mkdir(exist_ok=True)
+            path.unlink(missing_ok=True)  # a reader sees that it is another file
+            self._stream = path.open("xb", buffering=0)
+            self._stream.write(held or b"")
+        except OSError as error:
+            self._close()
+            self._progress(Warned(f"{path} cannot be written, so that `pano-mvs watch` shows nothing: {error}"))
+
+    def _close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def _write(self, event: Event) -> None:
+        if self._held is not None:
+            self._held += line_from_event(event).encode()
+        elif self._stream is not None:
+            with suppress(OSError):  # such as a full disk, which ends the run with a message of its own
+                self._stream.write(line_from_event(event).encode())
+
+
+class EventReader:
+    """Reads the file while a run appends to it."""
+
+    def __init__(self, out: Path) -> None:
+        self._path = out / EVENTS_FILE
+        self._first = b""  # the first line: another run begins another file
+        self._position = 0
+
+    def read(self) -> tuple[bool, list[tuple[float, Event]]]:
+        """Return whether another run has begun since the last call, and the events that are new, with their times.
+
+        Raises:
+            OSError: if there is no file.
+        """
+        with self._path.open("rb") as stream:
+            first = stream.readline()
+            is_new = first != self._first
+            self._first, self._position = first, 0 if is_new else self._position
+            stream.seek(self._position)
+            data = stream.read()
+        whole = data[: data.rfind(b"\n") + 1]
+        self._position += len(whole)
+        return is_new, [event for line in whole.splitlines() if (event := event_from_line(line)) is not None]

@@ -19,6 +19,7 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.report.page import gather_report, write_page
@@ -26,14 +27,12 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED, RUN_JSON, RunSummary
 from pano_mvs.scene import Poses, RangeMap
-from pano_mvs.session.event_log import EventLog
-from pano_mvs.session.final_stages import chain_of, latest
 from pano_mvs.session.planning import forecast_run, remember_report
-from pano_mvs.session.progress import Progress, RunFinished, RunStarted, ignore
+from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted
 from pano_mvs.session.session import Session, check_output
 from pano_mvs.session.spans import Spans
 from pano_mvs.session.sudden_exit import exit_text
-from pano_mvs.session.summarise import summarise
+from pano_mvs.session.summarise import chain_of, latest, summarise
 from pano_mvs.session.time_estimator import EventObserver
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
@@ -112,7 +111,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
     log = EventLog(progress)
     report = Spans(log) if otel else log
     observer = EventObserver(report, executor=executor)
-    observer.report(
+    observer(
         RunStarted(
             workflow=session.workflow.name,
             stages=tuple(session.graph.order),
@@ -130,7 +129,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         with output_lock(session.out):
             log.open(session.out)
             if (forecast := forecast_run(run)) is not None:
-                observer.report(forecast)
+                observer(forecast)
             summary, values = _execute(run, started, clock)
         end = _finished(summary, end)
         return RunOutput(session.out, summary, values, written=tuple(run.result.written))
@@ -175,7 +174,7 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
             repairs += 1
             if repairs > _MAX_REPAIRS:
                 raise
-            run.observer.warn(str(error))
+            run.observer(Warned(str(error)))
 
 
 def _finished(summary: RunSummary, end: RunFinished) -> RunFinished:

@@ -26,11 +26,11 @@ from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView, TwoViews
-from pano_mvs.scene.pairs_and_views import Pairs, Views
 from pano_mvs.scene.panorama import StaticMasks
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.session.final_stages import chain_of
+from pano_mvs.scene.two_view import Pairs, Views
 from pano_mvs.session.session import Session, open_session
+from pano_mvs.session.summarise import chain_of
 
 WORKFLOW_FILE = "metres.yaml"
 """The workflow with the scale, in the output folder."""
@@ -93,7 +93,6 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
         run: the output of a run.
         first: name of a registered image, or coordinates `x,y,z`, as the viewer and other programs show them.
         second: the other end.
-        metres: the distance.
         group: the group of poses in which points were measured; images state theirs.
 
     Raises:
@@ -173,7 +172,6 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     ranges and clouds. A run that is in metres already is corrected: its factor changes.
 
     Args:
-        run: the output of a run.
         known: the length.
         cache: folder of the cache; None for that of the run.
 

@@ -17,18 +17,9 @@ from pano_mvs import __version__
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.extras import import_extra
 from pano_mvs.core.text import shortened, without_controls
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFailed, UnitFinished, Warned
 from pano_mvs.results.summary import FAILED_ITEMS
-from pano_mvs.session.progress import (
-    Event,
-    Progress,
-    RunFinished,
-    RunStarted,
-    StageFinished,
-    StageStarted,
-    UnitFailed,
-    UnitFinished,
-    Warned,
-)
+from pano_mvs.session.progress import Event, Progress, RunFinished, RunStarted
 
 _WAIT_S = 5.0
 _REASON_CHARACTERS = 300

@@ -10,7 +10,7 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.running.events import Failure, StageSummary
 from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.results.records import (
     BlockedUnit,
@@ -38,11 +39,11 @@ from pano_mvs.results.records import (
     ViewSummary,
     WorkflowSummary,
 )
+from pano_mvs.results.stored_values import ROLES
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView, TwoViews
+from pano_mvs.scene import Axis, PointCloud, Poses, Record, Scores, TwoView, TwoViews
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import mean_up_direction, world_up, z_up_from_world
-from pano_mvs.session.final_stages import chain_of, final_stages, latest
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
 
@@ -185,7 +186,6 @@ def poses_summary(
     """Return the summary of poses.
 
     Args:
-        poses: the poses.
         rejected: image without a pose to the reason.
         doubts: registered image whose pose is doubtful to the reason.
         links: the pairs that were matched.
@@ -407,3 +407,47 @@ def height_note(height: float) -> str:
         f"{PLAUSIBLE_HEIGHT_M:g} m, one unit is {PLAUSIBLE_HEIGHT_M / height:.3g} m. To use metres, measure a distance "
         "or a height: pano-mvs scale --help"
     )
+
+
+_Kind = TypeVar("_Kind", bound=Record)
+
+
+def chain_of(workflow: Workflow, graph: Graph, kind: type[Record]) -> list[str]:
+    """Return the chain of stages that produce a kind of value from one another, starting with the first.
+
+    A stage that does not depend on the first, such as a second sweep beside it, is on another branch and not included.
+    """
+    makers = [name for name in graph.order if issubclass(workflow.stages[name].spec.output, kind)]
+    above: dict[str, set[str]] = {}
+    for name in graph.order:
+        feeding = {edge.producer for edge in graph.edges[name].values()}
+        above[name] = feeding.union(*(above[producer] for producer in feeding))
+    chain = makers[:1]
+    for name in makers[1:]:
+        if chain[-1] in above[name]:
+            chain.append(name)
+    return chain
+
+
+def latest(run: Run, kind: type[_Kind]) -> _Kind | None:
+    """Return the value of a kind from the last stage of the first chain that produced one, or None."""
+    for name in reversed(chain_of(run.workflow, run.graph, kind)):
+        value = run.load(name, kind)
+        if isinstance(value, kind):
+            return value
+    return None
+
+
+def final_stages(run: Run) -> dict[str, str]:
+    """Return role (see `ROLES`) to the stage that made the final values: the last of the first chain with any.
+
+    If the run ended early, a stage that had hardly begun does not replace the one before it.
+    """
+    found: dict[str, str] = {}
+    for role, kind in ROLES.items():
+        chain = chain_of(run.workflow, run.graph, kind)
+        made = {name: len(run.states[name].items) for name in chain if name in run.states and run.states[name].items}
+        least = max(made.values(), default=0) / 2 if run.result.stopped else 0
+        if names := [name for name, count in made.items() if count >= least]:
+            found[role] = names[-1]
+    return found

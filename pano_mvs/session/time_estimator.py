@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pano_mvs.core.kernel_cache import count_compiled
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.planning.forecast import StageForecast, makespan
-from pano_mvs.engine.running.events import Failure, Observer, StageSummary, UnitStatus
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFinished, UnitStarted, Warned
 from pano_mvs.session.progress import (
     Event,
     Forecast,
@@ -28,13 +28,7 @@ from pano_mvs.session.progress import (
     Progress,
     RunFinished,
     RunStarted,
-    StageFinished,
-    StageStarted,
     TimeLeft,
-    UnitFailed,
-    UnitFinished,
-    UnitStarted,
-    Warned,
     WorkersChanged,
 )
 
@@ -105,7 +99,6 @@ class StageProgress:
         The forecast counts like one finished unit of this run.
 
         Args:
-            now: the time.
             speed: factor for the forecast, see `TimeEstimator`.
         """
         longest_s = max((now - began for began in self.running.values()), default=0.0)
@@ -270,7 +263,6 @@ class Countdown:
         """Return the time to show for an estimate at a time.
 
         Args:
-            seconds_left: the estimate.
             now: the time in seconds, which must not decrease.
         """
         if math.isnan(self._shown_s):
@@ -299,8 +291,8 @@ def _share(work: Sequence[tuple[float, float]], unknown: int) -> float:
 _ESTIMATE_EVERY_S = 1.0
 
 
-class EventObserver(Observer):
-    """An observer of the engine's run that passes everything on as events, and adds the time left."""
+class EventObserver:
+    """An observer of the engine's run that passes everything on, and adds the time left."""
 
     def __init__(
         self, progress: Progress, clock: Callable[[], float] = time.monotonic, executor: Executor | None = None
@@ -313,37 +305,11 @@ class EventObserver(Observer):
         self._next_estimate_s = clock() + _ESTIMATE_EVERY_S
         self._kernels_before = self._kernels = count_compiled()
 
-    def report(self, event: Event) -> None:
-        """Pass on an event, and the time left if its last event is a second ago."""
-        self._estimator(event)
-        self._progress(event)
-        self.waiting()
-
-    def stage_started(self, name: str, units: int) -> None:
-        """Pass the event on."""
-        self.report(StageStarted(name, units))
-
-    def unit_started(self, name: str, item: str) -> None:
-        """Pass the event on."""
-        self.report(UnitStarted(name, item))
-
-    def unit_failed(self, failure: Failure) -> None:
-        """Pass the event on."""
-        names = ("stage", "item", "cause", "consequence", "log", "said")
-        self.report(UnitFailed(**{name: getattr(failure, name) for name in names}))
-
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        """Pass the event on."""
-        self.report(UnitFinished(name, item, status, round(seconds, 6)))
-
-    def stage_finished(self, summary: StageSummary) -> None:
-        """Pass the event on."""
-        counts = {name: getattr(summary, name) for name in ("use", "units", "run", "cached", "failed", "blocked")}
-        times = {name: round(getattr(summary, name), 6) for name in ("seconds", "unit_seconds")}
-        self.report(StageFinished(stage=summary.name, **counts, **times, metrics=dict(summary.metrics)))
-
-    def waiting(self) -> None:
-        """Report how many kernels have been compiled, which workers there are, and the time left."""
+    def __call__(self, event: Event | None) -> None:
+        """Pass on an event (None: there is none), and once a second compiled kernels, workers and the time left."""
+        if event is not None:
+            self._estimator(event)
+            self._progress(event)
         now = self._clock()
         if now < self._next_estimate_s:
             return
@@ -366,7 +332,3 @@ class EventObserver(Observer):
             self._progress(changed)
         if notice := executor.notice():
             self._progress(Warned(notice))
-
-    def warn(self, text: str) -> None:
-        """Pass the event on."""
-        self.report(Warned(text))

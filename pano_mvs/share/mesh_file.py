@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +10,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.meshes import read_glb
 from pano_mvs.io.ply import read_ply_mesh
 from pano_mvs.results.run_output import RunOutput
-from pano_mvs.scene import FilePart
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 
@@ -116,87 +112,11 @@ def _colored(run: RunOutput) -> SharedMesh:
 
 
 def _textured(run: RunOutput) -> SharedMesh:
-    mesh = read_glb(run.out / TEXTURED)
+    arrays, texture = read_glb(run.out / TEXTURED)
+    uv = np.stack([arrays.uv[:, 0], 1 - arrays.uv[:, 1]], axis=-1)
+    mesh = SharedMesh(arrays.positions, arrays.faces, uv=uv, texture=texture)
     exports = [stage for stage in run.summary.stages if stage.use == "export.mesh_textured"]
     if any(stage.params.get("frame") == "world" for stage in exports):  # instead of upright
         return mesh
     up = world_up(split_groups(run.poses)[0]) if run.poses is not None else WORLD_UP
     return replace(mesh, vertices=(mesh.vertices.astype(np.float64) @ y_up_from_world(up)).astype(np.float32))
-
-
-_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
-
-
-def read_glb(path: Path) -> SharedMesh:
-    """Return the mesh of a GLB file as `export.mesh_textured` writes it: one primitive, and one texture in the file.
-
-    The vertices are in the axes of the file.
-
-    Raises:
-        InputError: if the file cannot be read or has another layout.
-    """
-    data = FilePart(path).read_bytes()
-    try:
-        document, binary = _chunks(data)
-        (primitive,) = document["meshes"][0]["primitives"]
-        arrays = [
-            _accessor(document, binary, number)
-            for number in (
-                primitive["attributes"]["POSITION"],
-                primitive["attributes"]["TEXCOORD_0"],
-                primitive["indices"],
-            )
-        ]
-        material = document["materials"][primitive["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
-        image = document["images"][document["textures"][material["index"]]["source"]]
-        encoded = np.frombuffer(_view(document, binary, image["bufferView"]), np.uint8)
-        picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-        faces = arrays[2].reshape(-1, 3).astype(np.int32)
-        fits = len(arrays[0]) == len(arrays[1]) and (not faces.size or int(faces.max()) < len(arrays[0]))
-    except (ValueError, KeyError, IndexError, TypeError, struct.error, cv2.error) as error:
-        raise InputError(
-            f"{path}: not a textured mesh of pano-mvs in GLB ({error!r}). Run the workflow again"
-        ) from error
-    if picture is None or not fits:
-        raise InputError(f"{path}: its texture or its triangles are damaged. Run the workflow again")
-    texture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
-    from_upper_left = arrays[1].astype(np.float32)
-    uv = np.stack([from_upper_left[:, 0], 1 - from_upper_left[:, 1]], axis=-1)
-    return SharedMesh(arrays[0].astype(np.float32), faces, uv=uv, texture=texture)
-
-
-def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the description and the binary part of a GLB file."""
-    magic, version, length = struct.unpack_from("<III", data)
-    if (magic, version, length) != (_MAGIC, 2, len(data)):
-        raise ValueError("its header is not that of a complete GLB file, version 2")
-    chunks: dict[int, bytes] = {}
-    offset = 12
-    while offset < len(data):
-        size, kind = struct.unpack_from("<II", data, offset)
-        chunks[kind] = data[offset + 8 : offset + 8 + size]
-        offset += 8 + size
-    document: dict[str, Any] = json.loads(chunks[_JSON])
-    return document, chunks[_BINARY]
-
-
-def _view(document: dict[str, Any], binary: bytes, number: int) -> bytes:
-    view = document["bufferViews"][number]
-    start = view.get("byteOffset", 0)
-    if view.get("byteStride"):
-        raise ValueError("interleaved arrays")
-    return binary[start : start + view["byteLength"]]
-
-
-def _accessor(document: dict[str, Any], binary: bytes, number: int) -> NDArray[Any]:
-    accessor = document["accessors"][number]
-    width = _WIDTHS[accessor["type"]]
-    values = np.frombuffer(
-        _view(document, binary, accessor["bufferView"]),
-        _TYPES[accessor["componentType"]],
-        accessor["count"] * width,
-        accessor.get("byteOffset", 0),
-    )
-    return values.reshape(-1, width) if width > 1 else values

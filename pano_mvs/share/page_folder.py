@@ -55,7 +55,6 @@ class PageFolder:
     its own folder, but not read other files.
 
     Attributes:
-        folder: of the page.
         written: sizes of the pieces of data in bytes, by their paths below the folder, in the order of writing.
     """
 

@@ -15,7 +15,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.figures import share as share_text
-from pano_mvs.results.ramp import probability_color
+from pano_mvs.results.pictures import probability_color
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import PointCloud, Poses

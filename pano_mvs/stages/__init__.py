@@ -3,7 +3,7 @@
 They are registered through the entry point `pano_mvs.plugins`, like stages of plugins.
 """
 
-from pano_mvs.stages.depth import exchange, nearest, patchmatch, plain_surfaces, sweep
+from pano_mvs.stages.depth import exchange, full_size, nearest, patchmatch, plain_surfaces, sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.exports.files import ply, poses_files, previews, ranges, tiles_3d
@@ -31,7 +31,6 @@ from pano_mvs.stages.filters import (
     structure,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
-from pano_mvs.stages.full_size import full_size
 from pano_mvs.stages.fusion import photographs, scale_cloud, surface, tracked, vote
 from pano_mvs.stages.masks import apply, color, moving, operator, static
 from pano_mvs.stages.matches import brute_force, lightglue, merge, weak

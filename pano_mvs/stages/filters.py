@@ -16,8 +16,7 @@ from pano_mvs.algorithms.filters.data_term import require_confidence
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.planes import lay_planes
-from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
-from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range, remove_speckles
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.learned.networks import Provider, open_network
 from pano_mvs.algorithms.learned.range_prior import fill_from_prior, network_values

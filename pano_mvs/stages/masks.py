@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pano_mvs.algorithms.masks.areas import WIDTH, reduced_to_width, share_of_sphere
+from pano_mvs.algorithms.masks.areas import WIDTH, areas_of_color, reduced_to_width, share_of_sphere
 from pano_mvs.algorithms.masks.expected_view import OtherView
 from pano_mvs.algorithms.masks.moving import MAX_OTHERS, moving_pixels
-from pano_mvs.algorithms.masks.one_color import areas_of_color
 from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, StaticContent, static_content
 from pano_mvs.api import (

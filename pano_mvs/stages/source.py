@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pano_mvs.algorithms.faces.arrangement import arranged_faces
+from pano_mvs.algorithms.faces.layout import arranged_faces
 from pano_mvs.algorithms.faces.sampling import panorama_from_cube
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import (
@@ -31,7 +31,6 @@ from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pict
 from pano_mvs.io.images.copies import Copy, find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
-from pano_mvs.io.images.stereo import stereo_layout
 from pano_mvs.io.images.tour_configurations import FACES
 from pano_mvs.io.images.tours import TourScene, list_scenes
 from pano_mvs.scene.image_file import (
@@ -43,7 +42,7 @@ from pano_mvs.scene.image_file import (
     write_png,
 )
 from pano_mvs.scene.image_header import stated_size
-from pano_mvs.scene.stereo import StereoLayout, StereoSetting, one_eye
+from pano_mvs.scene.stereo import StereoLayout, StereoSetting, one_eye, stereo_layout
 
 STEREO: Any = Field(
     default="auto",

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from pano_mvs.algorithms import keyframes
 from pano_mvs.algorithms.keyframes import REDUCED_HW, KeyframeSettings, SmallFrame, reduced_grey, select_keyframes
-from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.algorithms.panoramas import sharpness
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.digest import digest_from_file

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
 from pano_mvs.testing.paint import Pattern, Texture, albedo_at, sky_color
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 
 _RAYS_AT_ONCE = 1 << 17
 
@@ -28,7 +23,6 @@ class Room:
         surfaces: in any order.
         texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
             "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
-        seed: seed of the texture.
         lamp: position of the light; the shading is diffuse, without shadows.
         textures: texture of each surface, if they differ; empty: all have `texture`.
         sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
@@ -86,7 +80,6 @@ def render(
     """Render a panorama of the room and its ranges.
 
     Args:
-        room: the room to render.
         cam_from_world: any pose.
         size_hw: (height, width) of the panorama.
         supersample: number of rays per pixel along each side, averaged for the colour.
@@ -110,56 +103,6 @@ def render(
 def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray) -> FloatArray:
     """Return the exact distance from a point (3,) to the first surface along unit rays (N, 3); (N,), else inf."""
     return _first_hit(room, origin_in_world, rays_in_world)[0]
-
-
-def colors_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray, *, pixel_rad: float) -> FloatArray:
-    """Return the colours (N, 3) in [0, 1] that a camera at a point (3,) sees along unit rays (N, 3).
-
-    Args:
-        room: the room.
-        origin_in_world: centre of the camera.
-        rays_in_world: directions.
-        pixel_rad: width of a pixel in radians, over which fine texture fades.
-    """
-    colors = np.zeros_like(rays_in_world)
-    for start in range(0, len(rays_in_world), _RAYS_AT_ONCE):
-        block = slice(start, start + _RAYS_AT_ONCE)
-        rays = rays_in_world[block]
-        hits = _first_hit(room, origin_in_world, rays)
-        colors[block] = _shaded(room, origin_in_world, rays, hits=hits, pixel_rad=pixel_rad)
-    return colors
-
-
-def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], *, size_hw: tuple[int, int]) -> None:
-    """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
-
-    `pano_mvs.evaluation.inputs.read_truth` reads the ground truth: poses are cam_from_world, ranges are float32
-    with inf where there is no surface, and each view has the SHA-256 of its image.
-    """
-    write_views(folder, (render(room, pose, size_hw) for pose in poses), poses)
-
-
-def write_views(
-    folder: Path, pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.float32]]], poses: Sequence[Rigid3]
-) -> None:
-    """Write views, each an image and its true ranges as returned by `render`, in the format of `write_capture`."""
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    (folder / "truth").mkdir(exist_ok=True)
-    views: list[dict[str, object]] = []
-    ranges: dict[str, NDArray[np.float32]] = {}
-    size_hw = (0, 0)
-    for number, ((image, range_map), pose) in enumerate(zip(pictures, poses, strict=True)):
-        size_hw = range_map.shape[0], range_map.shape[1]
-        name = f"{number:03d}"
-        data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-        (folder / "images" / f"{name}.png").write_bytes(data)
-        ranges[name] = np.where(np.isfinite(range_map), range_map, np.float32(np.inf))
-        digest = hashlib.sha256(data).hexdigest()
-        view = {"id": number, "image": f"images/{name}.png", "sha256": digest}
-        views.append(view | {"R": pose.rotation.tolist(), "t": pose.translation.tolist()})
-    text = json.dumps({"width": size_hw[1], "height": size_hw[0], "metric": True, "views": views}, indent=1)
-    (folder / "truth" / "poses.json").write_text(text, encoding="utf-8")
-    np.savez_compressed(folder / "truth" / "depth.npz", **ranges)  # type: ignore[arg-type]  # names are ours
 
 
 def _traced(
@@ -186,13 +129,10 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        if isinstance(surface, Bounded):
-            rows = surface.towards(origin, rays)
-            distance, normal = surface.surface.hit(origin, rays[rows])
-            nearer = distance < best[rows]
-        else:
-            rows, (distance, normal) = np.arange(len(rays)), surface.hit(origin, rays)
-            nearer = distance < best
+        towards = getattr(surface, "towards", None)  # large scenes have surfaces that say which rays come near them
+        rows = np.arange(len(rays)) if towards is None else towards(origin, rays)
+        distance, normal = surface.hit(origin, rays[rows])
+        nearer = distance < best[rows]
         on = rows[nearer]
         best[on], which[on], normals[on] = distance[nearer], idx, normal[nearer]
     return best, which, normals

@@ -44,7 +44,6 @@ class StageCase:
     """A stage with its test inputs.
 
     Attributes:
-        spec: the stage.
         settings: replace the defaults; `{capture}` in a string stands for the folder of the capture.
         inputs: port to a value, for ports of kinds that the tiny capture does not have.
         size_hw: size of the ordinary images.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 
@@ -99,63 +98,3 @@ class Quad:
         met = (distance > 0) & (share_u >= 0) & (share_u <= 1) & (share_v >= 0) & (share_v <= 1)
         unit = normal / np.sqrt(area_squared)
         return np.where(met, distance, np.inf), -np.sign(along)[:, None] * unit
-
-
-@dataclass(frozen=True)
-class Rod:
-    """The surface of a round rod between two points, seen from outside or from inside; its ends are open."""
-
-    foot: Vector
-    head: Vector
-    radius: float
-    colors_rgb: tuple[Vector, Vector]
-
-    def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
-        """Return the distance along each ray (N, 3) from one origin (3,), and the normal there."""
-        axis = np.array(self.head) - self.foot
-        length = float(np.linalg.norm(axis))
-        axis = axis / length
-        to_origin = origin - np.array(self.foot)
-        along_ray, along_origin = rays @ axis, float(to_origin @ axis)
-        # Perpendicular to the axis, the rod is a circle.
-        across, start = rays - along_ray[:, None] * axis, to_origin - along_origin * axis
-        a, b = np.sum(across**2, axis=1), across @ start
-        root = b**2 - a * (start @ start - self.radius**2)
-        distance, normals = np.full(len(rays), np.inf), np.zeros_like(rays)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for sign in (-1.0, 1.0):
-                to_wall = (-b + sign * np.sqrt(root)) / a
-                place = along_origin + to_wall * along_ray
-                met = (to_wall > 0) & (to_wall < distance) & (place >= 0) & (place <= length)
-                distance[met] = to_wall[met]
-                normals[met] = -sign * (start + to_wall[met, None] * across[met]) / self.radius
-        return distance, normals
-
-
-@dataclass(frozen=True)
-class Bounded:
-    """A surface within a bounding sphere, so that only rays towards the sphere are tested."""
-
-    surface: Surface
-    center: Vector
-    radius: float
-
-    @property
-    def colors_rgb(self) -> tuple[Vector, Vector]:
-        """The two colours between which the surface's texture varies."""
-        return self.surface.colors_rgb
-
-    def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
-        """Return the distance along each unit ray (N, 3) from one origin (3,), and the normal there."""
-        distance, normals, towards = np.full(len(rays), np.inf), np.zeros_like(rays), self.towards(origin, rays)
-        distance[towards], normals[towards] = self.surface.hit(origin, rays[towards])
-        return distance, normals
-
-    def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64]:
-        """Return the positions, ascending, of the unit rays (N, 3) from one origin (3,) that intersect the sphere."""
-        to_center = np.array(self.center) - origin
-        apart = float(np.linalg.norm(to_center))
-        if apart <= self.radius:
-            return np.arange(len(rays))
-        least = np.sqrt(1 - (self.radius / apart) ** 2) - 1e-9
-        return np.flatnonzero(rays @ (to_center / apart) >= least)

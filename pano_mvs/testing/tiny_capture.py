@@ -76,7 +76,6 @@ class TinyCapture:
 
     Attributes:
         folder: folder with images/ and truth/poses.json.
-        variant: the variant of the capture.
         names: image names.
         poses: cam_from_world of each image.
         pictures: the images, equal to the files unless these are cropped or scribbled.

@@ -45,9 +45,6 @@ def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], 
     return f"pixel {column} {row}: {said}\n{angles}"
 
 
-_PARALLEL_REACH = 0.006
-
-
 @dataclass(frozen=True, eq=False)
 class TourState:
     """State of the viewer.
@@ -275,7 +272,7 @@ class Tour:
             return
         height = self.state.viewpoint.height
         normals = None if self.state.backs or self.cloud is None else self.cloud.normals
-        found = point_under(start, direction, points, normals=normals, parallel_reach=_PARALLEL_REACH * height)
+        found = point_under(start, direction, points, normals=normals, parallel_reach=0.006 * height)
         if found is None:
             self.state = replace(self.state, message="no point there: click on the cloud")
             return

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.arrangement import arranged_faces
+from pano_mvs.algorithms.faces.layout import arranged_faces
 from pano_mvs.algorithms.faces.sampling import CUBE
 from tests.io.images.tours import face_of
 

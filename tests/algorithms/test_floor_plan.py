@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, Storey, WallCells, find_storeys
+from pano_mvs.algorithms.floor_plan.plan_grid import (
+    Extent,
+    PlanGrid,
+    Storey,
+    WallCells,
+    bar_length,
+    draw_plan,
+    find_storeys,
+)
 from pano_mvs.algorithms.floor_plan.wall_lines import Walls, wall_lines
 from pano_mvs.core.arrays import FloatArray
 from tests.algorithms.floor_plan_rooms import HEIGHT, L_SHAPE, RoomCloud, room_cloud, walls_of

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.masks.areas import reduced_to_width
-from pano_mvs.algorithms.masks.one_color import areas_of_color
+from pano_mvs.algorithms.masks.areas import areas_of_color, reduced_to_width
 from pano_mvs.algorithms.masks.static_content import (
     MIN_VIEWS,
     color_difference,

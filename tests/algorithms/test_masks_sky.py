@@ -16,9 +16,10 @@ from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.paint import BRICK, LEAVES, OAK, STONE
 from pano_mvs.testing.room import Room, default_room, render
-from pano_mvs.testing.scenes import SKIES
-from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
 from tests.synthetic.places import window_room
+from tests.synthetic.rod import Rod
+from tests.synthetic.scenes import SKIES
 
 SIZE_HW = (128, 256)
 CENTERS = [(0.0, 0.0, 0.0), (0.7, 0.1, 0.3), (-0.5, -0.1, 0.6), (0.2, 0.0, -0.7)]

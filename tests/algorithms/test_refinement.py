@@ -14,12 +14,13 @@ from pano_mvs.algorithms.patchmatch import kernels_match, kernels_refine
 from pano_mvs.algorithms.patchmatch.refine import (
     ViewWeights,
     _range_map_from_planes,
+    plain_and_changed,
     reference_arrays,
+    refine_plain_surfaces,
     refine_range,
     source_arrays,
     swept_limits,
 )
-from pano_mvs.algorithms.patchmatch.second_round import plain_and_changed, refine_plain_surfaces
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError

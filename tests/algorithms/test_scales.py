@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.patchmatch.second_round import refine_at_scale
+from pano_mvs.algorithms.patchmatch.refine import refine_at_scale, refine_range
 from pano_mvs.algorithms.scales import (
     coarser_levels,
     enlarged_range_map,
@@ -24,8 +23,8 @@ from pano_mvs.algorithms.scales import (
 from pano_mvs.geometry import Rigid3, pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room
-from pano_mvs.testing.scenes import weak_room
 from tests.algorithms.range_scenes import as_map, room_range
+from tests.synthetic.scenes import weak_room
 
 SIZE = (512, 1024)
 

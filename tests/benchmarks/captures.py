@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.testing.scenes import Scene
 from tests.stored import read_picture
+from tests.synthetic.scenes import Scene
 
 SCRATCH = Path(tempfile.gettempdir()) / "pano_mvs_benchmarks"
 """Where benchmarks keep what they have rendered."""

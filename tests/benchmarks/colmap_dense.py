@@ -27,10 +27,10 @@ from pano_mvs.scene.files import item_stems
 from pano_mvs.stages.exports.colmap import DenseParams, FacesParams, colmap_dense, colmap_faces
 from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along
-from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, context, true_poses
 from tests.benchmarks.table import print_table
+from tests.synthetic.scenes import SCENES, Scene
 
 _AT = 3.0
 
@@ -127,7 +127,7 @@ def main(
     min_confidence: list[int] | None = None,
     min_num_pixels: int = 3,
 ) -> None:
-    """Print the table; `size` is that of a face in pixels, and a scene "room" or one of `pano_mvs.testing.scenes`."""
+    """Print the table; `size` is that of a face in pixels, and a scene "room" or one of `tests.synthetic.scenes`."""
 
     def rows() -> Iterator[list[object]]:
         for made in (room_scene() if name == "room" else SCENES[name]() for name in scene or ["room"]):

@@ -41,10 +41,10 @@ from pano_mvs.geometry import (
     sample_panorama,
 )
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.testing.scenes import SCENES, Scene
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, DenseRun, Overrides
 from tests.benchmarks.table import print_table
+from tests.synthetic.scenes import SCENES, Scene
 
 Ranges = NDArray[np.float32]
 Turns = Mapping[str, NDArray[np.float64]]

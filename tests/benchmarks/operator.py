@@ -34,9 +34,9 @@ from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.testing.paint import noise
-from pano_mvs.testing.scenes import courtyard
 from tests.benchmarks.captures import read_capture
 from tests.synthetic.persons import OUTFITS, Person, draw_people, person
+from tests.synthetic.scenes import courtyard
 
 View = tuple[Picture, NDArray[np.float32], Rigid3]
 

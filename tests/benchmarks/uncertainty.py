@@ -20,10 +20,10 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
-from pano_mvs.testing.scenes import SCENES
 from tests.benchmarks.captures import SCRATCH, Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, Overrides
 from tests.benchmarks.table import print_table
+from tests.synthetic.scenes import SCENES
 
 _EDGE = 1.1
 

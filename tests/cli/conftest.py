@@ -12,8 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.engine.conftest import toy
+from tests.synthetic.capture_files import write_capture
 
 __all__ = ["toy"]
 

@@ -16,6 +16,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
+from pano_mvs.engine.running.events import Warned
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.registry import Registry
@@ -25,16 +26,16 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import StageOutcome
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.event_log import EventReader
 from pano_mvs.session.planning import reference_times
-from pano_mvs.session.progress import BlockStarted, Divided, Event, RunFinished, Warned
+from pano_mvs.session.progress import BlockStarted, Divided, Event, EventReader, RunFinished
 from pano_mvs.session.running import run_session
 from pano_mvs.session.session import Session
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.algorithms.blocks.walked_blocks import some_world
 from tests.algorithms.blocks.walked_blocks import walk as walked
 from tests.cli.conftest import Command, Outcome, deliverables, run_json
 from tests.session.merging.written_blocks import write_block
+from tests.synthetic.capture_files import write_capture
 
 BLOCKS = ("--block-size", "12", "--block-overlap", "5")
 """26 images in three blocks."""

@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.geometry import ray_from_pixel
 from pano_mvs.scene.image_file import decode_image, write_png
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Outcome
+from tests.synthetic.capture_files import write_capture
 
 WORKFLOW = """\
 pano_mvs: 1

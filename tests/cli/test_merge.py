@@ -13,10 +13,11 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.results.records import FailedUnit
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.testing.room import capture_poses, default_room, range_along, write_capture
+from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.algorithms.blocks.walked_blocks import some_world
 from tests.cli.conftest import SIZE_HW, SMALL, Command
 from tests.session.merging.written_blocks import write_block
+from tests.synthetic.capture_files import write_capture
 
 
 def test_merge_prints_the_agreement_and_what_it_wrote(pano_mvs: Command, tmp_path: Path) -> None:

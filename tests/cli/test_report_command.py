@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.engine.running.publish import Publisher
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.cli.conftest import Command, run_json
 from tests.engine.conftest import Toy
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
+from tests.synthetic.capture_files import write_capture
 
 
 def page_in(out: Path) -> Page:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.tour_command import open_in_browser
+from pano_mvs.cli.page_commands import open_in_browser
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session.session import Session
 from tests.cli.conftest import SMALL, Command
@@ -59,7 +59,7 @@ def test_the_preset_is_chosen_by_what_is_given(
         sessions.append(session)
         return 4
 
-    monkeypatch.setattr("pano_mvs.cli.tour_command.run_decided", stop)
+    monkeypatch.setattr("pano_mvs.cli.page_commands.run_decided", stop)
     result = pano_mvs("tour", name, "--cache", "kept")
     (session,) = sessions
     assert (result.code, session.workflow.name, session.store_root) == (4, workflow, Path("kept"))

@@ -19,8 +19,9 @@ from pano_mvs.cli.plugins.new import KINDS, rendered
 from pano_mvs.engine.stages.registry import declared_names
 from pano_mvs.scene import Record
 from pano_mvs.testing.conformance import stage_contract_tests
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+from tests.synthetic.capture_files import write_capture
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")

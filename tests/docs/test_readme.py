@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.stored import read_picture
+from tests.synthetic.capture_files import write_capture
 
 README = Path(__file__).parents[2] / "README.md"
 

@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from pano_mvs.testing.room import capture_poses, default_room
 from tests.docs.test_examples import ROOT, SCRIPTS, commands
+from tests.synthetic.capture_files import write_capture
 
 VERBS = ("view", "share", "inspect", "report", "evaluate")
 SUBJECTS = ("run", "poses", "depth", "cloud")

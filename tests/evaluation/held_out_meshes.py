@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.mesh.atlas import Atlas
 from pano_mvs.algorithms.mesh.surface import Mesh
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
-from pano_mvs.algorithms.mesh.visibility import SurfaceView, surface_view
+from pano_mvs.algorithms.mesh.view_quality import SurfaceView, surface_view
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle

@@ -15,9 +15,10 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.evaluation.inputs import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.testing.room import Room, capture_poses, default_room, render, write_capture
+from pano_mvs.testing.room import Room, capture_poses, default_room, render
 from pano_mvs.testing.surfaces import Ball
 from tests.stored import write_npz
+from tests.synthetic.capture_files import write_capture
 
 SIZE = (16, 32)
 

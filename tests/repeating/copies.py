@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Rod, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 from tests.repeating.fittings import Painted, Wall, corners, vector
 from tests.repeating.prints import Print
 from tests.repeating.walks import Rect
+from tests.synthetic.bounded import Bounded
+from tests.synthetic.rod import Rod
 
 
 @dataclass(frozen=True)

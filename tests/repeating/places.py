@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.testing.scenes import Scene
 from tests.repeating.halls import colonnade, tiled_hall
 from tests.repeating.rows import doors, facade_row, stairs
 from tests.repeating.twin_rooms import twin_rooms
 from tests.repeating.visits import TILES, Visit
 from tests.repeating.walks import LAYOUTS
+from tests.synthetic.scenes import Scene
 
 __all__ = [
     "REPEATS",

@@ -9,7 +9,6 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
-from pano_mvs.testing.scenes import Scene
 from tests.repeating.fittings import Site, Wall
 from tests.repeating.visits import (
     PLASTER,
@@ -25,6 +24,7 @@ from tests.repeating.visits import (
     wall_print,
 )
 from tests.repeating.walks import Ground, Rect
+from tests.synthetic.scenes import Scene
 
 
 def facade_row(

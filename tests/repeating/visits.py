@@ -10,12 +10,12 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
 from pano_mvs.testing.paint import Colors
 from pano_mvs.testing.room import Room
-from pano_mvs.testing.scenes import Scene
 from pano_mvs.testing.surfaces import Vector
 from tests.repeating.drawings import Drawing, Kind
 from tests.repeating.fittings import Site
 from tests.repeating.prints import Print
 from tests.repeating.walks import Ground, Layout, Rect, stands
+from tests.synthetic.scenes import Scene
 
 Tiles = Literal["marble", "checker", "motif"]
 

@@ -13,7 +13,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import write_preview
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, TwoView
-from pano_mvs.scene.pairs_and_views import pair_name
+from pano_mvs.scene.two_view import pair_name
 from pano_mvs.testing.room import default_room, render
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 

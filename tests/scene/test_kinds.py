@@ -12,9 +12,9 @@ from pano_mvs.core.errors import ChangedFileError, ContractError, InputError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Files, GlobalDescriptor, Pairs, PointCloud, Pose, Poses, RangeMap, TwoView, Views
 from pano_mvs.scene.files import FaceFiles, group_file, item_stems
-from pano_mvs.scene.pairs_and_views import pair_from_name, pair_name
 from pano_mvs.scene.record import Axis, FilePart, Record, require_array
 from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
+from pano_mvs.scene.two_view import pair_from_name, pair_name
 from tests.scene.pose_groups import drawn_group
 
 RNG = np.random.default_rng(5)

@@ -10,25 +10,31 @@ from typing import get_args
 import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
-from pano_mvs.results.records import Finding, Tile, Verdict
-from pano_mvs.session.event_log import EVENTS_FILE, EventLog, EventReader, event_from_line, line_from_event
-from pano_mvs.session.progress import (
-    BlockStarted,
-    Divided,
-    Event,
-    Forecast,
-    KernelsCompiled,
-    RunFinished,
-    RunStarted,
+from pano_mvs.engine.running.events import (
     StageFinished,
     StageStarted,
-    TimeLeft,
     UnitFailed,
     UnitFinished,
     UnitStarted,
     Warned,
-    WorkersChanged,
     ignore,
+)
+from pano_mvs.results.records import Finding, Tile, Verdict
+from pano_mvs.session.progress import (
+    EVENTS_FILE,
+    BlockStarted,
+    Divided,
+    Event,
+    EventLog,
+    EventReader,
+    Forecast,
+    KernelsCompiled,
+    RunFinished,
+    RunStarted,
+    TimeLeft,
+    WorkersChanged,
+    event_from_line,
+    line_from_event,
 )
 
 VERDICT = Verdict("fair", "Finished", "Usable.", "4 units.", (Tile("images", "4"),), (Finding("fair", "blurred"),))

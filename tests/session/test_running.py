@@ -8,15 +8,8 @@ import pytest
 
 import pano_mvs
 from pano_mvs.engine.cache.blobs import DamagedBlobError
-from pano_mvs.session.progress import (
-    Event,
-    RunFinished,
-    RunStarted,
-    StageFinished,
-    StageStarted,
-    UnitFailed,
-    UnitFinished,
-)
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFailed, UnitFinished
+from pano_mvs.session.progress import Event, RunFinished, RunStarted
 from pano_mvs.session.python_calls import arguments_from_options, overrides_from_settings
 from pano_mvs.session.running import Execution
 from tests.engine.conftest import Toy

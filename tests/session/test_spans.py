@@ -24,18 +24,8 @@ from typer.testing import CliRunner
 import pano_mvs
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import UsageError
-from pano_mvs.session.event_log import EventReader
-from pano_mvs.session.progress import (
-    Event,
-    RunFinished,
-    RunStarted,
-    StageFinished,
-    StageStarted,
-    UnitFailed,
-    UnitFinished,
-    Warned,
-    ignore,
-)
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFailed, UnitFinished, Warned, ignore
+from pano_mvs.session.progress import Event, EventReader, RunFinished, RunStarted
 from pano_mvs.session.running import Execution
 from pano_mvs.session.spans import Spans
 from tests.engine.conftest import Toy

@@ -9,20 +9,9 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.engine.planning.forecast import StageForecast
-from pano_mvs.engine.running.events import UnitStatus
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFinished, UnitStarted, UnitStatus
 from pano_mvs.session import time_estimator as observer_module
-from pano_mvs.session.progress import (
-    Event,
-    Forecast,
-    KernelsCompiled,
-    RunFinished,
-    RunStarted,
-    StageFinished,
-    StageStarted,
-    TimeLeft,
-    UnitFinished,
-    UnitStarted,
-)
+from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunFinished, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, EventObserver, TimeEstimator
 
 
@@ -275,17 +264,17 @@ def test_the_time_left_is_reported_once_a_second_beside_other_events(monkeypatch
     monkeypatch.setattr(observer_module, "count_compiled", lambda: 0)  # other processes may be compiling
     clock, events = Clock(), list[Event]()
     observer = EventObserver(events.append, clock)
-    observer.report(RunStarted("w", ("a",), "processes", workers=1, threads=1, out=Path("out")))
-    observer.report(Forecast((stage("a", 2, 10.0),)))
-    observer.stage_started("a", 2)
-    observer.unit_started("a", "1")
+    observer(RunStarted("w", ("a",), "processes", workers=1, threads=1, out=Path("out")))
+    observer(Forecast((stage("a", 2, 10.0),)))
+    observer(StageStarted("a", 2))
+    observer(UnitStarted("a", "1"))
     assert not [event for event in events if isinstance(event, TimeLeft)]
     clock.now += 5
-    observer.waiting()
-    observer.waiting()
+    observer(None)
+    observer(None)
     assert events[-1] == TimeLeft(15.0, at_least=False, done=0.25)
     clock.now += 5
-    observer.unit_finished("a", "1", status="run", seconds=10.0)
+    observer(UnitFinished("a", "1", "run", 10.0))
     assert [type(event) for event in events[-3:]] == [TimeLeft, UnitFinished, TimeLeft]
 
 
@@ -295,7 +284,7 @@ def test_kernels_that_are_compiled_meanwhile_are_reported(monkeypatch: pytest.Mo
     clock, events = Clock(), list[Event]()
     observer = EventObserver(events.append, clock)
     clock.now += 5
-    observer.waiting()
+    observer(None)
     clock.now += 3
-    observer.waiting()
+    observer(None)
     assert [event for event in events if isinstance(event, KernelsCompiled)] == [KernelsCompiled(2, seconds=3.0)]

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.meshes import read_glb
 from pano_mvs.results.run_output import load
 from pano_mvs.share import share_run
 from pano_mvs.share.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
-from pano_mvs.share.mesh_file import SharedMesh, coarser, read_glb, run_mesh, thinned
+from pano_mvs.share.mesh_file import SharedMesh, coarser, run_mesh, thinned
 from pano_mvs.share.scene_parts import outline
 from tests.share.box_run import POINT_SIGMA, box_mesh, box_run, frame_of_page, wall_color
 from tests.share.test_share import value_of

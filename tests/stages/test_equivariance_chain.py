@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import roll_panorama, rotation_from_rotvec
-from pano_mvs.testing.scenes import SCENES, Scene, write_scene
 from tests.benchmarks.dense_chain import DenseChain
 from tests.benchmarks.equivariance import (
     Bad,
@@ -22,6 +21,7 @@ from tests.benchmarks.equivariance import (
     smooth_truth,
     turned_picture,
 )
+from tests.synthetic.scenes import SCENES, Scene, write_scene
 
 SMALL = ["depth.planes=48", "depth.near=1.0", "depth.far=6.0"]
 SIZE = (80, 160)

@@ -11,8 +11,8 @@ import pytest
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import FilePart, Panorama, Pose, RangeMap
 from pano_mvs.scene.image_file import write_png
+from pano_mvs.stages.depth import FullSizeParams, full_size, full_size_memory_bytes
 from pano_mvs.stages.exports.files import RangesParams, ranges
-from pano_mvs.stages.full_size import FullSizeParams, full_size, full_size_memory_bytes
 from pano_mvs.testing.room import capture_poses, default_room, render
 
 SIZE, FILE = (64, 128), (192, 384)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import FisheyeLens, LensRig, Rigid3, rotation_from_rotvec
 from pano_mvs.io.rig_calibration import calibration_text
 from pano_mvs.scene.image_file import write_png
-from pano_mvs.testing.room import Room, colors_along
+from pano_mvs.testing.room import Room
+from tests.synthetic.colors import colors_along
 
 Layout = Literal["side_by_side", "folders", "suffixes"]
 

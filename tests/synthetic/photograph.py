@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.testing.room import Room, colors_along
+from pano_mvs.testing.room import Room
+from tests.synthetic.colors import colors_along
 
 _ROUNDS = 20
 _RAYS_AT_ONCE = 1 << 17

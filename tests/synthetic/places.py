@@ -1,6 +1,6 @@
 """Places for single parts of the product: a yard, a room with windows, a plain table and a large plain room.
 
-Settings are those of `pano_mvs.testing.scenes`.
+Settings are those of `tests.synthetic.scenes`.
 """
 
 from __future__ import annotations
@@ -8,8 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
-from pano_mvs.testing.scenes import Painted, Scene, painted, placed
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Quad, Rod, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
+from tests.synthetic.bounded import Bounded
+from tests.synthetic.rod import Rod
+from tests.synthetic.scenes import Painted, Scene, painted, placed
 
 _GROUND, _TOP, _FLOOR, _WALL = 1.6, -1.5, 1.3, 0.25
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.testing.paint import BLUE, OAK, RED, STEEL, Texture
 from pano_mvs.testing.room import default_room, render
-from pano_mvs.testing.scenes import Scene, poles
-from pano_mvs.testing.surfaces import Cuboid, Rod, Surface
+from pano_mvs.testing.surfaces import Cuboid, Surface
+from tests.synthetic.rod import Rod
+from tests.synthetic.scenes import Scene, poles
 
 __all__ = ["THIN_KINDS", "thin_pixels", "thin_scene"]
 
@@ -33,7 +34,7 @@ def thin_scene(
         seed: seed of the objects, textures, cameras and exposures.
         views: number of cameras, about 0.5 apart.
         turned: whether every camera is rotated arbitrarily.
-        exposure: as in `pano_mvs.testing.scenes.courtyard`.
+        exposure: as in `tests.synthetic.scenes.courtyard`.
     """
     base = poles(seed=seed, views=views, turned=turned, exposure=exposure)
     objects = THIN_KINDS[kind](np.random.default_rng([seed, 0x71]), 2 * np.pi / width)
@@ -50,7 +51,7 @@ def thin_pixels(scene: Scene, idx: int, truth: NDArray[np.float32]) -> NDArray[n
     """Return the pixels of a view, (H, W), that show what stands in the furnished room.
 
     Args:
-        scene: a scene of `thin_scene`, or `pano_mvs.testing.scenes.poles`.
+        scene: a scene of `thin_scene`, or `tests.synthetic.scenes.poles`.
         idx: number of the view.
         truth: (H, W) its true ranges.
     """

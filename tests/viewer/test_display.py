@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.viewer.display import require_display, require_drawing, require_window
+from pano_mvs.viewer.view import require_display, require_drawing, require_window
 
 
 def test_without_a_display_the_remedy_is_named() -> None:

@@ -12,8 +12,8 @@ from pano_mvs.io.images.preview import color_mapped, range_limits
 from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.actors import range_panorama
 from pano_mvs.viewer.controller import Tour
-from pano_mvs.viewer.display import quiet_vtk, require_drawing
 from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
+from pano_mvs.viewer.view import quiet_vtk, require_drawing
 from pano_mvs.viewer.viewpoint import box_of
 from pano_mvs.viewer.window import SceneWindow
 from tests.viewer.scenes import turned_poses, write_output

@@ -15,8 +15,8 @@ from pano_mvs.io.ply import write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.controller import Tour
-from pano_mvs.viewer.display import quiet_vtk, require_drawing
 from pano_mvs.viewer.shown_scene import open_scene
+from pano_mvs.viewer.view import quiet_vtk, require_drawing
 from pano_mvs.viewer.viewpoint import Viewpoint, box_of
 from pano_mvs.viewer.window import TEXTURED, SceneWindow
 from tests.viewer.scenes import HALF, turned_poses, world_color, write_output

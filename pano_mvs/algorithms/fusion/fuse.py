@@ -1,4 +1,4 @@
-"""Fuse range maps into one cloud of points on which views agree."""
+"""Fuse range maps into one cloud of points on which views agree, and thin a cloud to one point per voxel."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from pano_mvs.algorithms.fusion.view import (
     FusionSettings,
     FusionView,
     ViewWindow,
-    confident_view,
     held_rays,
     nearest_views,
 )
-from pano_mvs.algorithms.fusion.voxels import VoxelGrid
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP
 from pano_mvs.core.bands import for_bands
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.cloud import joined_uncertainty
@@ -39,18 +38,6 @@ _SUPPORT_RADIUS = 2
 _MAX_SUPPORT_STEP = 0.03
 
 
-def fuse_views(views: Sequence[FusionView], settings: FusionSettings | None = None, *, threads: int = 1) -> PointCloud:
-    """Fuse views into a cloud of the points on which they agree.
-
-    `views`: the views; see `fuse_stream` for many views. `settings`: settings of the fusion; None: the defaults.
-    `threads`: number of threads; the result does not depend on it.
-
-    Raises:
-        UsageError: if a view's arrays disagree.
-    """
-    return fuse_stream([view.pose for view in views], views.__getitem__, settings, threads=threads)
-
-
 def fuse_stream(
     poses: Sequence[Rigid3],
     load: Callable[[int], FusionView],
@@ -61,16 +48,24 @@ def fuse_stream(
 ) -> PointCloud:
     """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory, and the cloud.
 
-    Each view in turn is the reference of `fuse_reference`, with its neighbours as sources. The clouds are joined in the
-    order of the views, merged by voxels if `voxel_size` is set, and smoothed (`smooth_surfaces`). The result does not
-    depend on what is cached.
+    Each view in turn is a reference, with its neighbours as sources. A pixel becomes a point if `min_views` views agree
+    on it, by the test of `check_consistency`, unless more views whose own pixel is consistent see through it than
+    agree, which means that it is in free space. A pixel that lacks a single view is accepted by the support of its
+    surface (`min_support`), unless a consistent pixel contradicts it. Points that another agreeing view sees clearly
+    better are left to that view. A point is the mean of the positions in all agreeing views, weighted by 1 / (σ r)²
+    (`merge_within`), where σ is the relative uncertainty of the range, or 1; its colour is their mean weighted by
+    cos / r², the inverse of the area that a pixel covers; its confidence is the largest of theirs, its uncertainty the
+    smallest, because views that confirm each other share their errors.
+
+    The clouds are joined in the order of the views and of their pixels, merged by voxels if `voxel_size` is set, and
+    smoothed (`smooth_surfaces`). The result does not depend on what is cached.
 
     `poses`: cam_from_world of all views. `load`: position of a view to the view; called again if it was dropped from
-    the cache. `settings`: as in `fuse_views`. `threads`: as in `fuse_views`. `join`: joins the clouds of all views,
-    such as into files; None: `join_clouds`.
+    the cache. `settings`: settings of the fusion; None: the defaults. `threads`: number of threads; the result does not
+    depend on it. `join`: joins the clouds of all views, such as into files; None: `join_clouds`.
 
     Raises:
-        UsageError: as `fuse_views`.
+        UsageError: if a view's arrays disagree.
     """
     chosen = settings or FusionSettings()
     window = ViewWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
@@ -90,42 +85,6 @@ def fuse_stream(
     if not chosen.smooth:
         return cloud
     return smooth_surfaces(cloud, np.array([pose.center for pose in poses]), threads=threads)
-
-
-def fuse_reference(
-    reference: FusionView,
-    earlier: Sequence[FusionView],
-    later: Sequence[FusionView],
-    *,
-    settings: FusionSettings | None = None,
-    threads: int = 1,
-) -> PointCloud:
-    """Return the points that one view contributes to the cloud.
-
-    A pixel becomes a point if `min_views` views agree on it, by the test of `check_consistency`, unless more views
-    whose own pixel is consistent see through it than agree, which means that it is in free space. A pixel that lacks a
-    single view is accepted by the support of its surface (`min_support`), unless a consistent pixel contradicts it.
-    Points that another agreeing view sees clearly better are left to that view. A point is the mean of the positions in
-    all agreeing views, weighted by 1 / (σ r)² (`merge_within`), where σ is the relative uncertainty of the range, or 1;
-    its colour is their mean weighted by cos / r², the inverse of the area that a pixel covers; its confidence is the
-    largest of theirs, its uncertainty the smallest, because views that confirm each other share their errors. The
-    result is not smoothed.
-
-    `reference`: the view that contributes the points. `earlier`: neighbouring views that come before it. `later`:
-    neighbouring views that come after it. `settings`: as in `fuse_views`; `neighbours` and `voxel_size` are ignored.
-    `threads`: as in `fuse_views`.
-
-    Returns:
-        The points in the world frame, in the order of the reference's pixels.
-
-    Raises:
-        UsageError: as `fuse_views`.
-    """
-    chosen = settings or FusionSettings()
-    views = [*earlier, *later]
-    window = ViewWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
-    sources = [(window, idx, _tie(is_earlier=idx < len(earlier))) for idx in range(len(views))]
-    return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads=threads)
 
 
 def join_clouds(clouds: Iterable[PointCloud]) -> PointCloud:
@@ -309,3 +268,102 @@ def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArra
     first = np.diff(number, axis=1, prepend=-1) > 0
     chosen: NDArray[np.bool_] = first & (rows % settings.stride == settings.stride // 2)[:, None]
     return chosen
+
+
+# Number of points that are collected before they are sorted into voxels; with fewer, voxels are sorted too often.
+_MIN_WAITING = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Voxels:
+    """Voxels in the order in which they first appeared.
+
+    `places`: (G, 3) int64. `sums`: (G, 10) of weights, and of weighted positions, normals and colours. `first_normals`:
+    (G, 3) float32. `largest`: (G, 2) uint8 number of views and confidence. `uncertainties`: (G,) float32, the smallest
+    of each voxel.
+    """
+
+    places: NDArray[np.int64]
+    sums: NDArray[np.float64]
+    first_normals: NDArray[np.float32]
+    largest: NDArray[np.uint8]
+    uncertainties: NDArray[np.float32]
+
+
+class VoxelGrid:
+    """Adds clouds one at a time, and keeps one point per occupied voxel; memory grows with the number of voxels.
+
+    The points are in the order in which voxels first appear. Positions and colours are averages over the voxel,
+    weighted by the number of views; normals are averaged and normalised, or the first one if they cancel; the numbers
+    of views and the confidences are maxima, the uncertainties minima. Voxels are aligned with the world's axes and its
+    origin.
+    """
+
+    def __init__(self, voxel_size: float) -> None:
+        """Create an empty grid.
+
+        Raises:
+            UsageError: if the voxel size is not positive.
+        """
+        if not voxel_size > 0:
+            raise UsageError(f"voxel_size must be positive, got {voxel_size}")
+        self._voxel_size = voxel_size
+        self._parts: list[_Voxels] = []
+        self._has_confidence = True
+        self._has_uncertainty = True
+
+    def add(self, cloud: PointCloud) -> None:
+        """Add the points of a cloud."""
+        weight = np.maximum(cloud.view_counts, 1).astype(np.float64)[:, None]
+        places = np.floor(cloud.points_in_world.astype(np.float64) / self._voxel_size).astype(np.int64)
+        values = np.concatenate([cloud.points_in_world, cloud.normals_in_world, cloud.colors_rgb], axis=1, dtype=float)
+        confidence = np.zeros_like(cloud.view_counts) if cloud.confidence is None else cloud.confidence
+        largest = np.stack([cloud.view_counts, confidence], axis=1)
+        uncertainty = np.zeros(len(cloud), np.float32) if cloud.uncertainty is None else cloud.uncertainty
+        self._has_confidence &= cloud.confidence is not None
+        self._has_uncertainty &= cloud.uncertainty is not None
+        sums = np.concatenate([weight, weight * values], axis=1)
+        self._parts.append(_merged([_Voxels(places, sums, cloud.normals_in_world, largest, uncertainty)]))
+        waiting = sum(len(part.places) for part in self._parts[1:])
+        if waiting > max(_MIN_WAITING, len(self._parts[0].places)):
+            self._parts = [_merged(self._parts)]
+
+    def cloud(self) -> PointCloud:
+        """Return the points of all voxels."""
+        empty = np.zeros((0, 3), np.float32)
+        none = _Voxels(empty.astype(np.int64), np.zeros((0, 10)), empty, np.zeros((0, 2), np.uint8), empty[:, 0])
+        voxels = self._parts[0] if len(self._parts) == 1 else _merged([none, *self._parts])
+        mean = voxels.sums[:, 1:] / voxels.sums[:, :1]
+        length = np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
+        normals = np.where(length > 0.1, mean[:, 3:6] / np.maximum(length, 0.1), voxels.first_normals)
+        return PointCloud(
+            points_in_world=mean[:, :3].astype(np.float32),
+            normals_in_world=normals.astype(np.float32),
+            colors_rgb=np.rint(mean[:, 6:]).astype(np.uint8),
+            view_counts=voxels.largest[:, 0].copy(),
+            confidence=voxels.largest[:, 1].copy() if self._has_confidence else None,
+            uncertainty=voxels.uncertainties.copy() if self._has_uncertainty else None,
+        )
+
+
+def _merged(parts: list[_Voxels]) -> _Voxels:
+    """Return the voxels of all parts without duplicates."""
+    places = np.concatenate([part.places for part in parts])
+    order = np.lexsort(places.T[::-1])  # stable: the first point of a voxel stays in front
+    begins = np.ones(len(order), np.bool_)
+    begins[1:] = (np.diff(places[order], axis=0) != 0).any(axis=1)
+    starts = np.flatnonzero(begins)
+    if not len(starts):
+        return parts[0]
+    first = order[starts]
+    appearance = np.argsort(first, kind="stable")
+    sums = np.concatenate([part.sums for part in parts])[order]
+    largest = np.concatenate([part.largest for part in parts])[order]
+    uncertainties = np.concatenate([part.uncertainties for part in parts])[order]
+    return _Voxels(
+        places[first[appearance]],
+        np.add.reduceat(sums, starts, axis=0)[appearance],
+        np.concatenate([part.first_normals for part in parts])[first[appearance]],
+        np.maximum.reduceat(largest, starts, axis=0)[appearance],
+        np.minimum.reduceat(uncertainties, starts)[appearance],
+    )

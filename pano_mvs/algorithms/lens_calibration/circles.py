@@ -28,7 +28,6 @@ class ImageCircle:
 
     Attributes:
         center_xy: its centre in pixels.
-        radius_px: its radius.
         residual_px: median distance of the edge from the circle.
         seen: share of the circumference where the edge was found.
     """

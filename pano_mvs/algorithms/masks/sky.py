@@ -205,7 +205,6 @@ def sky_pixels(
         sources: of which the first `MAX_SOURCES` are used.
         source_from_reference: pose of each.
         valid: (H, W), False is ignored.
-        source_valid: of each source.
         rng: draws border points for planes.
 
     Raises:

@@ -18,10 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
-from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality
-from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
-from pano_mvs.algorithms.panoramas import filtered
-from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality, surface_view, vertex_normals
+from pano_mvs.algorithms.panoramas import filtered, sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
 
@@ -164,7 +162,6 @@ Loader = Callable[[int], PaintView]
 
 # Standard deviation, as a share of a panorama's width, of the Gaussian that separates detail from larger scales.
 _DETAIL_SCALE = 1 / 400
-_FEATHER_SIGMAS = 2.0
 _TEXELS_AT_ONCE = 1 << 13  # of a band; `for_bands` joins 32 of them
 _SAMPLES, _SAMPLE_WIDTH = 20_000, 512
 _LEAST_SHARPNESS = 0.25
@@ -218,7 +215,7 @@ class Surface:
         pose = view.cam_from_world
         ranges = surface_view(self.vertices_in_world, self.faces, pose, size_hw=size_hw, threads=threads).ranges
         sigma = size_hw[1] * _DETAIL_SCALE
-        quality = pixel_quality(view, ranges, feather_px=_FEATHER_SIGMAS * sigma)
+        quality = pixel_quality(view, ranges, feather_px=2.0 * sigma)
         margin = min(int(np.ceil(3 * sigma)), size_hw[0])
         side = 2 * margin + 1
         smooth = np.ascontiguousarray(

@@ -30,7 +30,6 @@ from pano_mvs.scene.surfaces import Structure
 
 # What a pixel without a plane costs, where 1 is a range that is not on the plane.
 _NO_PLANE = 0.6
-_RADIUS, _EPSILON = 8, 8.0
 # Weights of the own ranges of precise, confirmed, weak and filled pixels.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
 # The weight of the outline of the room where nothing is confirmed.
@@ -187,7 +186,7 @@ def _labels(
         unknown = np.isfinite(on_plane) & ~np.isfinite(ranges)
         cost = np.where(unknown, 0.5, np.minimum(np.nan_to_num(error, nan=1.0), 1.0))
         cost = (weight * cost + prior * ~shown) / (weight + prior)
-        filtered, _ = guided_values(cost, weight + prior, guide.astype(np.float64), radius=_RADIUS, epsilon=_EPSILON)
+        filtered, _ = guided_values(cost, weight + prior, guide.astype(np.float64), radius=8, epsilon=8.0)
         better = (filtered < best) & np.isfinite(on_plane)
         best[better], label[better] = filtered[better], number
     return label

@@ -44,27 +44,8 @@ class Exposure:
         return np.stack([table[picture[..., c], c] for c in range(picture.shape[-1])], axis=-1)
 
 
-def match_exposure(
-    reference: NDArray[np.uint8],
-    source: NDArray[np.uint8],
-    source_from_reference: Rigid3,
-    *,
-    ranges: NDArray[np.float32],
-    source_mask: NDArray[np.bool_] | None = None,
-) -> Exposure:
-    """Return the exposure of a source against the reference, robustly, from pixels whose range is known roughly.
-
-    Geman–McClure weights on a straight line through (source, reference) colours for each channel: occluded and wrong
-    pixels drop out. Too few pixels, or a fit beyond reason, leave the channel as it is.
-
-    `reference`: (H, W, C) uint8. `source`: (Hs, Ws, C) uint8. `source_from_reference`: pose. `ranges`: (h, w) rough
-    ranges of the reference, at any resolution; NaN is left out. `source_mask`: (Hs, Ws) False is left out.
-    """
-    return _exposure_of(source, source_from_reference, _Known.of(reference, ranges), source_mask=source_mask)
-
-
 @dataclass(frozen=True, eq=False)
-class _Known:
+class KnownPixels:
     """What every source is compared with: pixels of the reference whose range is known roughly.
 
     `points`: (N, 3) in the reference's frame. `colors`: (N, C) of the reference, smoothed. `cut_off`: (N, 1) how much
@@ -76,7 +57,8 @@ class _Known:
     cut_off: NDArray[np.float64]
 
     @classmethod
-    def of(cls, reference: NDArray[np.uint8], ranges: NDArray[np.float32]) -> _Known:
+    def of(cls, reference: NDArray[np.uint8], ranges: NDArray[np.float32]) -> KnownPixels:
+        """Return the pixels of a reference, (H, W, C), with a range, (h, w) at any resolution; NaN is left out."""
         known = np.isfinite(ranges)
         size_hw = reference.shape[0], reference.shape[1]
         pixels = pixel_from_ray(ray_grid((ranges.shape[0], ranges.shape[1]))[known], size_hw)
@@ -86,9 +68,20 @@ class _Known:
         return cls(points, sample_panorama(_smooth(reference), pixels), cut_off)
 
 
-def _exposure_of(
-    source: NDArray[np.uint8], source_from_reference: Rigid3, known: _Known, *, source_mask: NDArray[np.bool_] | None
+def match_exposure(
+    source: NDArray[np.uint8],
+    source_from_reference: Rigid3,
+    known: KnownPixels,
+    *,
+    source_mask: NDArray[np.bool_] | None = None,
 ) -> Exposure:
+    """Return the exposure of a source against the reference, robustly, from pixels whose range is known roughly.
+
+    Geman–McClure weights on a straight line through (source, reference) colours for each channel: occluded and wrong
+    pixels drop out. Too few pixels, or a fit beyond reason, leave the channel as it is.
+
+    `source`: (Hs, Ws, C) uint8. `source_mask`: (Hs, Ws) False is left out.
+    """
     pixels = pixel_from_ray(source_from_reference.apply(known.points), source.shape[:2])
     seen = sample_panorama(_smooth(source), pixels)
     cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + known.cut_off
@@ -158,9 +151,9 @@ def match_all(
     masks: Sequence[NDArray[np.bool_]] | None,
 ) -> list[NDArray[np.uint8]]:
     """Return all sources in the reference's exposure."""
-    known = _Known.of(reference, ranges)
+    known = KnownPixels.of(reference, ranges)
     matched = []
     for idx, (source, pose) in enumerate(zip(sources, source_from_reference, strict=True)):
         mask = None if masks is None else masks[idx]
-        matched.append(_exposure_of(source, pose, known, source_mask=mask).apply(source))
+        matched.append(match_exposure(source, pose, known, source_mask=mask).apply(source))
     return matched

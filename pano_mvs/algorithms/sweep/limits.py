@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
-from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.smoothing import remove_speckles
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.panoramas import contrast_around, reduced_mask, reduced_panorama
 from pano_mvs.algorithms.sweep.backends.registry import helper_backend

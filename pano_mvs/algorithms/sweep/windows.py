@@ -93,7 +93,6 @@ class WindowBands:
     Attributes:
         radius: rows on either side of a window's centre.
         columns: (H, 2 radius + 1) columns of a window's pixels against its centre.
-        width: of the picture.
     """
 
     radius: int

@@ -101,7 +101,6 @@ def folder_finding(what: str, folder: Path, option: str) -> Finding:
 
     Args:
         what: the use of the folder: "cache" or "results".
-        folder: the folder.
         option: the command line option that chooses another one.
     """
     finding = partial(Finding, "disk", what)

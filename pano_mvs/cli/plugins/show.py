@@ -52,7 +52,6 @@ def show_stage(name: str, console: Console, *, workflow: str | None = None, file
     """Show a stage's documentation, typed ports and settings.
 
     Args:
-        name: of the stage.
         console: where to.
         workflow: a workflow whose plugin files may define it.
         files: more plugin files that may define it.

@@ -15,10 +15,10 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
 from pano_mvs.cli.run.progress import ProgressDisplay
 from pano_mvs.cli.streams import apart
+from pano_mvs.engine.running.events import ignore
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary
-from pano_mvs.session.event_log import line_from_event
-from pano_mvs.session.progress import Event, Progress, ignore
+from pano_mvs.session.progress import Event, Progress, line_from_event
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import lost_scale
 from pano_mvs.session.session import Session
@@ -28,7 +28,6 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
     """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code.
 
     Args:
-        session: the session.
         execution: how units are computed.
         as_json: print events instead.
         advise: whether to print the commands that can follow.
@@ -48,7 +47,6 @@ def run_with_events(run: Callable[[Progress], RunOutput], watch: Progress = igno
     """Call a function that runs something with a callback for events, print these, and return its output.
 
     Args:
-        run: the function.
         watch: receives the events as well.
     """
     stream = apart(sys.stdout)
@@ -70,7 +68,6 @@ def run_shown(session: Session, execution: Execution, console: Console, *, advis
     """Run a workflow, print progress and a summary, and return it.
 
     Args:
-        session: the session.
         execution: how units are computed.
         console: where to print.
         advise: whether to print the commands that can follow.

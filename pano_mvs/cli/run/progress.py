@@ -20,21 +20,10 @@ from rich.text import Text
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.streams import apart
 from pano_mvs.core.text import clock_text, duration_text, one_line, shortened_list
-from pano_mvs.session.progress import (
-    Event,
-    Forecast,
-    KernelsCompiled,
-    RunStarted,
-    StageFinished,
-    TimeLeft,
-    UnitFailed,
-    Warned,
-)
+from pano_mvs.engine.running.events import StageFinished, UnitFailed, Warned
+from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
-_FIRST_LINE_S = 10.0
-_LINE_EVERY_S = 30.0
-_REFRESHES_PER_S = 4
 _COMPILING_S = 20.0
 """Kernels are shown to be compiled for this long after one was: some take so long."""
 
@@ -69,14 +58,14 @@ class ProgressDisplay:
                 Live(
                     get_renderable=self.live_lines,
                     console=self.console,
-                    refresh_per_second=_REFRESHES_PER_S,
+                    refresh_per_second=4,
                     transient=True,
                     redirect_stdout=False,
                     redirect_stderr=False,
                 )
             )
         else:
-            self._open.enter_context(_Repeated(self.print_line, first_s=_FIRST_LINE_S, every_s=_LINE_EVERY_S))
+            self._open.enter_context(_Repeated(self.print_line, first_s=10.0, every_s=30.0))
         return self
 
     def __exit__(

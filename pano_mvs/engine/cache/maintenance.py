@@ -77,7 +77,6 @@ class GarbageCollection:
 
     Attributes:
         runs: remembered runs that are too old.
-        records: records.
         blobs: blobs, and packs that were not finished.
         size_bytes: size of both.
         kept_bytes: size of the blobs that are kept.

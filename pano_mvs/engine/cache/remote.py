@@ -241,7 +241,6 @@ def _problem(name: str, path: Path, *, index: Path) -> str:
     """Return what is wrong with a file of a cache; "" if it is intact.
 
     Args:
-        name: of the file in the cache.
         path: the file, which may still have a temporary name.
         index: its own path, which is beside its pack if it is an index.
     """

@@ -42,8 +42,8 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.stage import Cardinality, Names, Port
 from pano_mvs.scene import Axis
-from pano_mvs.scene.pairs_and_views import pair_from_name
 from pano_mvs.scene.record import changed_text, vanished_text
+from pano_mvs.scene.two_view import pair_from_name
 
 # A process may open only about a thousand files, and a stage may read several kinds.
 _MAX_OPEN_FILES = 128

@@ -19,7 +19,6 @@ class Job:
 
     Attributes:
         number: identifies the job in this run.
-        unit: the unit.
         threads: number of threads that it may use.
         timeout_s: time after which it is ended; 0 for no limit.
         log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.

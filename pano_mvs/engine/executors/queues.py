@@ -46,7 +46,6 @@ class Queue(BaseModel):
     """The jobs of a queueing system.
 
     Attributes:
-        cores: of a job.
         memory: of a job, such as `32GB`.
         walltime: time limit of a job, as the queueing system writes it, such as `04:00:00`.
         jobs: largest number of jobs at a time.
@@ -120,8 +119,6 @@ def job_settings(system: str, queue: Queue, *, places: int, logs: Path) -> dict[
     """Return the arguments of a cluster of dask-jobqueue that describe its jobs.
 
     Args:
-        system: of `SYSTEMS`.
-        queue: settings of the jobs.
         places: number of units at a time in a job.
         logs: folder for what the jobs print; all hosts see it.
     """
@@ -212,7 +209,6 @@ class QueueExecutor(DaskExecutor):
 
         Args:
             store: the cache, in a folder with the same path on all hosts.
-            system: of `SYSTEMS`.
             queue: settings of the jobs.
             threads: threads for a unit; 0 for an equal share of the cores.
 

@@ -85,8 +85,6 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
     """Return everything beside the cache that a worker needs to compute a unit; paths are absolute.
 
     Args:
-        unit: the unit.
-        store: the cache.
         inputs_file: that `write_large_inputs` wrote; None if all inputs are to be in the message.
 
     Raises:

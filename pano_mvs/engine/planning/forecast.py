@@ -71,7 +71,6 @@ def forecast(
     Args:
         plans: of `make_plan`.
         workflow: the workflow that was planned.
-        graph: likewise.
         size: of the capture.
         histories: times of earlier runs; the first that has samples of a stage counts.
         threads: that a unit may use.
@@ -100,8 +99,6 @@ def expected_memory(
 
     Args:
         workflow: that would be run.
-        graph: likewise.
-        size: of the capture.
         histories: as in `forecast`.
         threads: that a unit may use.
     """

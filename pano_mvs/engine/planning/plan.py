@@ -99,7 +99,6 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     """Return why a unit is not in the cache.
 
     Args:
-        unit: the unit.
         last_key: its key in the latest run of this workflow; None if it was not part of that run.
         store: the cache, which may still have the record of that run.
     """
@@ -212,9 +211,7 @@ def make_plan(
 
     Args:
         workflow: with the options applied.
-        graph: likewise.
         store: the cache.
-        options: of the run.
         listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 

@@ -109,7 +109,6 @@ class Dispatcher:
         """Pass a unit to the executor.
 
         Args:
-            unit: the unit.
             siblings: number of units of its stage; if they are few, each may use more threads.
         """
         threads = max(self._executor.threads, self._executor.cores // siblings)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -36,6 +36,10 @@ class Failure:
     blocked: bool = False
     log: str = ""
     said: tuple[str, ...] = ()
+
+    def event(self) -> UnitFailed:
+        """Return the event that the unit has failed."""
+        return UnitFailed(self.stage, self.item, self.cause, self.consequence, self.log, self.said)
 
 
 def consequence_of(entry: StageEntry, item: str) -> str:
@@ -87,6 +91,12 @@ class StageSummary:
             return max(0.0, self.unit_seconds - self.slowest_s) / (self.run - 1)
         return self.unit_seconds / self.run if self.run else 0.0
 
+    def event(self) -> StageFinished:
+        """Return the event that the stage is complete."""
+        counts = self.units, self.run, self.cached, self.failed, self.blocked
+        times = round(self.seconds, 6), round(self.unit_seconds, 6)
+        return StageFinished(self.name, self.use, *counts, *times, dict(self.metrics))
+
 
 @dataclass(slots=True)
 class RunResult:
@@ -134,29 +144,102 @@ class RunResult:
         return sum(stage.cached for stage in self.stages)
 
 
-class Observer:
-    """Is notified of what a run does, as the progress bars of the command line are; this one ignores everything.
+@dataclass(frozen=True, slots=True)
+class StageStarted:
+    """A stage begins; it has this number of units of work."""
 
-    Stages overlap. If a damaged file is found in the cache, the run makes another pass and its stages start again.
+    kind: ClassVar[str] = "stage_started"
+    stage: str
+    units: int
+
+
+@dataclass(frozen=True, slots=True)
+class UnitStarted:
+    """A unit begins to be computed; `item` is empty if the stage has one unit."""
+
+    kind: ClassVar[str] = "unit_started"
+    stage: str
+    item: str
+
+
+@dataclass(frozen=True, slots=True)
+class UnitFailed:
+    """A unit failed; `UnitFinished` follows.
+
+    Attributes:
+        stage: name of the stage in the workflow.
+        item: the image, pair or view; empty if the stage has one unit.
+        cause: what went wrong and what to do about it.
+        consequence: what the result lacks because of it.
+        log: file with what the unit printed; empty if it printed nothing.
+        said: the last lines that it printed.
     """
 
-    def stage_started(self, name: str, units: int) -> None:
-        """The units of a stage are known."""
+    kind: ClassVar[str] = "unit_failed"
+    stage: str
+    item: str
+    cause: str
+    consequence: str = ""
+    log: str = ""
+    said: tuple[str, ...] = ()
 
-    def unit_started(self, name: str, item: str) -> None:
-        """A unit is being computed; this is not called for cached and blocked units."""
 
-    def unit_failed(self, failure: Failure) -> None:
-        """A unit has failed, after all its retries; `unit_finished` follows."""
+@dataclass(frozen=True, slots=True)
+class UnitFinished:
+    """A unit is done, after this time; outcomes are "run" (computed), "cached", "failed" and "blocked"."""
 
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        """A unit is settled; `seconds` is its computing time, 0 if it was not computed."""
+    kind: ClassVar[str] = "unit_finished"
+    stage: str
+    item: str
+    outcome: UnitStatus
+    seconds: float
 
-    def stage_finished(self, summary: StageSummary) -> None:
-        """A stage is complete."""
 
-    def waiting(self) -> None:
-        """Called every few seconds while units are being computed and nothing else happens, if the executor allows."""
+@dataclass(frozen=True, slots=True)
+class StageFinished:
+    """A stage is done.
 
-    def warn(self, text: str) -> None:
-        """There is a warning for the user; the run goes on."""
+    Attributes:
+        stage: its name in the workflow.
+        use: the registered stage, such as `depth.sweep`.
+        units: number of units.
+        run: of these computed.
+        cached: taken from the cache.
+        failed: without a result.
+        blocked: not run, because an input failed.
+        seconds: time during which at least one of its units was being computed.
+        unit_seconds: sum over its computed units.
+        metrics: mean over its units of each figure that the stage reports.
+    """
+
+    kind: ClassVar[str] = "stage_finished"
+    stage: str
+    use: str
+    units: int
+    run: int
+    cached: int
+    failed: int
+    blocked: int
+    seconds: float
+    unit_seconds: float
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """Something unexpected that does not stop the run."""
+
+    kind: ClassVar[str] = "warning"
+    text: str
+
+
+RunEvent = StageStarted | UnitStarted | UnitFailed | UnitFinished | StageFinished | Warned
+Observer = Callable[[RunEvent | None], None]
+"""Is called with what a run does, and with None every few seconds in which nothing happens but that units are computed.
+
+Stages overlap. If a damaged file is found in the cache, the run makes another pass and its stages start again.
+"""
+
+
+def ignore(_event: object) -> None:
+    """Do nothing with an event."""

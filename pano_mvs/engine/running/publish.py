@@ -151,7 +151,6 @@ class Publisher:
     """Writes the files of one run into one folder.
 
     Attributes:
-        out: the folder.
         store: the cache.
         written: the files that were written.
         published: every file of the run, and its digest.
@@ -228,7 +227,6 @@ class Publisher:
         Args:
             stage: name of the stage.
             item: name of the unit.
-            ref: its files.
             to: folder for them inside the output folder.
 
         Returns:

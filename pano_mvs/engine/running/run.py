@@ -35,7 +35,7 @@ from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
-from pano_mvs.engine.running.events import Failure, Observer, RunResult, consequence_of
+from pano_mvs.engine.running.events import Failure, Observer, RunResult, Warned, consequence_of, ignore
 from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
@@ -99,7 +99,7 @@ class Run:
         self.options = options
         self.store = store
         self.out = out
-        self.observer = observer or Observer()
+        self.observer = observer or ignore
         self.executor = executor or SerialExecutor(store)
         self.publisher = Publisher(out, store)
         if options.isolate and not self.executor.enforces_timeouts:
@@ -178,7 +178,7 @@ class Run:
     def warn(self, text: str) -> None:
         """Add a warning to the result, and notify the observer."""
         self._warnings.append(text)
-        self.observer.warn(text)
+        self.observer(Warned(text))
 
     def _execute_passes(self) -> None:
         """Repeat the pass until it finds nothing damaged; what it finds has been removed and is computed again."""
@@ -259,10 +259,8 @@ class Run:
         deadline = time.monotonic() + GRACE_S
         if self.dispatcher and self.executor.enforces_timeouts:
             count = len(self.dispatcher)
-            self.observer.warn(
-                f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s; "
-                "interrupt again to stop at once"
-            )
+            text = f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s"
+            self.observer(Warned(f"{text}; interrupt again to stop at once"))
             while self.dispatcher and (left := deadline - time.monotonic()) > 0:
                 self.dispatcher.next_finished(left)
 
@@ -354,7 +352,7 @@ class RunPass:
             if finished is not None:
                 self._end(finished)
             elif must_wait:
-                self._run.observer.waiting()
+                self._run.observer(None)
 
     def _take_from_cache(self, unit: Unit) -> bool:
         """Settle a unit that is in the cache; return whether it is, or is being computed for another unit."""

@@ -14,7 +14,17 @@ from pano_mvs.core.errors import InputError, RunStoppedError
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
-from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
+from pano_mvs.engine.running.events import (
+    Failure,
+    Observer,
+    RunResult,
+    StageStarted,
+    StageSummary,
+    UnitFinished,
+    UnitStarted,
+    UnitStatus,
+    consequence_of,
+)
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -70,7 +80,7 @@ class RunStatistics:
         units = len(self._states(entry.name).pending)
         self._counts[entry.name] = _StageCount(StageSummary(entry.name, entry.spec.name, units))
         self._result.stages.append(self._counts[entry.name].summary)
-        self._observer.stage_started(entry.name, units)
+        self._observer(StageStarted(entry.name, units))
 
     def unit_blocked(self, entry: StageEntry, item: str, reason: str) -> None:
         """Count a unit that cannot run; in a source, it is an image that cannot be used.
@@ -86,7 +96,7 @@ class RunStatistics:
             summary.blocked += 1
             failure = Failure(entry.name, item, f"it {reason}", consequence=consequence_of(entry, item), blocked=True)
         self._result.failures.append(failure)
-        self._observer.unit_finished(entry.name, item, status="blocked", seconds=0.0)
+        self._observer(UnitFinished(entry.name, item, "blocked", 0.0))
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
 
@@ -96,7 +106,7 @@ class RunStatistics:
         if not count.running:
             count.began = time.perf_counter()
         count.running.add(item)
-        self._observer.unit_started(entry.name, item)
+        self._observer(UnitStarted(entry.name, item))
 
     def unit_done(self, entry: StageEntry, item: str, record: UnitRecord, *, status: UnitStatus) -> None:
         """Count a unit with a result."""
@@ -117,8 +127,8 @@ class RunStatistics:
             count.rejected[item] = dict(record.rejected)
         if record.doubts:
             count.doubts[item] = dict(record.doubts)
-        seconds = record.seconds if status == "run" else 0.0
-        self._observer.unit_finished(entry.name, item, status=status, seconds=seconds)
+        seconds = round(record.seconds, 6) if status == "run" else 0.0
+        self._observer(UnitFinished(entry.name, item, status, seconds))
 
     def unit_failed(self, failure: Failure, seconds: float) -> None:
         """Count a unit without a result."""
@@ -126,8 +136,8 @@ class RunStatistics:
         self._stop_clock(count, failure.item)
         count.summary.failed += 1
         self._result.failures.append(failure)
-        self._observer.unit_failed(failure)
-        self._observer.unit_finished(failure.stage, failure.item, status="failed", seconds=seconds)
+        self._observer(failure.event())
+        self._observer(UnitFinished(failure.stage, failure.item, "failed", round(seconds, 6)))
 
     def unit_withdrawn(self, failure: Failure, *, was_computed: bool) -> None:
         """Count a unit as failed that was counted with a result before."""
@@ -138,7 +148,7 @@ class RunStatistics:
         for found in (count.metrics, count.notes, count.rejected, count.doubts):
             found.pop(failure.item, None)
         self._result.failures.append(failure)
-        self._observer.unit_failed(failure)
+        self._observer(failure.event())
 
     def stage_complete(self, entry: StageEntry) -> None:
         """Complete the summary of a stage.
@@ -159,7 +169,7 @@ class RunStatistics:
         source_notes = self._source_notes.get(entry.name, {})
         notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
         summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
-        self._observer.stage_finished(summary)
+        self._observer(summary.event())
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_MAX_SHOWN_CAUSES])
             listed = len(state.members)

@@ -58,7 +58,6 @@ class Registry:
     """The stages by name, and the plugins that define them.
 
     Attributes:
-        stages: by name.
         registrations: what plugins registered beside stages, by kind and name.
         origins: stage name to the plugin that defines it.
         plugins: all that were found, including broken ones.

@@ -47,7 +47,6 @@ def read_text(path: Path, what: str = "workflow") -> str:
     """Return the text of a YAML file.
 
     Args:
-        path: the file.
         what: its purpose, for messages.
 
     Raises:

@@ -18,7 +18,6 @@ class Edge:
     """A connection from a stage to a port of another one.
 
     Attributes:
-        port: the port.
         producer: name of the stage that feeds it.
         exploded: whether it carries the items of the producer's collection instead of the collection.
     """

@@ -90,7 +90,6 @@ class CloudEvaluation:
         scores: accuracy, completeness and F-score at each tolerance.
         cloud: the points, in the truth's frame.
         is_aligned: whether poses brought the cloud into the truth's frame; otherwise it was taken to lie in it.
-        compared: the truth.
         distances: from cloud to truth and back, measured up to `farthest`.
         limits: the tolerances in rising order.
         farthest: in the truth's unit.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +13,7 @@ from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.clouds.distances import Points, PointsInMemory
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation
-from pano_mvs.evaluation.drawing import WIDTH, put_text, strip, write_stack
+from pano_mvs.evaluation.drawing import WIDTH, drawn_figure
 from pano_mvs.io.ply import RGB, ply_header
 
 _VERTEX = np.dtype([*((name, "<f4") for name in "xyz"), *((name, "u1") for name in RGB), ("distance", "<f4")])
@@ -71,7 +70,7 @@ def write_error_cloud(
 
 
 _MAX_POINTS, _MAX_VIEWS = 2_000_000, 12
-_LINE, _SIZE_HW = 28, (640, WIDTH)
+_SIZE_HW = 640, WIDTH
 
 
 def write_error_clouds(folder: Path, evaluation: CloudEvaluation) -> None:
@@ -106,7 +105,7 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
     missed = surface.area * (distances.of_surface > limits[-1])
     lost = np.bincount(surface.view_idx, missed, max(1, len(evaluation.compared.used)))
     shown = set(np.argsort(-lost, kind="stable")[:_MAX_VIEWS].tolist())
-    parts = [_legend(evaluation)]
+    shown_pictures: list[tuple[str, Picture]] = []
     for idx, (name, view) in enumerate(evaluation.compared.used.items()):
         if idx not in shown:
             continue
@@ -116,27 +115,42 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
         rows = np.unique(np.nonzero(~np.isnan(panorama))[0])
         step = int(np.diff(rows).min()) if len(rows) > 1 else 1  # between rows with samples
         colors = distance_colors(panorama[step // 2 :: step, step // 2 :: step], limits)
-        size = WIDTH, round(WIDTH * colors.shape[0] / colors.shape[1])
-        parts += [
-            strip(_LINE, f"{name}: true surface, by its distance from the cloud"),
-            np.asarray(cv2.resize(colors, size, interpolation=cv2.INTER_NEAREST), np.uint8),
-        ]
+        shown_pictures.append((f"{name}: true surface, by its distance from the cloud", colors))
     points, _, of_points = _some_points(evaluation)
-    parts += [strip(_LINE, "cloud from above, by its distance from the true surface")]
-    write_stack(path, [*parts, _top_view(points, of_points, evaluation)])
+    if len(points):
+        title = "cloud from above, by its distance from the true surface"
+        shown_pictures.append((title, _top_view(points, of_points, limits)))
+    _write_pictures(path, shown_pictures, limits)
 
 
 def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str, evaluation: CloudEvaluation) -> None:
     """Write a PNG of points coloured by their distances, seen from three places, with a legend."""
     points, normals, distances = cloud
-    parts = [_legend(evaluation)]
+    pictures: list[tuple[str, Picture]] = []
     if len(points):
         cameras, up = evaluation.compared.cameras, evaluation.compared.up
         colors = distance_colors(distances, evaluation.limits)
         for view in viewpoints(points, cameras, up, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
-            parts.append(strip(_LINE, f"{title}, {view.title.lower()}"))
-            parts.append(draw_cloud(points, normals, colors, viewpoint=view, size_hw=_SIZE_HW))
-    write_stack(path, parts)
+            drawn = draw_cloud(points, normals, colors, viewpoint=view, size_hw=_SIZE_HW)
+            pictures.append((f"{title}, {view.title.lower()}", drawn))
+    _write_pictures(path, pictures, evaluation.limits)
+
+
+def _write_pictures(path: Path, pictures: Sequence[tuple[str, Picture]], limits: Sequence[float]) -> None:
+    """Write a PNG of pictures with titles below each other, and of what the colours of `distance_colors` mean."""
+    from matplotlib.patches import Patch
+
+    heights = [WIDTH * len(picture) / picture.shape[1] for _, picture in pictures]
+    entries = [(limit, f"up to {limit:g}") for limit in limits] + [(np.inf, "farther"), (np.nan, "not counted")]
+    colors = distance_colors(np.array([distance for distance, _ in entries], np.float32), limits) / 255
+    patches = [Patch(color=color, label=text) for color, (_, text) in zip(colors, entries, strict=True)]
+    with drawn_figure(path, (WIDTH, sum(heights) + 40 * len(pictures) + 60)) as figure:
+        figure.legend(handles=patches, loc="outside upper left", ncols=len(patches), frameon=False)
+        for idx, (title, picture) in enumerate(pictures):
+            axes = figure.add_subplot(len(pictures), 1, idx + 1)
+            axes.imshow(picture, interpolation="nearest")
+            axes.set_title(title, loc="left")
+            axes.set_axis_off()
 
 
 def _some_points(evaluation: CloudEvaluation) -> tuple[Points, Points, Points]:
@@ -156,30 +170,16 @@ def _towards_cameras(evaluation: CloudEvaluation, step: int) -> Points:
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True), np.float32)
 
 
-def _top_view(points: Points, distances: Points, evaluation: CloudEvaluation) -> Picture:
+def _top_view(points: Points, distances: Points, limits: Sequence[float]) -> Picture:
     """Return the cloud from above without its outermost 1 %; of the points of a pixel, the worst is shown."""
     flat = points[:, [0, 2]].astype(np.float64)
-    if not len(flat):
-        return strip(_LINE)
     low, high = np.quantile(flat, [0.005, 0.995], axis=0)
     scale = (WIDTH - 1) / max(float((high - low).max()), 1e-9)
     size = np.minimum(np.ceil((high - low) * scale).astype(int) + 1, WIDTH)  # the product may round above WIDTH - 1
     pixel = np.rint((flat - low) * scale).astype(int)
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     order = np.flatnonzero(inside)[np.argsort(distances[inside], kind="stable")]
-    view = strip(int(size[1]))
+    view = np.full((size[1], WIDTH, 3), 255, np.uint8)
     # z points ahead, which is upwards in the picture.
-    view[size[1] - 1 - pixel[order, 1], pixel[order, 0]] = distance_colors(distances[order], evaluation.limits)
+    view[size[1] - 1 - pixel[order, 1], pixel[order, 0]] = distance_colors(distances[order], limits)
     return view
-
-
-def _legend(evaluation: CloudEvaluation) -> Picture:
-    """Return a strip (28, 1024, 3) RGB with the colours of `distance_colors` and the distances that they stand for."""
-    legend = strip(_LINE)
-    limits = evaluation.limits
-    entries = [(limit, f"up to {limit:g}") for limit in limits] + [(np.inf, "farther"), (np.nan, "not counted")]
-    for idx, (distance, text) in enumerate(entries):
-        left = 8 + idx * (WIDTH - 8) // len(entries)
-        legend[6 : _LINE - 6, left : left + 20] = distance_colors(np.array([distance], np.float32), limits)[0]
-        put_text(legend, text, (left + 26, _LINE - 9))
-    return legend

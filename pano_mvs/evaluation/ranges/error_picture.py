@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.file_names import file_inside, path_inside
-from pano_mvs.evaluation.drawing import INK, WIDTH, put_text, strip, write_stack
+from pano_mvs.evaluation.drawing import WIDTH, drawn_figure
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
 from pano_mvs.evaluation.ranges.pairs import RangePairs
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
@@ -20,23 +21,14 @@ from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 from pano_mvs.scene import FilePart, Panorama
 
-_HEIGHT, _GAP, _CAPTION, _BAR, _FOOT = WIDTH // 2, 8, 34, 20, 60
-_SCALE_LEFT, _SCALE_LENGTH = 48, 640
-_GREY, _MISSING = (128, 128, 128), (25, 25, 25)
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+
+_BAR: Any = {"orientation": "horizontal", "aspect": 50, "pad": 0.01}
 # From too near over correct to too far; distinguishable for colour-blind readers. Lightness shows the size of an error,
 # hue its sign.
-_SIGNED = np.array(
-    [
-        (16, 44, 110),
-        (50, 116, 190),
-        (158, 202, 232),
-        (245, 245, 242),
-        (246, 190, 130),
-        (210, 92, 40),
-        (116, 18, 18),
-    ],
-    np.float64,
-)
+_SIGNED = ("#102c6e", "#3274be", "#9ecae8", "#f5f5f2", "#f6be82", "#d25c28", "#741212")
 
 
 def write_depth_pictures(
@@ -75,27 +67,36 @@ def write_error_picture(
         counted: (H, W), False where an error does not count; None: counts wherever the truth is known.
         limit: the error at the ends of the scale; larger ones have the colour of the end.
     """
+    from matplotlib.patches import Patch
+
     counted = np.isfinite(truth) if counted is None else counted & np.isfinite(truth)
     near, far = range_limits(np.where(np.isfinite(truth), truth, estimated).astype(np.float32))
-    error = error_colored(signed_error(estimated, truth), limit, counted=counted)
-    empty = np.full((_HEIGHT, WIDTH, 3), 240, np.uint8)
-    shown = empty if image is None else cv2.resize(image, (WIDTH, _HEIGHT), interpolation=cv2.INTER_AREA)
-    panorama = "panorama" if image is not None else "panorama: not given (--images)"
-    top = (
-        [strip(_CAPTION, panorama), np.asarray(shown, np.uint8), strip(_FOOT)],
-        [strip(_CAPTION, "signed error, estimate / truth - 1"), _fitted(error), _error_bar(limit)],
-    )
-    bottom = [
-        [
-            strip(_CAPTION, f"{what} range"),
-            _fitted(color_mapped(ranges.astype(np.float32), near, far)),
-            _range_bar(near, far),
-        ]
-        for what, ranges in (("estimated", estimated), ("true", truth))
-    ]
-    gap = np.full((_CAPTION + _HEIGHT + _FOOT, _GAP, 3), 255, np.uint8)
-    rows = [np.hstack([np.vstack(left), gap, np.vstack(right)]) for left, right in (top, bottom)]
-    write_stack(path, rows)
+    colors = range_colors(near, far)
+    patches = [Patch(color="#191919", label="no range"), Patch(color="#808080", label="no truth")]
+    with drawn_figure(path, (2 * WIDTH, 1200)) as figure:
+        figure.set_layout_engine(None)  # takes longer than drawing
+        (panorama, errors), *below = figure.subplots(2, 2)
+        figure.subplots_adjust(0.02, 0.03, 0.98, 0.96, wspace=0.05, hspace=0.1)
+        empty = np.full((1, 2, 3), 240, np.uint8)
+        _show(
+            panorama, empty if image is None else image, f"panorama{': not given (--images)' if image is None else ''}"
+        )
+        shown = error_colored(signed_error(estimated, truth), limit, counted=counted)
+        _show(errors, shown, "signed error, estimate / truth - 1")
+        errors.legend(handles=patches, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, frameon=False)
+        figure.colorbar(signed_colors(limit), ax=errors, format=lambda error, _: f"{100 * error:+.3g} %", **_BAR)
+        for axes, ranges, what in zip(below[0], (estimated, truth), ("estimated", "true"), strict=True):
+            _show(axes, color_mapped(ranges.astype(np.float32), near, far), f"{what} range")
+            bar = figure.colorbar(colors, ax=axes, ticks=scale_ticks(near, far), format="{x:g}", **_BAR)
+            bar.minorticks_off()
+
+
+def _show(axes: Axes, picture: Picture, title: str) -> None:
+    """Show a picture: larger ones averaged, smaller ones with repeated pixels."""
+    how = cv2.INTER_AREA if picture.shape[1] > WIDTH else cv2.INTER_NEAREST
+    axes.imshow(cv2.resize(picture, (WIDTH, WIDTH // 2), interpolation=how), interpolation="nearest")
+    axes.set_title(title)
+    axes.set_axis_off()
 
 
 def signed_error(estimated: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -105,15 +106,29 @@ def signed_error(estimated: NDArray[np.floating], truth: NDArray[np.floating]) -
     return np.where(np.isfinite(error), error, np.nan)
 
 
+def signed_colors(limit: float) -> ScalarMappable:
+    """Return the colours of signed errors, for errors up to ± the limit; NaN is black."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colors = LinearSegmentedColormap.from_list("signed", _SIGNED, N=1024)
+    return ScalarMappable(Normalize(-limit, limit), colors.with_extremes(bad="#191919"))
+
+
+def range_colors(near: float, far: float) -> ScalarMappable:
+    """Return the colours of ranges as `color_mapped` gives them."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, LogNorm
+
+    colors = color_mapped(np.geomspace(near, far, 256, dtype=np.float32)[None], near, far)[0]
+    return ScalarMappable(LogNorm(near, far), ListedColormap(colors / 255))
+
+
 def error_colored(error: NDArray[np.float64], limit: float, *, counted: NDArray[np.bool_] | None = None) -> Picture:
     """Return signed errors as colours, (..., 3) RGB: black where NaN, grey where not counted."""
-    place = (np.clip(np.nan_to_num(error / limit), -1, 1) + 1) / 2 * (len(_SIGNED) - 1)
-    at = np.minimum(place.astype(np.intp), len(_SIGNED) - 2)
-    share = (place - at)[..., None]
-    colors: Picture = np.rint((1 - share) * _SIGNED[at] + share * _SIGNED[at + 1]).astype(np.uint8)
-    colors[np.isnan(error)] = _MISSING
+    colors = np.asarray(signed_colors(limit).to_rgba(np.ma.masked_invalid(error), bytes=True)[..., :3], np.uint8)
     if counted is not None:
-        colors[~counted] = _GREY
+        colors[~counted] = 128
     return colors
 
 
@@ -135,37 +150,3 @@ def _panoramas(images: Path | None, pairs: RangePairs) -> Mapping[str, Path]:
 def _load(path: Path) -> Picture:
     info = describe_picture(path)
     return Panorama(FilePart(path, external=True), info.size_hw, info.size_hw, crop_ltwh=info.crop_ltwh).load()
-
-
-def _fitted(colors: Picture) -> Picture:
-    """Return a picture at the panel's size: larger ones averaged, smaller ones with repeated pixels."""
-    how = cv2.INTER_AREA if colors.shape[1] > WIDTH else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(colors, (WIDTH, _HEIGHT), interpolation=how), np.uint8)
-
-
-def _range_bar(near: float, far: float) -> Picture:
-    places = (near * (far / near) ** np.linspace(0, 1, _SCALE_LENGTH)).astype(np.float32)
-    ticks = {f"{value:g}": float(np.log(value / near) / np.log(far / near)) for value in scale_ticks(near, far)}
-    return _bar(color_mapped(places[None], near, far), ticks, {"no range": _GREY})
-
-
-def _error_bar(limit: float) -> Picture:
-    places = np.linspace(-limit, limit, _SCALE_LENGTH)[None]
-    ticks = {f"{100 * limit * share:+.3g} %" if share else "0": (share + 1) / 2 for share in (-1, -0.5, 0, 0.5, 1)}
-    return _bar(error_colored(places, limit), ticks, {"no range": _MISSING, "no truth": _GREY})
-
-
-def _bar(colors: Picture, ticks: Mapping[str, float], others: Mapping[str, tuple[int, int, int]]) -> Picture:
-    """Return a strip with a scale of colours, (1, N, 3), numbers at shares of its length, and single colours."""
-    bar = strip(_FOOT)
-    bottom, length = 6 + _BAR, colors.shape[1]
-    bar[6:bottom, _SCALE_LEFT : _SCALE_LEFT + length] = colors
-    for text, share in ticks.items():
-        x = _SCALE_LEFT + round(share * (length - 1))
-        cv2.line(bar, (x, bottom), (x, bottom + 5), INK, 1)
-        put_text(bar, text, (x, bottom + 20), centered=True)
-    for idx, (text, color) in enumerate(others.items()):
-        x = _SCALE_LEFT + length + 50 + 130 * idx
-        cv2.rectangle(bar, (x, 6), (x + _BAR, bottom), color, cv2.FILLED)
-        put_text(bar, text, (x + _BAR + 8, _BAR))
-    return bar

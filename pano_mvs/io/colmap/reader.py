@@ -66,7 +66,6 @@ class ModelImage:
         name: of the file, relative to the folder of the images.
         quat_wxyz: rotation of cam_from_world as stored, (4,).
         translation: of cam_from_world, (3,).
-        camera_id: of its camera.
         pixels: (n, 2), its key points.
         point_ids: (n,), the point that each key point observes; negative without one.
         where: the file and the image, for error messages.

@@ -149,7 +149,6 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
     """Yield the files of a capture, following links, except hidden files, masks, outputs of runs and caches.
 
     Args:
-        folder: the folder.
         notes: a warning is appended for each subfolder that cannot be listed, and each image that is not a file.
 
     Raises:
@@ -244,7 +243,6 @@ def list_rig_pictures(
     """Return the captures in a folder and its subfolders, in natural order.
 
     Args:
-        folder: the folder.
         lens_names: names of the two lenses.
         layout: "side_by_side": each file shows both lenses, the first on the left; "folders": one of the folders in
             the path of a file has the name of its lens, as in front/000.jpg; "suffixes": file names end with a

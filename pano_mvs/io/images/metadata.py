@@ -21,8 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pano_mvs.core.text import shortened
-from pano_mvs.core.xml_text import xml_root
+from pano_mvs.core.text import shortened, xml_root
 from pano_mvs.scene.image_header import (
     PNG_START,
     Entry,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
-from pano_mvs.core.xml_text import xml_root
+from pano_mvs.core.text import xml_root
 
 FACES = "frblud"
 NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top": "u", "down": "d", "bottom": "d"}

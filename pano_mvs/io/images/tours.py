@@ -125,12 +125,7 @@ def _is_panorama(path: Path) -> bool:
 
 
 class _Capture:
-    """The files of a folder, by their paths below it; what a configuration states is looked up here, and nowhere else.
-
-    Args:
-        folder: the folder.
-        files: the files in it.
-    """
+    """The files of a folder by their paths below it: what a configuration states is looked up here alone."""
 
     def __init__(self, folder: Path, files: Sequence[Path]) -> None:
         self.folder, self.files = folder, files

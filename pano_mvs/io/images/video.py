@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, is_folder, problem_of
 from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
-from pano_mvs.io.images.stereo import stereo_layout
-from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye
+from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye, stereo_layout
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace FFmpeg's messages
 
@@ -80,7 +79,6 @@ def describe_video(path: Path, stereo: StereoSetting = "auto") -> VideoInfo:
     """Return the header of a video after checking that its frames may be panoramas.
 
     Args:
-        path: the video.
         stereo: how its frames show both eyes; "auto": as its metadata say, else if square frames, or frames four times
             as wide as high, have two halves that are nearly equal.
 

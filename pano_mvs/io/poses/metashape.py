@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.xml_text import xml_root
+from pano_mvs.core.text import xml_root
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
 from pano_mvs.scene.poses import Poses

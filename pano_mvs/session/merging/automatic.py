@@ -48,7 +48,6 @@ def decision_of(
     """Return the division that the options of `run` state, or without a size the one that `decide_blocks` finds.
 
     Args:
-        session: the session.
         execution: how units are computed.
         size: maximum number of images of a block; 0 for no blocks; None to decide.
         overlap: images that consecutive blocks share; 0 for the default.
@@ -78,7 +77,6 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
     scheduler, whose memory is not known.
 
     Args:
-        session: the session.
         execution: how units are computed.
 
     Raises:

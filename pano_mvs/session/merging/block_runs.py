@@ -23,9 +23,9 @@ from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.scene import Poses
-from pano_mvs.session.final_stages import chain_of
 from pano_mvs.session.merging.merge import require_free
 from pano_mvs.session.session import Session, check_output
+from pano_mvs.session.summarise import chain_of
 
 
 @dataclass(frozen=True)

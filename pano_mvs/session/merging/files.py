@@ -40,7 +40,6 @@ class Block:
 
     Attributes:
         run: its output.
-        poses: of the largest group.
         left_out: names of the cameras in other groups.
     """
 
@@ -151,7 +150,6 @@ class MergeFiles:
 
     Attributes:
         out: the output folder.
-        blocks: the blocks.
         world_from_block: the similarity of each.
         merged: the merged cameras.
         written: files that depend on the images and the stages of the blocks, relative to the folder.

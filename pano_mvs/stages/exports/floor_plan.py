@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from pano_mvs.algorithms.floor_plan.drawing import bar_length, draw_plan, strip_px
-from pano_mvs.algorithms.floor_plan.plan_grid import Extent, PlanGrid, Storey, find_storeys
+from pano_mvs.algorithms.floor_plan.plan_grid import (
+    Extent,
+    PlanGrid,
+    Storey,
+    bar_length,
+    draw_plan,
+    find_storeys,
+    strip_px,
+)
 from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
 from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
 from pano_mvs.core.arrays import FloatArray
@@ -25,11 +32,9 @@ Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 _SAMPLED_POINTS = 500_000
 _EDGE_QUANTILE = 0.003
 _MARGIN = 0.03
-_CELL_PX = 4
 _MIN_POINTS = 100
 # In terms of the height of the room.
 _LENGTH_SHARE, _GAP_SHARE, _SNAP_SHARE = 0.15, 0.12, 0.08
-_CUT_SHARE = 0.9
 _MAX_SIDE_PX = 4096
 
 
@@ -43,9 +48,7 @@ class FloorPlanParams(Params):
         default=1600, ge=100, le=_MAX_SIDE_PX, description="longer side of the plan in pixels, if `pixel` is 0"
     )
     pixel: float = Field(default=0.0, ge=0, description="edge of a pixel in scene units; 0: by `width_px`")
-    cut: float = Field(
-        default=_CUT_SHARE, gt=0, le=2, description="height of the cut of the orthophoto, in camera heights"
-    )
+    cut: float = Field(default=0.9, gt=0, le=2, description="height of the cut of the orthophoto, in camera heights")
     min_wall_share: float = Field(
         default=0.4, gt=0, le=1, description="share of the height of the room at which a wall must be seen"
     )
@@ -153,7 +156,7 @@ class _GroupPlan:
         """Write the files of one storey, and return its entry in floor_plan.json."""
         heights = self.centers[list(storey.cameras), 2]
         eyes = float(np.median(heights)) if len(heights) else storey.ceiling
-        grid = PlanGrid(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor), cell_px=_CELL_PX)
+        grid = PlanGrid(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor), cell_px=4)
         for points, normals, colors in self._chunks():
             grid.add(points, normals, colors)
         walls = wall_lines(

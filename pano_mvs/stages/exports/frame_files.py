@@ -245,7 +245,6 @@ def write_transforms(
         root: folder of the variants in the output folder.
         group: poses and frames.
         cloud: of the group; None: the sparse points of its poses.
-        params: of the initial points.
         ctx: of the stage.
         file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
     """

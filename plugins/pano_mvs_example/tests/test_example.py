@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pano_mvs.api import Context, PointCloud
+from pano_mvs.api import Context, PointCloud, Rigid3
 from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
-from pano_mvs.testing.scenes import courtyard
+from pano_mvs.testing.room import Room, render
+from pano_mvs.testing.surfaces import Cuboid, Quad
 
 from pano_mvs_example import sky, xyz
 from pano_mvs_example.sky_mask import SkyParams, find_sky
@@ -24,7 +25,15 @@ def test_keeps_the_contract(contract_test: ContractTest) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_sky_is_found_and_little_else(seed: int) -> None:
-    picture, ranges = courtyard(seed=seed, turned=False).view(0, SIZE_HW)
+    brick = ((0.62, 0.36, 0.27), (0.50, 0.40, 0.33))
+    ground = Quad((-30.0, 1.6, -30.0), (60.0, 0.0, 0.0), (0.0, 0.0, 60.0), brick)
+    yard = (
+        ground,
+        Cuboid((-9.0, -2.0, 6.0), (9.0, 1.6, 7.0), brick),
+        Cuboid((-8.0, -3.5, -9.0), (2.0, 1.6, -5.0), brick),
+    )
+    room = Room(yard, "outdoor", seed, sky=((0.36, 0.55, 0.86), (0.80, 0.86, 0.92)))
+    picture, ranges = render(room, Rigid3.identity(), SIZE_HW)
     truth = np.isnan(ranges)
     found = find_sky(picture, np.ones(SIZE_HW, np.bool_), SkyParams(margin_px=0))
     assert (found & truth).sum() / truth.sum() > 0.9

@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.faces.layout import face_centers
 from pano_mvs.algorithms.features import sphorb
-from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid
-from pano_mvs.algorithms.features.sphorb import extract_sphorb, grid_pyramid, smooth_panorama
+from pano_mvs.algorithms.features.sphorb import NEIGHBOURS, GeodesicGrid, extract_sphorb, grid_pyramid, smooth_panorama
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import angle_between, ray_grid, roll_panorama
 

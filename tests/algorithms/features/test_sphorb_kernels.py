@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features import kernels_sphorb as kernels
-from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring
-from pano_mvs.algorithms.features.sphorb import binary_tests, lattice_disc
+from pano_mvs.algorithms.features.sphorb import NEIGHBOURS, GeodesicGrid, binary_tests, hexagon_ring, lattice_disc
 from tests.oracles import sphorb as oracle
 
 STEPS, MARGIN = 12, 9

@@ -12,8 +12,8 @@ from pano_mvs.algorithms.filters.planes import fit_plane, lay_planes, plain_surf
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
-from pano_mvs.testing.scenes import white_room
 from tests.algorithms.range_scenes import TRUSTED, as_map
+from tests.synthetic.scenes import white_room
 
 Wall = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap]
 

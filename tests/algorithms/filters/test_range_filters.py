@@ -18,8 +18,7 @@ from pano_mvs.algorithms.filters.data_term import confidence_weight, require_con
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours, large_holes
 from pano_mvs.algorithms.filters.guided import guided_range, guided_values
 from pano_mvs.algorithms.filters.planes import lay_planes
-from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range
-from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range, remove_speckles
 from pano_mvs.algorithms.filters.supported import supported_pixels
 from pano_mvs.algorithms.panoramas import box_spread, box_sum, columns_per_step, largest_channel
 from pano_mvs.algorithms.patchmatch.refine import refine_range

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.fusion import voxels
-from pano_mvs.algorithms.fusion.fuse import fuse_reference, fuse_stream, fuse_views, join_clouds
+from pano_mvs.algorithms.fusion import fuse
+from pano_mvs.algorithms.fusion.fuse import fuse_stream, join_clouds
 from pano_mvs.algorithms.fusion.kernels_fuse import add_source, find_supported
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces, surface_heights
 from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView, nearest_views
-from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec, sines_of_grid
 from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along
+from tests.algorithms.fusion.whole import fuse_reference, fuse_views, thin_by_voxels
 from tests.algorithms.range_scenes import as_map, box_range, room_range
 from tests.known import known
 from tests.oracles import fusion as fusion_oracle
@@ -350,8 +350,8 @@ class TestVoxels:
         parts = [self.cloud(rng.uniform(-1, 1, (200, 3))) for _ in range(5)]
         whole = thin_by_voxels(join_clouds(parts), 0.3)
         for waiting in (10, 10**9):
-            monkeypatch.setattr(voxels, "_MIN_WAITING", waiting)
-            grid = voxels.VoxelGrid(0.3)
+            monkeypatch.setattr(fuse, "_MIN_WAITING", waiting)
+            grid = fuse.VoxelGrid(0.3)
             for part in parts:
                 grid.add(part)
             for name, values in vars(grid.cloud()).items():

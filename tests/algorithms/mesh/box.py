@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.mesh.view_quality import PaintView
-from pano_mvs.algorithms.mesh.visibility import surface_view
+from pano_mvs.algorithms.mesh.view_quality import PaintView, surface_view
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 

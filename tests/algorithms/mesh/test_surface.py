@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.mesh.atlas import Texels
 from pano_mvs.algorithms.mesh.surface import FreeSpace, decimated
-from pano_mvs.algorithms.mesh.visibility import surface_view, vertex_normals
+from pano_mvs.algorithms.mesh.view_quality import surface_view, vertex_normals
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap

@@ -22,8 +22,8 @@ from pano_mvs.geometry import Rigid3, roll_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
-from pano_mvs.testing.scenes import courtyard, desk
 from tests.synthetic.places import plain_table
+from tests.synthetic.scenes import courtyard, desk
 
 SPACINGS = ("parallax", "inverse", "log", "uniform")
 

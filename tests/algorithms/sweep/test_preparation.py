@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.exposure import match_exposure, shrink
+from pano_mvs.algorithms.sweep.exposure import KnownPixels, match_exposure, shrink
 from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window, prepare_picture
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
@@ -28,7 +28,7 @@ def test_the_exposure_is_found_although_a_third_of_the_ranges_is_wrong(pair: Pai
     first, second, pose, ranges = pair
     reference = np.clip(np.rint(gain * first + offset), 0, 255).astype(np.uint8)
     wrong = np.random.default_rng(0).random(ranges.shape) < 1 / 3
-    found = match_exposure(reference, second, pose, ranges=np.where(wrong, 0.5, ranges).astype(np.float32))
+    found = match_exposure(second, pose, KnownPixels.of(reference, np.where(wrong, 0.5, ranges).astype(np.float32)))
     np.testing.assert_allclose(found.gain, gain, atol=0.05)
     middle = found.gain * 110 + found.offset
     np.testing.assert_allclose(middle, gain * 110 + offset, atol=2.5)
@@ -39,17 +39,19 @@ def test_the_same_exposure_is_found_to_be_the_same(pair: Pair) -> None:
     first, second, pose, ranges = pair
     rng = np.random.default_rng(0)
     noisy = np.clip(np.rint(second + rng.normal(0, 2, second.shape)), 0, 255).astype(np.uint8)
-    np.testing.assert_array_equal(match_exposure(first, noisy, pose, ranges=ranges).apply(noisy), noisy)
+    np.testing.assert_array_equal(match_exposure(noisy, pose, KnownPixels.of(first, ranges)).apply(noisy), noisy)
 
 
 def test_an_exposure_that_cannot_be_known_is_left_alone(pair: Pair) -> None:
     first, second, pose, ranges = pair
     nowhere = np.full_like(ranges, np.nan)
-    assert match_exposure(first, second, pose, ranges=nowhere).gain.tolist() == [1, 1, 1]
+    assert match_exposure(second, pose, KnownPixels.of(first, nowhere)).gain.tolist() == [1, 1, 1]
     plain = np.full_like(first, 90)
-    assert match_exposure(plain, plain, pose, ranges=ranges).offset.tolist() == [0, 0, 0]
+    assert match_exposure(plain, pose, KnownPixels.of(plain, ranges)).offset.tolist() == [0, 0, 0]
     unrelated = np.random.default_rng(1).integers(0, 256, first.shape, dtype=np.uint8)
-    np.testing.assert_array_equal(match_exposure(first, unrelated, pose, ranges=ranges).apply(unrelated), unrelated)
+    np.testing.assert_array_equal(
+        match_exposure(unrelated, pose, KnownPixels.of(first, ranges)).apply(unrelated), unrelated
+    )
 
 
 def test_a_masked_source_does_not_spoil_the_exposure(pair: Pair) -> None:
@@ -57,7 +59,7 @@ def test_a_masked_source_does_not_spoil_the_exposure(pair: Pair) -> None:
     spoilt, mask = second.copy(), np.ones(second.shape[:2], np.bool_)
     mask[20:] = False
     spoilt[20:] = 255 - spoilt[20:]
-    found = match_exposure(first, spoilt, pose, ranges=ranges, source_mask=mask)
+    found = match_exposure(spoilt, pose, KnownPixels.of(first, ranges), source_mask=mask)
     np.testing.assert_allclose(found.gain, 1, atol=0.08)
 
 

@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_rotvec
-from pano_mvs.testing import scenes
-from pano_mvs.testing.scenes import Scene
 from tests.benchmarks.poses.captures_with_truth import Cameras, Pictures
 from tests.benchmarks.poses.house_of_rooms import House
 from tests.benchmarks.poses.house_walk import walk_poses, walk_view
@@ -20,7 +18,9 @@ from tests.benchmarks.poses.tours.plan import Style, build
 from tests.benchmarks.poses.tours.rendering import lit, panorama
 from tests.repeating.places import REPEATS, draw_sizes
 from tests.repeating.walks import LAYOUTS
+from tests.synthetic import scenes
 from tests.synthetic.places import large_plain_room
+from tests.synthetic.scenes import Scene
 
 WIDTH = 384
 SIZE_HW = (WIDTH // 2, WIDTH)

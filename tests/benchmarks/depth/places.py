@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.panorama import StaticMasks
-from pano_mvs.testing.scenes import SCENES
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, extras
 from tests.stored import read_picture
 from tests.synthetic.places import large_plain_room, yard
 from tests.synthetic.rig import RIGS, with_rig
+from tests.synthetic.scenes import SCENES
 
 SCENE_MAKERS = {**SCENES, "yard": yard, "large_plain_room": large_plain_room}
 # What "soft" images look like: as if enlarged, with the noise and the compression of a consumer camera.

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
-from pano_mvs.testing.scenes import courtyard
 from tests.benchmarks.captures import SCRATCH, Capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.benchmarks.depth.scores import share_of_sphere
 from tests.benchmarks.table import print_table
 from tests.synthetic.places import window_room, yard
+from tests.synthetic.scenes import courtyard
 
 MAKERS = {maker.__name__: maker for maker in (courtyard, yard, window_room)}
 PLACES: tuple[tuple[str, dict[str, Any]], ...] = (

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.scenes import Scene, poles
 from tests.benchmarks.captures import SCRATCH, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.benchmarks.table import print_table
+from tests.synthetic.scenes import Scene, poles
 from tests.synthetic.thin import THIN_KINDS, thin_pixels, thin_scene
 
 KINDS = ("poles", *THIN_KINDS)

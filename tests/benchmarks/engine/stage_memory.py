@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.scene import Record
-from pano_mvs.testing.scenes import SCENES
 from tests.benchmarks.captures import scene_capture
 from tests.benchmarks.dense_chain import DenseChain, Overrides
 from tests.benchmarks.table import print_table
+from tests.synthetic.scenes import SCENES
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

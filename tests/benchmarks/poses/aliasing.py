@@ -34,11 +34,11 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.testing import paint, room, surfaces
-from pano_mvs.testing.scenes import Scene
 from tests.benchmarks.poses.captures_with_truth import MAPPERS, SEED, Cameras, Pictures, matched, native
 from tests.benchmarks.poses.placements import judge_placements
 from tests.repeating import drawings, fittings, prints
 from tests.repeating.places import draw_arguments, draw_capture
+from tests.synthetic.scenes import Scene
 
 OURS = "ours"
 

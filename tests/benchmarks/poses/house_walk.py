@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors
 from pano_mvs.testing.room import Room, render
-from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Surface, Vector
 from tests.benchmarks.poses.painted import Paint, bounded, write_views
+from tests.synthetic.bounded import Bounded
 
 STEP = 0.6
 _VIEWS = 300

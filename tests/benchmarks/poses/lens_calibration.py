@@ -37,10 +37,10 @@ from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.session.calibrating import calibrate_camera
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
-from pano_mvs.testing.scenes import corridor, courtyard, desk, poles, white_room
 from tests.benchmarks.poses.captures_with_truth import cameras_of, matched
 from tests.synthetic.fisheye_rig import render_lens
 from tests.synthetic.places import window_room, yard
+from tests.synthetic.scenes import corridor, courtyard, desk, poles, white_room
 
 SCENES = {
     "corridor": corridor,

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import extract_sift
-from pano_mvs.algorithms.fusion.fuse import fuse_views
 from pano_mvs.algorithms.fusion.view import FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
@@ -34,12 +33,13 @@ from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from
 from pano_mvs.scene import Features, Poses, RangeMap
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.poses_localise import LocaliseParams, localise
-from pano_mvs.testing.room import colors_along
-from pano_mvs.testing.scenes import SCENES, Scene
+from tests.algorithms.fusion.whole import fuse_views
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain
 from tests.stored import write_npz
+from tests.synthetic.colors import colors_along
 from tests.synthetic.photograph import render_photograph
+from tests.synthetic.scenes import SCENES, Scene
 
 PHOTO_WH = (800, 600)
 SOFT_WH = (480, 360)

@@ -31,9 +31,9 @@ from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translatio
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_quat_wxyz
-from pano_mvs.testing.scenes import poles, weak_room, white_room
 from tests.benchmarks.poses.captures_with_truth import Cameras, Pictures, cameras_of, load, native
 from tests.synthetic.places import large_plain_room
+from tests.synthetic.scenes import poles, weak_room, white_room
 
 SCENES = {scene.__name__: scene for scene in (large_plain_room, white_room, weak_room, poles)}
 SIZE_HW = (512, 1024)

@@ -23,11 +23,11 @@ from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
-from pano_mvs.testing.scenes import Scene
 from tests.benchmarks.poses.captures_with_truth import SEED, Pictures, matched
 from tests.benchmarks.poses.house_of_rooms import House
 from tests.benchmarks.poses.placements import judge_placements
 from tests.repeating.places import REPEATS
+from tests.synthetic.scenes import Scene
 
 Views = dict[tuple[str, str], TwoView]
 Truth = dict[str, Rigid3]

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE
 from pano_mvs.testing.room import Room, render
-from pano_mvs.testing.surfaces import Ball, Cuboid, Rod
+from pano_mvs.testing.surfaces import Ball, Cuboid
 from tests.benchmarks.poses.painted import Paint, Painted, bounded, write_views
+from tests.synthetic.rod import Rod
 
 VIEWS_PER_ROOM = 10
 _LONG, _HALF_WIDE, _CEILING, _FLOOR = 6.0, 2.5, -1.3, 1.4

@@ -190,8 +190,8 @@ def test_errors_are_written_as_clouds_and_drawn(
     for name in ("accuracy.png", "completeness.png"):
         picture = read_picture(tmp_path / "e" / name)
         assert picture is not None
-        assert picture.shape == (28 + 3 * (28 + 640), 1024, 3)
-        above = picture[56 : 56 + 640]
+        assert picture.shape == (3 * (640 + 40) + 60, 1024, 3)
+        above = picture[60 : 60 + 640]
         red, right = ((np.abs(above.astype(int) - color).max(axis=-1) < 3) for color in ((45, 30, 190), (142, 130, 38)))
         assert min(red.mean(), right.mean()) > 0.01
         assert np.nonzero(red)[1].mean() > np.nonzero(right)[1].mean()  # x grows to the right

@@ -12,18 +12,8 @@ import pytest
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.progress import ProgressDisplay, _Repeated
 from pano_mvs.engine.planning.forecast import StageForecast
-from pano_mvs.session.progress import (
-    Event,
-    Forecast,
-    KernelsCompiled,
-    RunStarted,
-    StageFinished,
-    StageStarted,
-    UnitFailed,
-    UnitFinished,
-    UnitStarted,
-    Warned,
-)
+from pano_mvs.engine.running.events import StageFinished, StageStarted, UnitFailed, UnitFinished, UnitStarted, Warned
+from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted
 from tests.session.test_time_estimator import Clock
 
 STARTED = RunStarted("w", ("depth", "cloud"), "processes", workers=1, threads=1, out=Path("out"))

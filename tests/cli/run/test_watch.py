@@ -16,21 +16,18 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.watch_command import BlocksView, RunView, _updated, watch_run
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.planning.forecast import StageForecast
+from pano_mvs.engine.running.events import StageStarted, UnitFailed, UnitFinished, UnitStarted, ignore
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.session.event_log import EventLog, EventReader
 from pano_mvs.session.progress import (
     BlockStarted,
     Event,
+    EventLog,
+    EventReader,
     Forecast,
     RunFinished,
     RunStarted,
-    StageStarted,
     TimeLeft,
-    UnitFailed,
-    UnitFinished,
-    UnitStarted,
     WorkersChanged,
-    ignore,
 )
 from tests.cli.conftest import Command
 from tests.engine.conftest import Toy, start, wait_for_records
@@ -168,8 +165,8 @@ def test_killed_run_is_noticed(tmp_path: Path) -> None:
 import os, sys
 from pathlib import Path
 from pano_mvs.engine.running.output_lock import output_lock
-from pano_mvs.session.event_log import EventLog
-from pano_mvs.session.progress import Warned, ignore
+from pano_mvs.session.progress import EventLog
+from pano_mvs.engine.running.events import Warned, ignore
 log, out = EventLog(ignore), Path(sys.argv[1])
 with output_lock(out):
     log.open(out)

@@ -12,7 +12,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.running.events import Observer, RunResult
+from pano_mvs.engine.running.events import Observer, RunEvent, RunResult, UnitFinished, Warned
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
 from tests.engine.toy import NUMBERS
@@ -94,7 +94,7 @@ def texts(toy: Toy) -> Toy:
     return toy
 
 
-class Meddler(Observer):
+class Meddler:
     """Does something once, when a unit has been computed."""
 
     def __init__(self, stage: str, item: str, meddle: Callable[[], object]) -> None:
@@ -102,13 +102,12 @@ class Meddler(Observer):
         self._meddle: Callable[[], object] | None = meddle
         self.warnings: list[str] = []
 
-    def unit_finished(self, name: str, item: str, *, status: str, seconds: float) -> None:
-        if (name, item) == self._when and self._meddle is not None:
+    def __call__(self, event: RunEvent | None) -> None:
+        if isinstance(event, UnitFinished) and (event.stage, event.item) == self._when and self._meddle is not None:
             self._meddle()
             self._meddle = None
-
-    def warn(self, text: str) -> None:
-        self.warnings.append(text)
+        elif isinstance(event, Warned):
+            self.warnings.append(event.text)
 
 
 def run(toy: Toy, observer: Observer | None = None, *, executor: str = "serial", cache: str = "cache") -> RunResult:

@@ -9,7 +9,7 @@ from pano_mvs.core.errors import InputError, RunStoppedError, StoreError, UsageE
 from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.events import Observer, StageSummary
+from pano_mvs.engine.running.events import RunEvent, StageFinished
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
@@ -322,18 +322,16 @@ def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:
 def test_output_that_is_removed_during_the_run_is_written_again(toy: Toy) -> None:
     """A run whose output folder was removed said that all was well, and the next one set its report aside."""
 
-    class Remover(Observer):
-        """Removes the output folder once, when some of its files are there."""
-
-        def stage_finished(self, summary: StageSummary) -> None:
-            if summary.name == "each" and not (toy.folder / "gone").exists():
-                (toy.folder / "out").rename(toy.folder / "gone")
+    def remover(event: RunEvent | None) -> None:
+        """Remove the output folder once, when some of its files are there."""
+        if isinstance(event, StageFinished) and event.stage == "each" and not (toy.folder / "gone").exists():
+            (toy.folder / "out").rename(toy.folder / "gone")
 
     toy.run()
     expected = toy.deliverables()
     remove_whole(toy.folder / "out")
     session = toy.session(cache=toy.folder / "other")
-    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, observer=Remover())
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, observer=remover)
     result = run.execute()
     assert result.exit_code == 0
     assert toy.deliverables() == expected

@@ -13,7 +13,7 @@ from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import FinishedJob
-from pano_mvs.engine.running.events import Observer, RunResult, UnitStatus
+from pano_mvs.engine.running.events import Observer, RunEvent, RunResult, UnitFinished, UnitStarted
 from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
 from tests.engine.conftest import Toy, ran
 
@@ -55,18 +55,18 @@ class Shelf(SerialExecutor):
         return self.memory_bytes
 
 
-class Heard(Observer):
+class Heard:
     """Notes what it hears of units."""
 
     def __init__(self) -> None:
         self.started: list[str] = []
         self.finished: list[tuple[str, str]] = []
 
-    def unit_started(self, name: str, item: str) -> None:
-        self.started.append(f"{name}:{item}")
-
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        self.finished.append((f"{name}:{item}", status))
+    def __call__(self, event: RunEvent | None) -> None:
+        if isinstance(event, UnitStarted):
+            self.started.append(f"{event.stage}:{event.item}")
+        elif isinstance(event, UnitFinished):
+            self.finished.append((f"{event.stage}:{event.item}", event.outcome))
 
 
 def run_with(toy: Toy, shelf: Shelf, *overrides: str, observer: Observer | None = None) -> RunResult:

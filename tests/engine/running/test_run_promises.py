@@ -9,7 +9,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running import run as module
-from pano_mvs.engine.running.events import Observer, RunResult
+from pano_mvs.engine.running.events import Observer, RunEvent, RunResult, Warned, ignore
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Pairs, Record
 from tests.engine.conftest import Toy
@@ -18,14 +18,15 @@ from tests.engine.running.test_run_pass import Shelf, run_with, shelf
 __all__ = ["shelf"]  # a fixture
 
 
-class Warned(Observer):
+class Warnings:
     """Notes the warnings."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
 
-    def warn(self, text: str) -> None:
-        self.texts.append(text)
+    def __call__(self, event: RunEvent | None) -> None:
+        if isinstance(event, Warned):
+            self.texts.append(event.text)
 
 
 class Interrupted(Shelf):
@@ -75,7 +76,7 @@ def test_timeouts_without_effect_are_warned_of(
     toy: Toy, shelf: Shelf, override: str, enforces: bool, count: int
 ) -> None:
     shelf.enforces_timeouts = enforces
-    warned = Warned()
+    warned = Warnings()
     result = make_run(toy, shelf, warned, override, "mean.timeout_s=0").execute()
     texts = [
         "timeout_s of scaled has no effect: a unit that runs in the main process cannot be ended. "
@@ -90,7 +91,7 @@ def test_an_interrupted_run_lets_running_units_end(toy: Toy, monkeypatch: pytest
     monkeypatch.setattr(module, "GRACE_S", 0.2 if hanging else 600.0)
     interrupted = Interrupted(Store(toy.folder / "cache"))
     interrupted.enforces_timeouts, interrupted.hanging = True, hanging
-    warned = Warned()
+    warned = Warnings()
     run = make_run(toy, interrupted, warned)
     with pytest.raises(KeyboardInterrupt):
         run.execute()
@@ -104,7 +105,7 @@ def test_an_interrupted_run_lets_running_units_end(toy: Toy, monkeypatch: pytest
 
 
 def test_units_in_this_process_are_not_waited_for_after_an_interrupt(toy: Toy) -> None:
-    interrupted, warned = Interrupted(Store(toy.folder / "cache")), Warned()
+    interrupted, warned = Interrupted(Store(toy.folder / "cache")), Warnings()
     with pytest.raises(KeyboardInterrupt):
         make_run(toy, interrupted, warned).execute()
     assert warned.texts == []
@@ -113,14 +114,14 @@ def test_units_in_this_process_are_not_waited_for_after_an_interrupt(toy: Toy) -
 
 def test_what_is_damaged_again_after_each_repair_ends_the_run(toy: Toy, shelf: Shelf) -> None:
     shelf.answers["scaled:4.txt"] = JobOutcome("damaged", cause="blob x is damaged")
-    warned = Warned()
+    warned = Warnings()
     with pytest.raises(StoreError, match="blob x is damaged again and again: check the disk, or choose another cache"):
         make_run(toy, shelf, warned).execute()
     assert warned.texts == ["blob x is damaged"] * 4
 
 
 def test_values_of_a_run_are_loaded_by_stage_and_item(toy: Toy, shelf: Shelf) -> None:
-    run = make_run(toy, shelf, Observer())
+    run = make_run(toy, shelf, ignore)
     run.execute()
     pairs = run.load("pairs", Pairs)
     assert isinstance(pairs, Pairs)
@@ -178,7 +179,7 @@ def test_an_error_forgets_nothing(toy: Toy, shelf: Shelf) -> None:
 
 def test_files_of_earlier_runs_are_removed_or_named(toy: Toy, shelf: Shelf) -> None:
     def result_of(*overrides: str) -> RunResult:
-        return make_run(toy, shelf, Observer(), *overrides).execute(earlier_files=first.published)
+        return make_run(toy, shelf, ignore, *overrides).execute(earlier_files=first.published)
 
     first = toy.run()
     assert first.written == sorted(first.published) != []

@@ -11,7 +11,8 @@ from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.planning.units import PENDING, StageState
 from pano_mvs.engine.running import run as run_module
-from pano_mvs.engine.running.events import Failure, Observer, RunResult
+from pano_mvs.engine.running.events import Failure, RunEvent, RunResult
+from pano_mvs.engine.running.events import ignore as ignore_event
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.scene import Axis
@@ -29,7 +30,7 @@ def test_a_stage_takes_the_time_in_which_its_units_are_computed(toy: Toy, monkey
         pass
 
     result = RunResult()
-    counts = RunStatistics(result, Observer(), states=lambda _name: state, name_items=ignore)
+    counts = RunStatistics(result, ignore_event, states=lambda _name: state, name_items=ignore)
     counts.stage_opened(entry)
 
     def at(time_s: float) -> None:
@@ -70,14 +71,14 @@ class Patient(SerialExecutor):
         return super().wait(timeout_s) if len(self.waits) % 2 == 0 else None
 
 
-class Waiting(Observer):
+class Waiting:
     """Counts how often it learns that a run waits."""
 
     def __init__(self) -> None:
         self.count = 0
 
-    def waiting(self) -> None:
-        self.count += 1
+    def __call__(self, event: RunEvent | None) -> None:
+        self.count += event is None
 
 
 def test_an_observer_learns_that_a_run_waits_and_the_run_goes_on(toy: Toy) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sharpness import sharpness
+from pano_mvs.algorithms.panoramas import sharpness
 from pano_mvs.algorithms.stitching import is_dual_fisheye
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec, sample_panorama
 from pano_mvs.testing.room import default_room, render
-from pano_mvs.testing.scenes import SCENES
+from tests.synthetic.scenes import SCENES
 
 SIZE = (128, 256)
 

@@ -16,11 +16,11 @@ from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render
-from pano_mvs.testing.scenes import white_room
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
 from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
 from tests.benchmarks.poses.placements import judge_placements
 from tests.known import known
+from tests.synthetic.scenes import white_room
 
 Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]
 

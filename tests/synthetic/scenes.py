@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Texture
-from pano_mvs.testing.room import Room, default_room, render, write_views
-from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod, Surface, Vector
+from pano_mvs.testing.room import Room, default_room, render
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
+from tests.synthetic.capture_files import write_views
+from tests.synthetic.rod import Rod
 
 Painted = tuple[Surface, Texture]
 
@@ -190,7 +192,7 @@ SCENES: dict[str, Callable[..., Scene]] = {
 
 
 def write_scene(folder: Path, scene: Scene, size_hw: tuple[int, int]) -> None:
-    """Write all views of a scene as a capture with ground truth, like `pano_mvs.testing.room.write_capture`."""
+    """Write all views of a scene as a capture with ground truth, like `write_capture`."""
     write_views(folder, (scene.view(idx, size_hw) for idx in range(len(scene.poses))), scene.poses)
 
 
