@@ -14,7 +14,7 @@ or keyword-only parameters of a function:
 @checks_settings
 def median_range(range_map: RangeMap, *, window: Annotated[int, Setting("side", ge=3, odd=True)] = 5) -> RangeMap:
 
-`engine.stages.settings.params_from` makes the parameters of a stage from either.
+`engine.stages.params.params_from` makes the parameters of a stage from either.
 """
 
 from __future__ import annotations

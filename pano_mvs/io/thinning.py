@@ -1,6 +1,6 @@
 """Select the points of a cloud to write, in bounded memory.
 
-`algorithms.fusion.voxels` averages the points of a voxel while the cloud is made. Here one point of each voxel is
+`algorithms.fusion` averages the points of a voxel while the cloud is made. Here one point of each voxel is
 selected from a finished cloud, which may be larger than memory.
 """
 

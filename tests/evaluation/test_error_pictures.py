@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.clouds.pictures import _top_view, distance_colors, write_error_cloud
+from pano_mvs.evaluation.clouds.pictures import _top_view, _write_pictures, distance_colors, write_error_cloud
 from pano_mvs.evaluation.drawing import WIDTH
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
 from pano_mvs.io.ply import open_ply_points
@@ -72,6 +72,19 @@ def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path: Path) -> None
     write_error_picture(tmp_path / "a.jpg", nothing, nothing, counted=np.zeros((8, 16), bool))
     picture = read_picture(tmp_path / "a.jpg")
     assert (picture[:600, 1024:] == GREY).all(axis=-1).mean() > 0.5
+
+
+@pytest.mark.filterwarnings("error")
+def test_pictures_of_a_cloud_are_as_wide_as_the_page_with_any_names(tmp_path: Path) -> None:
+    blue = np.full((8, 8, 3), (0, 0, 255), np.uint8)
+    limits = [0.01 * number for number in range(1, 12)]
+    _write_pictures(tmp_path / "e.png", [("$x_$ 東.png", blue), ("a$b$.jpg", blue[:2])], limits)
+    picture = read_picture(tmp_path / "e.png")
+    widths = (picture == (255, 0, 0)).all(axis=2).sum(axis=1)
+    assert widths.max() > 0.95 * WIDTH
+    assert np.median(widths[widths > 0]) > 0.95 * WIDTH
+    _write_pictures(tmp_path / "none.png", [], limits)
+    assert read_picture(tmp_path / "none.png").shape[1] == WIDTH
 
 
 def test_a_cloud_of_any_width_fits_into_the_view_from_above() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
 from pano_mvs.algorithms.learned.tiles import SCALES, Scale
 from pano_mvs.core.arrays import FloatArray
@@ -31,7 +31,7 @@ def extract_aliked(
     mask: NDArray[np.bool_],
     *,
     up: FloatArray,
-    max_keypoints: MaxKeypoints = 6000,
+    max_keypoints: Annotated[int, Setting("maximum number of either size, spread evenly over the sphere", ge=8)] = 6000,
     threshold: Annotated[float, Setting("minimum score of a key point", ge=0, le=1)] = 0.01,
     networks: Networks = PACKAGED,
 ) -> Features:

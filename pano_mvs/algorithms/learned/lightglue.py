@@ -169,12 +169,12 @@ class Side:
         """Return the learned key points of a panorama."""
         learned = slice(len(features) - features.learned, None)
         bearings, sizes = features.bearings[learned], features.sizes_rad[learned]
-        nearest = np.argmin([np.abs(sizes - size_rad(scale)) for scale in SCALES], axis=0)
+        is_small = np.isclose(sizes, size_rad(SCALES[1]), rtol=0.01)
         views = []
         for number, scale in enumerate(SCALES):
             for tile in scale.level_tiles(np.array(features.up)):
                 pixels = tile.pixels_from_rays(bearings)
-                seen = (nearest == number) & tile.contains(pixels)
+                seen = (is_small == bool(number)) & tile.contains(pixels)
                 views.append(np.where(seen[:, None], pixels / (TILE_PX / 2) - 1, np.nan))
         return cls(features.descriptors[learned].astype(np.float32), np.array(views, np.float32))
 

@@ -37,7 +37,7 @@ class Scale(NamedTuple):
 
 SCALES = (Scale(60.0, 8, (-18.0, 18.0)), Scale(32.0, 12, (0.0,)))
 """The network finds the same key points only at about the same size, but a room looks two to four times as large from
-within as through a door: the second scale shows it as large (see docs/learned.md, What they add)."""
+within as through a door: the second scale shows it as large (see docs/learned.md)."""
 
 
 @lru_cache

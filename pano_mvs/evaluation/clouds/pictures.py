@@ -70,6 +70,7 @@ def write_error_cloud(
 
 
 _MAX_POINTS, _MAX_VIEWS = 2_000_000, 12
+_LEGEND_COLUMNS = 7
 _SIZE_HW = 640, WIDTH
 
 
@@ -144,12 +145,14 @@ def _write_pictures(path: Path, pictures: Sequence[tuple[str, Picture]], limits:
     entries = [(limit, f"up to {limit:g}") for limit in limits] + [(np.inf, "farther"), (np.nan, "not counted")]
     colors = distance_colors(np.array([distance for distance, _ in entries], np.float32), limits) / 255
     patches = [Patch(color=color, label=text) for color, (_, text) in zip(colors, entries, strict=True)]
-    with drawn_figure(path, (WIDTH, sum(heights) + 40 * len(pictures) + 60)) as figure:
-        figure.legend(handles=patches, loc="outside upper left", ncols=len(patches), frameon=False)
-        for idx, (title, picture) in enumerate(pictures):
-            axes = figure.add_subplot(len(pictures), 1, idx + 1)
+    legend = 40 + 20 * -(-len(patches) // _LEGEND_COLUMNS)
+    with drawn_figure(path, (WIDTH, sum(heights) + 40 * len(pictures) + legend)) as figure:
+        figure.legend(handles=patches, loc="outside upper left", ncols=_LEGEND_COLUMNS, frameon=False)
+        # Without pictures, for example of a cloud without points, there is only the legend.
+        rows = figure.subplots(len(pictures), 1, height_ratios=heights, squeeze=False)[:, 0] if pictures else []
+        for axes, (title, picture) in zip(rows, pictures, strict=True):
             axes.imshow(picture, interpolation="nearest")
-            axes.set_title(title, loc="left")
+            axes.set_title(title, loc="left", parse_math=False)
             axes.set_axis_off()
 
 

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.learned import lightglue, networks
+from pano_mvs.algorithms.learned import aliked, lightglue, networks
 from pano_mvs.algorithms.learned.aliked import extract_aliked, maxima_of_scores
 from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
 from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
@@ -198,6 +198,16 @@ def test_a_plain_panorama_has_no_key_points() -> None:
     plain = extract_aliked(np.full((*SIZE, 3), 90, np.uint8), np.ones(SIZE, np.bool_), up=UP, threshold=0.1)
     plain.check()
     assert len(plain) == 0
+
+
+@pytest.mark.parametrize("size_rad", [0.0, 0.1])
+def test_learned_key_points_of_any_size_are_matched_in_the_large_views(found: Features, size_rad: float) -> None:
+    large, small = (np.count_nonzero(np.isclose(found.sizes_rad, aliked.size_rad(scale))) for scale in SCALES)
+    assert min(large, small) > 500
+    side = lightglue.Side.of(replace(found, sizes_rad=np.full(len(found), size_rad, np.float32)))
+    seen = np.isfinite(side.places[..., 0]).any(axis=1)
+    assert seen[:16].all()
+    assert not seen[16:].any()
 
 
 def test_key_points_of_other_stages_cannot_be_matched(found: Features) -> None:
