@@ -6,7 +6,7 @@ compares them within a view and across; it stops once it is sure of nearly all, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,32 +24,33 @@ from pano_mvs.scene import Features
 LAYERS = 9
 # Of the network, as published: shares of confident key points at which it stops, and of hopeless ones that it drops.
 _DEPTH_CONFIDENCE, _WIDTH_CONFIDENCE = 0.95, 0.99
-# Only pairs with some, but not many matches in their first pairs of views get further ones.
-_FIRST_VIEWS, _FEW, _ENOUGH = 8, 100, 500
+_FEW = 100  # Matches of large views below which small ones find nothing, either.
 
 
 @checks_settings
-def match_learned(
+def match_by_size(
     first: Features,
     second: Features,
     *,
     min_score: Annotated[float, Setting("minimum probability of a match", ge=0, le=1)] = 0.1,
     max_views: Annotated[
-        int, Setting("maximum number of pairs of views that are compared, those most alike", ge=1, le=784)
-    ] = 20,
+        int, Setting("number of pairs of views of either size that are compared, those most alike", ge=1, le=256)
+    ] = 8,
     networks: Networks = PACKAGED,
-) -> NDArray[np.int32]:
-    """Match the ALIKED key points of two panoramas.
+) -> Iterator[NDArray[np.int32]]:
+    """Match the ALIKED key points of two panoramas, first those of large views, then also those of small ones.
 
     Args:
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
         min_score: minimum probability of a match.
-        max_views: how many of the 784 pairs of views are compared at most, those with the most similar descriptors.
+        max_views: how many of the pairs of large views are compared, those with the most similar descriptors, and how
+            many pairs with a small view.
         networks: the network files and what executes them.
 
-    Returns:
-        (M, 2) int32 positions in the first and second image, one to one, by ascending position in the first.
+    Yields:
+        (M, 2) int32 positions in the first and second image, one to one, by ascending position in the first: those of
+        large views and, unless these are hardly any, those of all views.
 
     Raises:
         UsageError: if both images have key points but no learned ones, or a network file or the provider is missing.
@@ -57,18 +58,29 @@ def match_learned(
     if len(first) and len(second) and not (first.learned or second.learned):
         raise UsageError("matches.lightglue needs the key points of features.aliked: add that stage before it")
     if min(first.learned, second.learned) < 2:
-        return np.zeros((0, 2), np.int32)
-    sides = [Side.of(features) for features in (first, second)]
+        yield np.zeros((0, 2), np.int32)
+        return
+    sides = Side.of(first), Side.of(second)
+    nearest = match_l2(sides[0].descriptors, sides[1].descriptors, ratio=1)
     glue = LightGlue(networks)
     best: dict[tuple[int, int], float] = {}
-    for number, (one, other) in enumerate(_alike(sides[0], sides[1], max_views)):
-        if number >= _FIRST_VIEWS and not _FEW <= len(best) < _ENOUGH:
-            break  # hardly anything in common, or enough
-        (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
-        matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
-        for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
-            best[int(i), int(j)] = max(best.get((int(i), int(j)), 0.0), float(score))
-    return _one_to_one(best, offsets=[len(features) - features.learned for features in (first, second)])
+    for small in (False, True):
+        for one, other in _alike(sides, nearest, max_views, small=small):
+            (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
+            matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
+            for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
+                best[int(i), int(j)] = max(best.get((int(i), int(j)), 0.0), float(score))
+        yield _one_to_one(best, offsets=[len(features) - features.learned for features in (first, second)])
+        if len(best) < _FEW:
+            return
+
+
+def match_learned(
+    first: Features, second: Features, *, min_score: float = 0.1, max_views: int = 8, networks: Networks = PACKAGED
+) -> NDArray[np.int32]:
+    """Return the matches (M, 2) of all views; see `match_by_size`."""
+    *_, matches = match_by_size(first, second, min_score=min_score, max_views=max_views, networks=networks)
+    return matches
 
 
 class LightGlue:
@@ -184,16 +196,20 @@ class Side:
         return idx, self.descriptors[idx] / np.float32(DESCRIPTOR_NORM), self.places[view, idx]
 
 
-def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
-    """Return pairs of views with the most descriptors that are each other's nearest; those seen before count half."""
-    nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
-    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
+def _alike(sides: tuple[Side, Side], nearest: NDArray[np.int32], most: int, *, small: bool) -> list[tuple[int, int]]:
+    """Return pairs of large views, or with a small one, by descriptors that are each other's nearest (M, 2).
+
+    Descriptors that an earlier pair has shown count half.
+    """
+    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate(sides)]
+    is_small = np.arange(len(seen[0])) >= SCALES[0].views
+    used = (is_small[:, None] | is_small) != small
     weights = np.ones(len(nearest))
     pairs: list[tuple[int, int]] = []
-    while len(pairs) < min(most, len(seen[0]) * len(seen[1])):
-        counts = (seen[0] * weights) @ seen[1].T.astype(np.float64)
-        counts[tuple(np.array(pairs, np.intp).reshape(-1, 2).T)] = -1.0
+    while len(pairs) < min(most, int((~used).sum())):
+        counts = np.where(used, -1.0, (seen[0] * weights) @ seen[1].T.astype(np.float64))
         one, other = (int(each) for each in np.unravel_index(np.argmax(counts), counts.shape))
+        used[one, other] = True
         pairs.append((one, other))
         weights[seen[0][one] & seen[1][other]] *= 0.5
     return pairs

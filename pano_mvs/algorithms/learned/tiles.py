@@ -22,6 +22,11 @@ class Scale(NamedTuple):
     downwards_deg: tuple[float, ...]
 
     @property
+    def views(self) -> int:
+        """The number of views."""
+        return self.columns * len(self.downwards_deg)
+
+    @property
     def focal_px(self) -> float:
         """The focal length of a view."""
         return TILE_PX / 2 / float(np.tan(np.deg2rad(self.fov_deg) / 2))

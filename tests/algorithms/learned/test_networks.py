@@ -123,9 +123,7 @@ def turned(features: Features, other: Features, new_from_old: NDArray[np.float64
 
 
 @pytest.mark.slow
-def test_a_rolled_panorama_has_the_rolled_key_points(
-    panorama: NDArray[np.uint8], found: Features, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8], found: Features) -> None:
     """No view's centre is where it was, and what was on the seam is not."""
     rolled, new_from_old = roll_panorama(panorama, 200)
     other = extract_aliked(rolled, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
@@ -133,8 +131,7 @@ def test_a_rolled_panorama_has_the_rolled_key_points(
     assert count > 400
     assert right > 0.97
     near_seam = found.bearings @ np.array([0.0, 0.0, -1.0]) > np.cos(np.deg2rad(15))
-    monkeypatch.setattr(lightglue, "_ENOUGH", 10_000)  # all views
-    matched = match_learned(found, other, max_views=48)[:, 0]
+    matched = match_learned(found, other, max_views=24)[:, 0]
     assert np.mean(near_seam[matched]) > 0.7 * np.mean(near_seam)
 
 

@@ -16,7 +16,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, signific
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
-from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED, max_log10_false_alarms
+from pano_mvs.algorithms.two_view.verification import max_log10_false_alarms
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
@@ -118,11 +118,11 @@ def _is_significant(alignment: Alignment, evidence: _PairEvidence, *, learned: b
     Pairs that agree with it are taken as independent, so that several weak ones together may be as significant as one
     must be. Rotation and direction of one pair leave the lengths open: other pairs that agree determine them,
     or by the ranges of the matches that are known. Either evidence must outweigh the pairs that do not agree.
-    Learned matches without such pairs must be as significant as those of a pair, because false ones agree with one
-    another.
+    Learned matches count only with such pairs, because false ones agree with one another.
     """
-    limit = MAX_LOG10_LEARNED if learned and evidence.agreeing < 1 else _MAX_LOG10_FALSE_ALARMS
-    by_matches = alignment.log10_false_alarms / limit
+    by_matches = alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS
+    if learned and evidence.agreeing < 1:
+        return False
     by_pairs = evidence.agreeing if evidence.has_length else 0.0
     return max(by_matches, by_pairs) >= 1 and max(by_matches, evidence.agreeing) >= evidence.disagreeing
 
