@@ -163,4 +163,4 @@ def _scaled_twice(value: float, factor: int) -> float:
 
 def test_a_call_with_a_constant_compiles_no_further_copy() -> None:
     assert _scaled_twice(2.0, 4) == 14.0
-    assert len(_scaled.overloads) == 1
+    assert len(_scaled.overloads) <= 1  # none if the caller comes from the disk
