@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.belief.model import steps_behind
 from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.benchmarks.belief.fitting import (
+    MEASURED,
     SIGNS,
     Cameras,
     Outcome,
@@ -27,6 +27,7 @@ from tests.benchmarks.belief.fitting import (
     read_table,
     write_table,
 )
+from tests.benchmarks.belief.measuring import evidence_of
 from tests.benchmarks.belief.refit import decidable, doubted, source_of
 
 
@@ -121,7 +122,7 @@ def test_outcomes_count_both_errors() -> None:
 
 
 @pytest.mark.slow
-def test_every_measurement_that_is_fitted_is_measured() -> None:
+def test_every_measurement_of_a_table_is_measured() -> None:
     tiny = tiny_capture(Variant(size_hw=(128, 256)))
     poses = Poses.without_points(dict(zip(tiny.names, tiny.poses, strict=True)), frame="x", scale="x", metric=True)
     whole = np.ones((128, 256), np.bool_)
@@ -129,11 +130,12 @@ def test_every_measurement_that_is_fitted_is_measured() -> None:
     group = verified_group(
         poses, loaded.__getitem__, features=tiny.each(Features), two_views=tiny.each(TwoView), correct=False
     )
-    evidence = camera_evidence(group.model, group.checks.shares, group.checks.expected)
-    for row in evidence.values():
-        assert row.keys() == SIGNS.keys()
+    for row in evidence_of(group).values():
+        assert row.keys() == {*MEASURED} == {*SIGNS, "contradicted"}
+        assert row["contradicted"] == 0
         assert row["ratio"] > 0.7
         assert row["agreeing"] > 1
     without = verified_group(poses, loaded.__getitem__, features={}, two_views={}, correct=False)
-    found = camera_evidence(without.model, without.checks.shares, without.checks.expected)
-    assert all(np.isnan(row["agreeing"]) and row["ratio"] > 0.7 for row in found.values())
+    for row in evidence_of(without).values():
+        assert np.isnan([row["agreeing"], row["contradicted"]]).all()
+        assert row["ratio"] > 0.7

@@ -27,6 +27,9 @@ SIGNS = {
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 
+MEASURED = (*SIGNS, "contradicted")
+"""What tables hold. The last one is not fitted, because it is not known for all of their cameras."""
+
 OF_IMAGES, OF_PAIRS = {"ratio", "share", "joint_contradicting"}, {*SIGNS} - {"ratio", "share", "joint_contradicting"}
 QUANTILES = (0.01, 0.04, 0.1, 0.25, 0.5)
 ENOUGH = {"ratio": 0.35, "share": 0.25}
@@ -84,7 +87,7 @@ def read_table(path: Path) -> Cameras:
     """Return the cameras of a file that `write_table` has written."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SIGNS}
+    columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in MEASURED}
     flags = {name: np.array([row[name] == "1" for row in rows], np.bool_) for name in ("right", "doubted")}
     captures = [f"{row['family']} {row['seed']} {row['variant']}" for row in rows]
     return Cameras(
@@ -93,12 +96,12 @@ def read_table(path: Path) -> Cameras:
 
 
 def write_table(path: Path, cameras: Cameras) -> None:
-    """Write cameras as CSV, with four digits of each measurement that is fitted."""
+    """Write cameras as CSV, with four digits of each measurement."""
     with path.open("w", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["family", "seed", "variant", "right", "doubted", *SIGNS])
+        out.writerow(["family", "seed", "variant", "right", "doubted", *MEASURED])
         for idx, capture in enumerate(cameras.capture):
-            values = [cameras.columns[name][idx] for name in SIGNS]
+            values = [cameras.columns[name][idx] for name in MEASURED]
             figures = [f"{value:.4g}" if np.isfinite(value) else "" for value in values]
             out.writerow([*capture.split(), int(cameras.right[idx]), int(cameras.doubted[idx]), *figures])
 

@@ -19,6 +19,7 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
+from pano_mvs.algorithms.poses.verification.contradictions import contradicted_parts
 from pano_mvs.algorithms.poses.verification.joints import measured_joints
 from pano_mvs.algorithms.poses.verification.verify_poses import VerifiedGroup, verified_group
 from pano_mvs.algorithms.two_view import verify_pair
@@ -34,6 +35,7 @@ VARIANTS = ("asked", "displaced", "pairs_alone", "halved", "thinned")
 every second or third image."""
 _LEFT_OUT = {"halved": 2, "thinned": 3}
 _LEARNED_KEYPOINTS, _LEARNED_VIEWS = 3000, 4
+_CONTRADICTED = 0.1
 
 
 @dataclass(frozen=True)
@@ -170,16 +172,24 @@ def _displaced(poses: Poses, rng: np.random.Generator) -> Poses:
     return Poses.without_points(cameras, frame=poses.frame, scale=poses.scale, metric=False)
 
 
+def evidence_of(found: VerifiedGroup) -> dict[int, dict[str, float]]:
+    """Return the evidence for each camera, and the share of that between its part and the rest that contradicts it.
+
+    The latter, `contradicted`, is 0 where it is below a tenth or the images confirm the part, and missing where the
+    pairs count as not measured.
+    """
+    model, checks = found.model, found.checks
+    rows = camera_evidence(model, checks.shares, checks.expected, joints=measured_joints(model, found.confirmation))
+    parts = contradicted_parts(model, checks.shares, more_than=_CONTRADICTED)
+    shares = {image: part.share for part in parts for image in part.images}
+    return {
+        image: row | {"contradicted": shares.get(image, 0.0) if np.isfinite(row["agreeing"]) else np.nan}
+        for image, row in rows.items()
+    }
+
+
 def _rows(capture: Capture, variant: str, found: VerifiedGroup, *, group: int, learned: bool) -> list[dict[str, Any]]:
-    placed, evidence = (
-        judge_placements(found.poses, capture.truth),
-        camera_evidence(
-            found.model,
-            found.checks.shares,
-            found.checks.expected,
-            joints=measured_joints(found.model, found.confirmation),
-        ),
-    )
+    placed, evidence = judge_placements(found.poses, capture.truth), evidence_of(found)
     return [
         asdict(
             Measured(

@@ -20,8 +20,6 @@ from pano_mvs.geometry import Rigid3, geodesic_angle
 
 # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
 _SUSPICIOUS = 0.75
-# Where the images confirm more than this share of the texture, matches that contradict a part come from what repeats.
-_MOSTLY_CONFIRMED = 0.5
 # Another pose is used if it is better by this factor and by this difference.
 _BETTER, _MARGIN = 1.15, 0.03
 # If no more than this can be expected to be confirmed, nothing can be concluded.
@@ -353,9 +351,7 @@ def _believe(
 
 def _doubt_contradicted_parts(model: PlacedModel, found: CameraChecks) -> None:
     """Report parts that verified pairs contradict as doubtful, unless the images confirm most of their texture."""
-    for part in contradicted_parts(model):
-        if np.nan_to_num([found.shares[image] for image in part.images]).mean() > _MOSTLY_CONFIRMED:
-            continue
+    for part in contradicted_parts(model, found.shares):
         one, other = (model.pairs.names[image] for image in part.pair)
         why = (
             f"{100 * part.share:.0f} % of the evidence of pairs between its part of the capture and the rest "

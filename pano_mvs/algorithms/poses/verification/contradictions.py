@@ -26,6 +26,8 @@ tour and seven rendered houses, none of the 28 right ones has such a cut, and th
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(3.0)), float(np.deg2rad(10.0))
 _MOST = 200.0  # −log₁₀ of the false alarms that one pair counts at most
 _STARTS = 20
+# Where the images confirm more than this share of the texture, matches that contradict a part come from what repeats.
+_MOSTLY_CONFIRMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,23 @@ class ContradictedPart:
     pair: Edge
 
 
-def contradicted_parts(model: PlacedModel) -> list[ContradictedPart]:
-    """Return the parts of a model that are contradicted too much, each of them after the ones before were left out."""
+def contradicted_parts(
+    model: PlacedModel, shares: Mapping[int, float], *, more_than: float = MAX_CONTRADICTED
+) -> list[ContradictedPart]:
+    """Return the parts of a model that are contradicted, each of them found after the ones before were left out.
+
+    Args:
+        model: the cameras, with their verified pairs if these are known.
+        shares: image position to the share of its texture that other images confirm, NaN where unknown. Parts of which
+            the images confirm most are not returned.
+        more_than: smallest share of the significance of the pairs across the cut.
+    """
     significance = _significance(model)
     left = set(model.cameras)
     found = []
-    while (part := _most_contradicted(significance, left)) is not None:
-        found.append(part)
+    while (part := _most_contradicted(significance, left, more_than)) is not None:
+        if np.nan_to_num([shares.get(image, np.nan) for image in part.images]).mean() <= _MOSTLY_CONFIRMED:
+            found.append(part)
         left -= {*part.images}
     return found
 
@@ -81,9 +93,9 @@ def _agrees(model: PlacedModel, edge: Edge, view: TwoView) -> bool:
 
 
 def _most_contradicted(
-    significance: Mapping[Edge, tuple[float, float]], images: Collection[int]
+    significance: Mapping[Edge, tuple[float, float]], images: Collection[int], more_than: float
 ) -> ContradictedPart | None:
-    """Return the part of some images whose cut gains most by contradictions; None if no cut has too many."""
+    """Return the part of some images whose cut gains most by contradictions; None if none has enough."""
     members = sorted(images)
     number = {image: idx for idx, image in enumerate(members)}
     edges = [edge for edge in significance if number.keys() >= {*edge}]
@@ -91,7 +103,7 @@ def _most_contradicted(
         return None
     ends = np.array([[number[image] for image in edge] for edge in edges]).T
     agreeing, against = np.array([significance[edge] for edge in edges]).T
-    gains = (1 - MAX_CONTRADICTED) * against - MAX_CONTRADICTED * agreeing
+    gains = (1 - more_than) * against - more_than * agreeing
     graph = csr_array(coo_array((np.tile(gains, 2), np.concatenate([ends, ends[::-1]], axis=1)), (len(members),) * 2))
     heaviest = [idx for idx in np.argsort(-against, kind="stable")[:_STARTS] if against[idx] > 0]
     cuts = [_best_cut(graph, start) for start in dict.fromkeys(ends[:, heaviest].T.ravel().tolist())]

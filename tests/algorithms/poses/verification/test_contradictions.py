@@ -50,7 +50,7 @@ def consecutive() -> dict[tuple[int, int], TwoView]:
 
 
 def test_a_right_model_has_no_contradicted_part() -> None:
-    assert contradicted_parts(placed(consecutive())) == []
+    assert contradicted_parts(placed(consecutive()), {}) == []
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_a_right_model_has_no_contradicted_part() -> None:
 )
 def test_the_part_is_found_that_pairs_have_elsewhere(elsewhere: list[tuple[int, int]], part: tuple[int, ...]) -> None:
     """One false pair among several true ones makes no part; all that cross a cut make one, of one camera or a room."""
-    parts = contradicted_parts(placed(consecutive() | {pair: wrong(*pair) for pair in elsewhere}))
+    parts = contradicted_parts(placed(consecutive() | {pair: wrong(*pair) for pair in elsewhere}), {})
     assert [one.images for one in parts] == ([part] if part else [])
     if part:
         assert parts[0].share == pytest.approx(1.0)
@@ -75,16 +75,16 @@ def test_a_pair_counts_by_how_clearly_it_decides() -> None:
     undecided = seen(CAMERAS[4], CAMERAS[5]).with_alternatives([wrong(4, 5, matches=38)])
     views = {pair: view for pair, view in consecutive().items() if 5 not in pair}
     against = {(3, 5): wrong(3, 5, exponent=-30.0)}
-    held = contradicted_parts(placed(views | against | {(4, 5): seen(CAMERAS[4], CAMERAS[5])}))
+    held = contradicted_parts(placed(views | against | {(4, 5): seen(CAMERAS[4], CAMERAS[5])}), {})
     assert held == []
-    (part,) = contradicted_parts(placed(views | against | {(4, 5): undecided}))
+    (part,) = contradicted_parts(placed(views | against | {(4, 5): undecided}), {})
     assert part.images == (5,)
     assert part.share == pytest.approx(30 / 35)
 
 
 def test_both_sides_are_named_if_they_are_equally_large() -> None:
     views = {pair: view for pair, view in consecutive().items() if (pair[0] < 3) == (pair[1] < 3)}
-    (part,) = contradicted_parts(placed(views | {(2, 3): wrong(2, 3)}))
+    (part,) = contradicted_parts(placed(views | {(2, 3): wrong(2, 3)}), {})
     assert part.images == tuple(CAMERAS)
 
 
@@ -93,3 +93,13 @@ def test_cameras_of_a_contradicted_part_are_doubtful_with_the_pair_that_speaks_a
     checks: CameraChecks = check_cameras(model, None)
     assert [image for image, why in checks.doubts.items() if "evidence of pairs" in why] == [5]
     assert "2.png and 5.png" in checks.doubts[5]
+
+
+def test_a_part_that_the_images_confirm_or_that_little_contradicts_is_left_out() -> None:
+    contradicted = placed(consecutive() | {pair: wrong(*pair) for pair in ((2, 5), (3, 5), (4, 5))})
+    assert [len(contradicted_parts(contradicted, {5: share})) for share in (np.nan, 0.4, 0.6)] == [1, 1, 0]
+    one_of_five = placed(consecutive() | {(2, 3): wrong(2, 3)})
+    assert contradicted_parts(one_of_five, {}) == []
+    (part,) = contradicted_parts(one_of_five, {}, more_than=0.1)
+    assert part.images == (2,)
+    assert part.share == pytest.approx(0.2)
