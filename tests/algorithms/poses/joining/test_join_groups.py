@@ -106,13 +106,20 @@ def test_learned_pairs_that_are_weak_by_themselves_add_up(pairs: list[tuple[str,
 
 @pytest.mark.parametrize(
     ("alarms", "agreeing", "disagreeing", "significant"),
-    [(-44, 1.2, 1.7, True), (-12, 1.1, 1.7, False), (-44, 0.0, 5.0, False), (-9, 0.9, 0.0, False)],
+    [
+        (-44, 1.2, 1.7, True),
+        (-12, 1.1, 1.7, False),
+        (-44, 0.0, 5.0, False),
+        (-9, 0.9, 0.0, False),
+        (-60, 0.5, 0.0, True),
+    ],
 )
 def test_an_alignment_outweighs_the_pairs_that_contradict_it(
     alarms: float, agreeing: float, disagreeing: float, significant: bool
 ) -> None:
     evidence = _PairEvidence(agreeing, disagreeing, has_length=True)
     assert _is_significant(_alignment(alarms), evidence, learned=False) == significant
+    assert _is_significant(_alignment(alarms), evidence, learned=True) == (significant and agreeing >= 1)
 
 
 @pytest.mark.parametrize(("best", "rival", "is_rival"), [(0.5, 0.0, True), (3.0, 0.0, False), (3.0, 2.0, True)])
