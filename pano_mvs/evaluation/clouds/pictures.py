@@ -148,9 +148,9 @@ def _write_pictures(path: Path, pictures: Sequence[tuple[str, Picture]], limits:
     legend = 40 + 20 * -(-len(patches) // _LEGEND_COLUMNS)
     with drawn_figure(path, (WIDTH, sum(heights) + 40 * len(pictures) + legend)) as figure:
         figure.legend(handles=patches, loc="outside upper left", ncols=_LEGEND_COLUMNS, frameon=False)
-        # Without pictures, for example of a cloud without points, there is only the legend.
-        rows = figure.subplots(len(pictures), 1, height_ratios=heights, squeeze=False)[:, 0] if pictures else []
-        for axes, (title, picture) in zip(rows, pictures, strict=True):
+        grid = figure.add_gridspec(max(len(pictures), 1), 1, height_ratios=heights or None)
+        for row, (title, picture) in enumerate(pictures):
+            axes = figure.add_subplot(grid[row, 0])
             axes.imshow(picture, interpolation="nearest")
             axes.set_title(title, loc="left", parse_math=False)
             axes.set_axis_off()

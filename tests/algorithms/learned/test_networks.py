@@ -202,7 +202,7 @@ def test_learned_key_points_of_any_size_are_matched_in_the_large_views(found: Fe
     large, small = (np.count_nonzero(np.isclose(found.sizes_rad, aliked.size_rad(scale))) for scale in SCALES)
     assert min(large, small) > 500
     side = lightglue.Side.of(replace(found, sizes_rad=np.full(len(found), size_rad, np.float32)))
-    seen = np.isfinite(side.places[..., 0]).any(axis=1)
+    seen = np.asarray(np.isfinite(side.places[..., 0]).any(axis=1))
     assert seen[:16].all()
     assert not seen[16:].any()
 
