@@ -14,13 +14,12 @@ from pano_mvs.scene.record import Axis, Record, require, require_array
 
 @dataclass(frozen=True, eq=False)
 class Features(Record):
-    """Key points of one panorama, the strongest of each detector, and of each size of the learned ones, first.
+    """Key points of one panorama, the strongest of each detector first.
 
     Attributes:
         bearings: (N, 3) float64 unit rays in the camera frame.
         descriptors: (N, D) float32 (compared by Euclidean distance) or uint8 (compared by Hamming distance).
-        sizes_rad: (N,) float32 angular diameter of the patch that was described; of a learned key point, it decides in
-            which of the network's views it is matched.
+        sizes_rad: (N,) float32 angular diameter of the patch that was described.
         scores: (N,) float32 strength of the detector's response.
         colors_rgb: (N, 3) uint8 colour of the panorama at the key point.
         metric: "l2" or "hamming".

@@ -106,7 +106,7 @@ def aliked(
     params: AlikedParams,
     ctx: Context,
 ) -> Features:
-    """Key points of the network ALIKED on level views of two sizes around the horizon, for matches.lightglue.
+    """Key points of the network ALIKED on level views around the horizon, for matches.lightglue.
 
     The network finds the same points on white walls, glass and in other light, where SIFT finds few. The camera is
     levelled by the vertical lines in the panorama. Without any, its own up direction counts. A panorama that is upside

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.algorithms.learned.lightglue import match_by_size
+from pano_mvs.algorithms.learned.lightglue import match_learned
 from pano_mvs.algorithms.learned.weak_images import weak_images
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.two_view.verification import verify_pair
@@ -35,7 +35,7 @@ def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context
     return two_view
 
 
-@params_from(match_by_size, verify_pair, own_last=True)
+@params_from(match_learned, verify_pair, own_last=True)
 class LightGlueParams(NetworkParams):
     """Settings of matches.lightglue."""
 
@@ -44,21 +44,15 @@ class LightGlueParams(NetworkParams):
 def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -> TwoView:
     """Match the key points of features.aliked by the network LightGlue, then verify the matches by spherical RANSAC.
 
-    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors:
-    of 60° and, if these do not verify the pair, also of 32°. Key points of an earlier stage of features are matched as
-    in matches.brute_force, and verified together with these.
+    The network compares the key points of level views of both panoramas, in pairs of views with similar descriptors.
+    Key points of an earlier stage of features are matched as in matches.brute_force, and verified together with these.
     """
     first, second = features
-    found = match_features(first.without_learned(), second.without_learned())
-    views: list[TwoView] = []
-    for learned in match_by_size(first, second, networks=params.networks, **arguments_from(match_by_size, params)):
-        candidates = np.concatenate([found, learned])
-        views.append(verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params)))
-        if views[-1]:
-            break
-    best = min(views, key=lambda view: (not view, view.log10_false_alarms))
-    _report_pair(best, best.candidates, ctx)
-    return best
+    learned = match_learned(first, second, networks=params.networks, **arguments_from(match_learned, params))
+    candidates = np.concatenate([match_features(first.without_learned(), second.without_learned()), learned])
+    two_view = verify_pair(first, second, candidates, rng=ctx.rng, **arguments_from(verify_pair, params))
+    _report_pair(two_view, len(candidates), ctx)
+    return two_view
 
 
 @params_from(weak_images)

@@ -44,11 +44,11 @@ from pano_mvs.stages.features import NetworkParams
 
 # Photographs whose panoramas are chosen together: the larger, the less often the panoramas are read.
 _BLOCK = 32
-_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 900_000_000, 7_000_000, 11_000_000
+_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 900_000_000, 7_000_000, 6_000_000
 
 
 def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
-    """Return the memory for a block of photographs and the panoramas in memory, of 20,000 key points each (default)."""
+    """Return the memory for a block of photographs and the panoramas in memory, of 8000 key points (the default)."""
     candidates, count = _candidates(params), len(inputs["ranges"])
     photographs = _BLOCK if 0 < candidates < count else 1
     kept = LocatedPanoramas.kept(candidates, count)

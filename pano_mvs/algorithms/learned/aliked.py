@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Networks
-from pano_mvs.algorithms.learned.tiles import SCALES, Scale
+from pano_mvs.algorithms.learned.tiles import FOCAL_PX, level_tiles
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -31,63 +31,27 @@ def extract_aliked(
     mask: NDArray[np.bool_],
     *,
     up: FloatArray,
-    max_keypoints: Annotated[int, Setting("maximum number of either size, spread evenly over the sphere", ge=8)] = 6000,
+    max_keypoints: MaxKeypoints = 6000,
     threshold: Annotated[float, Setting("minimum score of a key point", ge=0, le=1)] = 0.01,
     networks: Networks = PACKAGED,
 ) -> Features:
-    """Extract the ALIKED key points of a panorama on level views of two sizes around the horizon.
+    """Extract the ALIKED key points of a panorama on two rows of level views around the horizon.
 
-    Views are level because the descriptors do not tolerate a large roll. They have two sizes because the descriptors
-    tolerate little zoom, and a room looks larger from within than through its door. Key points that two views of one
-    size share are one. The last digits of the network's results differ between processors, so descriptors are rounded.
+    Views are level because the descriptors do not tolerate a large roll. Key points that two views share are one. The
+    last digits of the network's results differ between processors, so descriptors are rounded.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
         mask: (H, W) bool; masked (False) pixels have no key points.
         up: (3,) direction of the zenith in the camera frame.
-        max_keypoints: maximum number of key points of either size, spread evenly over the sphere.
+        max_keypoints: maximum number of key points, spread evenly over the sphere.
         threshold: minimum score.
         networks: the network files and what executes them.
 
     Raises:
         UsageError: if a network file or the provider is missing.
     """
-    size_hw = (image.shape[0], image.shape[1])
-    parts = [
-        _of_scale(image, mask, scale, up=up, max_keypoints=max_keypoints, threshold=threshold, networks=networks)
-        for scale in SCALES
-    ]
-    bearings, descriptors, scores, sizes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Features(
-        bearings=bearings,
-        descriptors=np.rint(DESCRIPTOR_NORM * descriptors).astype(np.float32),
-        sizes_rad=sizes,
-        scores=scores,
-        colors_rgb=image[_pixels_of(bearings, size_hw)],
-        metric="l2",
-        size_hw=size_hw,
-        learned=len(bearings),
-        up=(float(up[0]), float(up[1]), float(up[2])),
-    )
-
-
-def size_rad(scale: Scale) -> np.float32:
-    """Return the angular diameter of the key points of a scale."""
-    return np.float32(2 * _RADIUS_PX / scale.focal_px)
-
-
-def _of_scale(
-    image: NDArray[np.uint8],
-    mask: NDArray[np.bool_],
-    scale: Scale,
-    *,
-    up: FloatArray,
-    max_keypoints: int,
-    threshold: float,
-    networks: Networks,
-) -> tuple[FloatArray, Array, Array, Array]:
-    """Return bearings, unit descriptors, scores and sizes of the key points in the views of one scale."""
-    tiles = scale.level_tiles(up)
+    tiles = level_tiles(up)
     size_hw = (image.shape[0], image.shape[1])
     found = []
     for number, tile in enumerate(tiles):
@@ -105,11 +69,22 @@ def _of_scale(
         one = described_tile(
             sample_view(image, tile, interpolation=cv2.INTER_LINEAR), kept, threshold=threshold, networks=networks
         )
-        found.append((tile.bearings_from_pixels(one.pixels_px), one.descriptors, one.scores))
-    bearings, descriptors, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    keep = distinct_keypoints(bearings, scores, radius_rad=float(size_rad(scale)) / 4)
+        bearings = tile.bearings_from_pixels(one.pixels_px)
+        found.append((bearings, one.descriptors, one.scores, image[_pixels_of(bearings, size_hw)]))
+    bearings, descriptors, scores, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    keep = distinct_keypoints(bearings, scores, radius_rad=_RADIUS_PX / FOCAL_PX / 2)
     keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]
-    return bearings[keep], descriptors[keep], scores[keep], np.full(len(keep), size_rad(scale))
+    return Features(
+        bearings=bearings[keep],
+        descriptors=np.rint(DESCRIPTOR_NORM * descriptors[keep]).astype(np.float32),
+        sizes_rad=np.full(len(keep), 2 * _RADIUS_PX / FOCAL_PX, np.float32),
+        scores=scores[keep],
+        colors_rgb=colors[keep],
+        metric="l2",
+        size_hw=size_hw,
+        learned=len(keep),
+        up=(float(up[0]), float(up[1]), float(up[2])),
+    )
 
 
 class DescribedTile(NamedTuple):

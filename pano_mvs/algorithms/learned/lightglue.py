@@ -6,16 +6,15 @@ compares them within a view and across; it stops once it is sure of nearly all, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.learned.aliked import size_rad
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Network, Networks
-from pano_mvs.algorithms.learned.tiles import SCALES
+from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -24,33 +23,30 @@ from pano_mvs.scene import Features
 LAYERS = 9
 # Of the network, as published: shares of confident key points at which it stops, and of hopeless ones that it drops.
 _DEPTH_CONFIDENCE, _WIDTH_CONFIDENCE = 0.95, 0.99
-_FEW = 100  # Matches of large views below which small ones find nothing, either.
 
 
 @checks_settings
-def match_by_size(
+def match_learned(
     first: Features,
     second: Features,
     *,
     min_score: Annotated[float, Setting("minimum probability of a match", ge=0, le=1)] = 0.1,
     max_views: Annotated[
-        int, Setting("number of pairs of views of either size that are compared, those most alike", ge=1, le=256)
+        int, Setting("number of pairs of views that are compared, those most alike", ge=1, le=256)
     ] = 8,
     networks: Networks = PACKAGED,
-) -> Iterator[NDArray[np.int32]]:
-    """Match the ALIKED key points of two panoramas, first those of large views, then also those of small ones.
+) -> NDArray[np.int32]:
+    """Match the ALIKED key points of two panoramas.
 
     Args:
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
         min_score: minimum probability of a match.
-        max_views: how many of the pairs of large views are compared, those with the most similar descriptors, and how
-            many pairs with a small view.
+        max_views: how many of the 256 pairs of views are compared, those with the most similar descriptors.
         networks: the network files and what executes them.
 
-    Yields:
-        (M, 2) int32 positions in the first and second image, one to one, by ascending position in the first: those of
-        large views and, unless these are hardly any, those of all views.
+    Returns:
+        (M, 2) int32 positions in the first and second image, one to one, by ascending position in the first.
 
     Raises:
         UsageError: if both images have key points but no learned ones, or a network file or the provider is missing.
@@ -58,29 +54,16 @@ def match_by_size(
     if len(first) and len(second) and not (first.learned or second.learned):
         raise UsageError("matches.lightglue needs the key points of features.aliked: add that stage before it")
     if min(first.learned, second.learned) < 2:
-        yield np.zeros((0, 2), np.int32)
-        return
-    sides = Side.of(first), Side.of(second)
-    nearest = match_l2(sides[0].descriptors, sides[1].descriptors, ratio=1)
+        return np.zeros((0, 2), np.int32)
+    sides = [Side.of(features) for features in (first, second)]
     glue = LightGlue(networks)
     best: dict[tuple[int, int], float] = {}
-    for small in (False, True):
-        for one, other in _alike(sides, nearest, max_views, small=small):
-            (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
-            matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
-            for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
-                best[int(i), int(j)] = max(best.get((int(i), int(j)), 0.0), float(score))
-        yield _one_to_one(best, offsets=[len(features) - features.learned for features in (first, second)])
-        if len(best) < _FEW:
-            return
-
-
-def match_learned(
-    first: Features, second: Features, *, min_score: float = 0.1, max_views: int = 8, networks: Networks = PACKAGED
-) -> NDArray[np.int32]:
-    """Return the matches (M, 2) of all views; see `match_by_size`."""
-    *_, matches = match_by_size(first, second, min_score=min_score, max_views=max_views, networks=networks)
-    return matches
+    for one, other in _alike(sides[0], sides[1], max_views):
+        (first_idx, *first_seen), (second_idx, *second_seen) = sides[0].inside(one), sides[1].inside(other)
+        matches, scores = glue.match(first_seen, second_seen, min_score=min_score)
+        for i, j, score in zip(first_idx[matches[:, 0]], second_idx[matches[:, 1]], scores, strict=True):
+            best[int(i), int(j)] = max(best.get((int(i), int(j)), 0.0), float(score))
+    return _one_to_one(best, offsets=[len(features) - features.learned for features in (first, second)])
 
 
 class LightGlue:
@@ -170,7 +153,7 @@ class Side:
 
     Attributes:
         descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
-        places: (V, N, 2) positions in the views of their own scale, −1 … 1 from edge to edge; NaN elsewhere.
+        places: (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them.
     """
 
     descriptors: Array
@@ -180,14 +163,10 @@ class Side:
     def of(cls, features: Features) -> Side:
         """Return the learned key points of a panorama."""
         learned = slice(len(features) - features.learned, None)
-        bearings, sizes = features.bearings[learned], features.sizes_rad[learned]
-        is_small = np.isclose(sizes, size_rad(SCALES[1]), rtol=0.01)
-        views = []
-        for number, scale in enumerate(SCALES):
-            for tile in scale.level_tiles(np.array(features.up)):
-                pixels = tile.pixels_from_rays(bearings)
-                seen = (is_small == bool(number)) & tile.contains(pixels)
-                views.append(np.where(seen[:, None], pixels / (TILE_PX / 2) - 1, np.nan))
+        tiles = level_tiles(np.array(features.up))
+        places = [tile.pixels_from_rays(features.bearings[learned]) / (TILE_PX / 2) - 1 for tile in tiles]
+        inside = [tile.contains((place + 1) * (TILE_PX / 2)) for tile, place in zip(tiles, places, strict=True)]
+        views = [np.where(seen[:, None], place, np.nan) for seen, place in zip(inside, places, strict=True)]
         return cls(features.descriptors[learned].astype(np.float32), np.array(views, np.float32))
 
     def inside(self, view: int) -> tuple[NDArray[np.intp], Array, Array]:
@@ -196,23 +175,13 @@ class Side:
         return idx, self.descriptors[idx] / np.float32(DESCRIPTOR_NORM), self.places[view, idx]
 
 
-def _alike(sides: tuple[Side, Side], nearest: NDArray[np.int32], most: int, *, small: bool) -> list[tuple[int, int]]:
-    """Return pairs of large views, or with a small one, by descriptors that are each other's nearest (M, 2).
-
-    Descriptors that an earlier pair has shown count half.
-    """
-    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate(sides)]
-    is_small = np.arange(len(seen[0])) >= SCALES[0].views
-    used = (is_small[:, None] | is_small) != small
-    weights = np.ones(len(nearest))
-    pairs: list[tuple[int, int]] = []
-    while len(pairs) < min(most, int((~used).sum())):
-        counts = np.where(used, -1.0, (seen[0] * weights) @ seen[1].T.astype(np.float64))
-        one, other = (int(each) for each in np.unravel_index(np.argmax(counts), counts.shape))
-        used[one, other] = True
-        pairs.append((one, other))
-        weights[seen[0][one] & seen[1][other]] *= 0.5
-    return pairs
+def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
+    """Return the pairs of views with the most descriptors that are each other's nearest."""
+    nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
+    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
+    counts = seen[0].astype(np.int64) @ seen[1].astype(np.int64).T
+    order = np.argsort(-counts, axis=None, kind="stable")[:most]
+    return [(int(one), int(other)) for one, other in zip(*np.unravel_index(order, counts.shape), strict=True)]
 
 
 def _one_to_one(scores: dict[tuple[int, int], float], offsets: list[int]) -> NDArray[np.int32]:

@@ -28,7 +28,7 @@ from pano_mvs.algorithms.features.selection import spread_keypoints
 from pano_mvs.algorithms.learned import lightglue
 from pano_mvs.algorithms.learned.aliked import extract_aliked
 from pano_mvs.algorithms.learned.networks import TILE_PX
-from pano_mvs.algorithms.learned.tiles import SCALES
+from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_file import decode_image
@@ -49,7 +49,7 @@ class Found(NamedTuple):
 
 def found_by(detect: Callable[[Any], tuple[Any, Any, Any]], image: NDArray[np.uint8]) -> Found:
     """Return the key points that a network finds in the level views, each in the view whose centre is nearest."""
-    torch, tiles = importlib.import_module("torch"), SCALES[0].level_tiles(UP)
+    torch, tiles = importlib.import_module("torch"), level_tiles(UP)
     parts = []
     for number, tile in enumerate(tiles):
         picture = sample_view(image, tile, interpolation=cv2.INTER_LINEAR)
@@ -69,10 +69,9 @@ def found_by(detect: Callable[[Any], tuple[Any, Any, Any]], image: NDArray[np.ui
 def by_glue(glue: Any, first: Found, second: Found) -> NDArray[np.int64]:
     """Return the matches (M, 2) by LightGlue in PyTorch, of the views that are most alike."""
     torch = importlib.import_module("torch")
-    sides = lightglue.Side(first.descriptors, first.places), lightglue.Side(second.descriptors, second.places)
-    nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
+    sides = [lightglue.Side(one.descriptors, one.places) for one in (first, second)]
     pairs: set[tuple[int, int]] = set()
-    for views in lightglue._alike(sides, nearest, VIEWS, small=False):
+    for views in lightglue._alike(sides[0], sides[1], VIEWS):
         seen = [np.flatnonzero(~np.isnan(side.places[view, :, 0])) for side, view in zip(sides, views, strict=True)]
         inputs = {
             f"image{n}": {
