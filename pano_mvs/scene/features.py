@@ -25,7 +25,8 @@ class Features(Record):
         metric: "l2" or "hamming".
         size_hw: (height, width) of the panorama in which they were detected.
         learned: number of key points, the last ones, that the network ALIKED found and LightGlue can match.
-        up: direction of the zenith in the camera frame, by which the network's views were levelled.
+        ups: directions that may be the zenith in the camera frame, by each of which views were levelled for the network.
+        per_up: number of learned key points in the views of each of `ups`, in their order; empty: all in the first's.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -38,7 +39,13 @@ class Features(Record):
     metric: Literal["l2", "hamming"]
     size_hw: tuple[int, int]
     learned: int = 0
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    ups: tuple[tuple[float, float, float], ...] = ((0.0, -1.0, 0.0),)
+    per_up: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Convert the tuples, which are stored as lists."""
+        object.__setattr__(self, "ups", tuple((x, y, z) for x, y, z in self.ups))
+        object.__setattr__(self, "per_up", tuple(self.per_up))
 
     def __len__(self) -> int:
         """Return the number of key points."""
@@ -50,7 +57,7 @@ class Features(Record):
 
     def without_learned(self) -> Features:
         """Return the key points that no network found."""
-        return self._part(slice(0, len(self) - self.learned), learned=0)
+        return replace(self._part(slice(0, len(self) - self.learned), learned=0), per_up=())
 
     def _part(self, chosen: slice, *, learned: int) -> Features:
         names = ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
@@ -67,6 +74,8 @@ class Features(Record):
         require_array(self, "sizes_rad", dtype=np.float32, shape=(count,))
         require_array(self, "scores", dtype=np.float32, shape=(count,))
         require_array(self, "colors_rgb", dtype=np.uint8, shape=(count, 3))
+        counted = not self.per_up or (len(self.per_up), sum(self.per_up)) == (len(self.ups), self.learned)
+        require(counted, self, "per_up must state for each of ups how many key points are learned")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.networks import Networks, Provider
-from pano_mvs.algorithms.poses.frame.upside_down import up_of_picture
+from pano_mvs.algorithms.poses.frame.upside_down import LEVEL_DEG, ups_of_picture
 from pano_mvs.api import Context, Each, Features, InputPath, Panorama, Params, arguments_from, params_from, stage
 from pano_mvs.scene import WeakImage
 
@@ -109,16 +110,20 @@ def aliked(
     """Key points of the network ALIKED on level views around the horizon, for matches.lightglue.
 
     The network finds the same points on white walls, glass and in other light, where SIFT finds few. The camera is
-    levelled by the vertical lines in the panorama. Without any, its own up direction counts. A panorama that is upside
-    down, by its brightness and texture, is turned over. The result begins with the key points of an earlier stage of
-    features, if there is one. After matches.weak, images that need no learned key points keep theirs.
+    levelled by the lines in the panorama. Without any, its own up direction counts. Brightness and texture show if it was
+    turned by more than 20°; where they do not tell which way, the network sees it with each likely direction up. The
+    result begins with the key points of an earlier stage of features, if there is one. After matches.weak, images that
+    need no learned key points keep theirs.
     """
     if params.only_weak and weak is not None and features is not None and not weak.wanted:
         return features
     picture, mask = image.load(), image.load_mask()
-    up = up_of_picture(picture, mask)
-    if up[1] > 0:
-        ctx.note("{count} panoramas seem upside down, by brightness and texture, so networks see them turned by 180°")
-    learned = extract_aliked(picture, mask, up=up, networks=params.networks, **arguments_from(extract_aliked, params))
+    ups = ups_of_picture(picture, mask)
+    if len(ups) > 1 or -ups[0][1] < np.cos(np.radians(LEVEL_DEG)):
+        ctx.note(
+            "{count} panoramas seem to be turned or upside down, by lines, brightness and texture, so networks see them "
+            "in each likely orientation"
+        )
+    learned = extract_aliked(picture, mask, ups=ups, networks=params.networks, **arguments_from(extract_aliked, params))
     ctx.metric("keypoints", len(learned))
     return learned if features is None else joined(features, learned)

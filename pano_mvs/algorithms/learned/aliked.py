@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, NamedTuple
 
 import cv2
@@ -30,27 +30,57 @@ def extract_aliked(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     *,
-    up: FloatArray,
+    ups: Sequence[FloatArray],
     max_keypoints: MaxKeypoints = 6000,
     threshold: Annotated[float, Setting("minimum score of a key point", ge=0, le=1)] = 0.01,
     networks: Networks = PACKAGED,
 ) -> Features:
     """Extract the ALIKED key points of a panorama on two rows of level views around the horizon.
 
-    Views are level because the descriptors do not tolerate a large roll. Key points that two views share are one. The
-    last digits of the network's results differ between processors, so descriptors are rounded.
+    Views are level because the descriptors do not tolerate a large roll; where several directions may be up, there are
+    views for each. Key points that two views of one direction share are one. The last digits of the network's results
+    differ between processors, so descriptors are rounded.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
         mask: (H, W) bool; masked (False) pixels have no key points.
-        up: (3,) direction of the zenith in the camera frame.
-        max_keypoints: maximum number of key points, spread evenly over the sphere.
+        ups: directions (3,) in the camera frame that may be the zenith, at least one.
+        max_keypoints: maximum number of key points for each of `ups`, spread evenly over the sphere.
         threshold: minimum score.
         networks: the network files and what executes them.
 
     Raises:
         UsageError: if a network file or the provider is missing.
     """
+    size_hw = (image.shape[0], image.shape[1])
+    parts = [
+        _with_up(image, mask, up, max_keypoints=max_keypoints, threshold=threshold, networks=networks) for up in ups
+    ]
+    bearings, descriptors, scores = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Features(
+        bearings=bearings,
+        descriptors=np.rint(DESCRIPTOR_NORM * descriptors).astype(np.float32),
+        sizes_rad=np.full(len(bearings), 2 * _RADIUS_PX / FOCAL_PX, np.float32),
+        scores=scores,
+        colors_rgb=image[_pixels_of(bearings, size_hw)],
+        metric="l2",
+        size_hw=size_hw,
+        learned=len(bearings),
+        ups=tuple((float(x), float(y), float(z)) for x, y, z in ups),
+        per_up=tuple(len(one) for one, *_ in parts),
+    )
+
+
+def _with_up(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    up: FloatArray,
+    *,
+    max_keypoints: int,
+    threshold: float,
+    networks: Networks,
+) -> tuple[FloatArray, Array, Array]:
+    """Return bearings, unit descriptors and scores of the key points in the views that are level if `up` (3,) is."""
     tiles = level_tiles(up)
     size_hw = (image.shape[0], image.shape[1])
     found = []
@@ -69,22 +99,11 @@ def extract_aliked(
         one = described_tile(
             sample_view(image, tile, interpolation=cv2.INTER_LINEAR), kept, threshold=threshold, networks=networks
         )
-        bearings = tile.bearings_from_pixels(one.pixels_px)
-        found.append((bearings, one.descriptors, one.scores, image[_pixels_of(bearings, size_hw)]))
-    bearings, descriptors, scores, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        found.append((tile.bearings_from_pixels(one.pixels_px), one.descriptors, one.scores))
+    bearings, descriptors, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
     keep = distinct_keypoints(bearings, scores, radius_rad=_RADIUS_PX / FOCAL_PX / 2)
     keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]
-    return Features(
-        bearings=bearings[keep],
-        descriptors=np.rint(DESCRIPTOR_NORM * descriptors[keep]).astype(np.float32),
-        sizes_rad=np.full(len(keep), 2 * _RADIUS_PX / FOCAL_PX, np.float32),
-        scores=scores[keep],
-        colors_rgb=colors[keep],
-        metric="l2",
-        size_hw=size_hw,
-        learned=len(keep),
-        up=(float(up[0]), float(up[1]), float(up[2])),
-    )
+    return bearings[keep], descriptors[keep], scores[keep]
 
 
 class DescribedTile(NamedTuple):
@@ -138,7 +157,8 @@ def joined(first: Features, learned: Features) -> Features:
         raise UsageError("learned key points can only be added to those of features.sift_tangent")
     names = ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
     arrays = {name: np.concatenate([getattr(first, name), getattr(learned, name)]) for name in names}
-    return Features(**arrays, metric="l2", size_hw=first.size_hw, learned=len(learned), up=learned.up)
+    own = {"learned": len(learned), "ups": learned.ups, "per_up": learned.per_up}
+    return Features(**arrays, **own, metric="l2", size_hw=first.size_hw)
 
 
 def maxima_of_scores(score: Array, threshold: float) -> tuple[FloatArray, Array]:

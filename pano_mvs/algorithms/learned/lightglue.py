@@ -42,7 +42,7 @@ def match_learned(
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
         min_score: minimum probability of a match.
-        max_views: how many of the 256 pairs of views are compared, those with the most similar descriptors.
+        max_views: how many of the 256 or more pairs of views are compared, those with the most similar descriptors.
         networks: the network files and what executes them.
 
     Returns:
@@ -149,7 +149,7 @@ def _matched_by_colmap(
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """The learned key points of a panorama in its level views.
+    """The learned key points of a panorama in its level views, for each direction that may be up.
 
     Attributes:
         descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
@@ -162,12 +162,15 @@ class Side:
     @classmethod
     def of(cls, features: Features) -> Side:
         """Return the learned key points of a panorama."""
-        learned = slice(len(features) - features.learned, None)
-        tiles = level_tiles(np.array(features.up))
-        places = [tile.pixels_from_rays(features.bearings[learned]) / (TILE_PX / 2) - 1 for tile in tiles]
-        inside = [tile.contains((place + 1) * (TILE_PX / 2)) for tile, place in zip(tiles, places, strict=True)]
-        views = [np.where(seen[:, None], place, np.nan) for seen, place in zip(inside, places, strict=True)]
-        return cls(features.descriptors[learned].astype(np.float32), np.array(views, np.float32))
+        learned = features.only_learned()
+        of_up = np.repeat(np.arange(len(learned.ups)), learned.per_up or (learned.learned,))
+        views = []
+        for number, up in enumerate(learned.ups):
+            for tile in level_tiles(np.array(up)):
+                pixels = tile.pixels_from_rays(learned.bearings)
+                seen = (of_up == number) & tile.contains(pixels)
+                views.append(np.where(seen[:, None], pixels / (TILE_PX / 2) - 1, np.nan))
+        return cls(learned.descriptors.astype(np.float32), np.array(views, np.float32))
 
     def inside(self, view: int) -> tuple[NDArray[np.intp], Array, Array]:
         """Return the key points in a view, their unit descriptors and their places in it."""

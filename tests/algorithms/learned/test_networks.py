@@ -50,7 +50,7 @@ def panorama(by_torch: Mapping[str, Any]) -> NDArray[np.uint8]:
 
 @pytest.fixture(scope="module")
 def found(panorama: NDArray[np.uint8]) -> Features:
-    return extract_aliked(panorama, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
+    return extract_aliked(panorama, np.ones(SIZE, np.bool_), ups=[UP], max_keypoints=1500)
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -116,7 +116,7 @@ def turned(features: Features, other: Features, new_from_old: NDArray[np.float64
 def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8], found: Features) -> None:
     """No view's centre is where it was, and what was on the seam is not."""
     rolled, new_from_old = roll_panorama(panorama, 200)
-    other = extract_aliked(rolled, np.ones(SIZE, np.bool_), up=UP, max_keypoints=1500)
+    other = extract_aliked(rolled, np.ones(SIZE, np.bool_), ups=[UP], max_keypoints=1500)
     count, right = turned(found, other, new_from_old)
     assert count > 400
     assert right > 0.97
@@ -129,7 +129,7 @@ def test_a_rolled_panorama_has_the_rolled_key_points(panorama: NDArray[np.uint8]
 def test_a_tilted_camera_is_levelled_by_its_zenith(panorama: NDArray[np.uint8], found: Features) -> None:
     tilt = rotation_from_rotvec([0.5, 0.0, -0.6])
     picture = rotate_panorama(panorama, tilt)
-    other = extract_aliked(picture, np.ones(SIZE, np.bool_), up=tilt @ UP, max_keypoints=1500)
+    other = extract_aliked(picture, np.ones(SIZE, np.bool_), ups=[tilt @ UP], max_keypoints=1500)
     count, right = turned(found, other, tilt)
     assert count > 400
     assert right > 0.97
@@ -157,13 +157,13 @@ def test_the_record_is_valid_and_leaves_out_masked_pixels(panorama: NDArray[np.u
     assert np.linalg.norm(found.descriptors, axis=1) == pytest.approx(networks.DESCRIPTOR_NORM, rel=0.01)
     mask = np.ones(SIZE, np.bool_)
     mask[:, 400:600] = False
-    rest = extract_aliked(panorama, mask, up=UP)
+    rest = extract_aliked(panorama, mask, ups=[UP])
     azimuth = np.arctan2(rest.bearings[:, 0], rest.bearings[:, 2]) / (2 * np.pi) + 0.5
     assert not np.any((azimuth > 400 / 1024) & (azimuth < 600 / 1024))
 
 
 def test_a_plain_panorama_has_no_key_points() -> None:
-    plain = extract_aliked(np.full((*SIZE, 3), 90, np.uint8), np.ones(SIZE, np.bool_), up=UP, threshold=0.1)
+    plain = extract_aliked(np.full((*SIZE, 3), 90, np.uint8), np.ones(SIZE, np.bool_), ups=[UP], threshold=0.1)
     plain.check()
     assert len(plain) == 0
 
@@ -212,7 +212,7 @@ def test_files_of_colmap_find_and_match_key_points(panorama: NDArray[np.uint8], 
     rolled, new_from_old = roll_panorama(panorama, 128)
     mask = np.ones(SIZE, np.bool_)
     first, second = (
-        extract_aliked(one, mask, up=UP, max_keypoints=1500, networks=theirs) for one in (panorama, rolled)
+        extract_aliked(one, mask, ups=[UP], max_keypoints=1500, networks=theirs) for one in (panorama, rolled)
     )
     first.check()
     matches = match_learned(first, second, networks=theirs, min_score=0.99)
@@ -222,7 +222,7 @@ def test_files_of_colmap_find_and_match_key_points(panorama: NDArray[np.uint8], 
     view = PinholeView(np.eye(3), 256.0, np.array([256.0, 256.0]), (TILE_PX, TILE_PX))
     photograph = view_of_photograph(sample_view(panorama, view), networks=theirs)
     assert len(match_photograph(photograph, first, networks=theirs)) > 20
-    plain = extract_aliked(np.zeros((*SIZE, 3), np.uint8), mask, up=UP, networks=theirs)
+    plain = extract_aliked(np.zeros((*SIZE, 3), np.uint8), mask, ups=[UP], networks=theirs)
     assert match_learned(plain, first, networks=theirs).shape == (0, 2)
 
 

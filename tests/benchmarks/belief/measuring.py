@@ -141,7 +141,7 @@ def matched(capture: Capture, *, learned: bool) -> tuple[dict[str, Features], Vi
     weak = weak_images(features, views)
     for name in (*weak.weak, *weak.similar):
         points = extract_aliked(
-            capture.pictures[name], whole[name], up=np.array([0.0, -1.0, 0.0]), max_keypoints=_LEARNED_KEYPOINTS
+            capture.pictures[name], whole[name], ups=[np.array([0.0, -1.0, 0.0])], max_keypoints=_LEARNED_KEYPOINTS
         )
         features[name] = joined(features[name], points)
     for pair in learned_pairs(features).pairs:

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
-from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, up_of_panorama
+from pano_mvs.algorithms.poses.frame.vertical_lines import (
+    SIDES,
+    Picture,
+    find_segments,
+    orthogonal_directions,
+    up_from_lines,
+)
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
 from pano_mvs.scene import Poses
@@ -29,6 +35,11 @@ _BAND_DEG = (55.0, 80.0)
 # Fitted: where each difference is bounded, and its weight in the log-odds.
 _SCALES = np.array([0.33, 1.27, 1.38])
 _WEIGHTS = np.array([3.5, -3.8, -3.0])
+LEVEL_DEG = 20.0
+"""Tilt up to which a panorama counts as level."""
+# Of single panoramas: the share that is level, and that of these whose vertical is none of the axes (1 of 47 measured).
+_LEVEL, _OUTSIDE = 0.9, 0.03
+_LEAST = 0.1
 PRIOR_LOG_ODDS = float(np.log(0.01 / 0.99))
 """One capture in a hundred is taken to be upside down."""
 
@@ -44,19 +55,49 @@ def upside_down_probability(poses: Poses, pictures: Mapping[str, Picture], up: F
     return 1 / (1 + float(np.exp(-_log_odds(differences_below(poses, pictures, up)))))
 
 
-def up_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> FloatArray:
-    """Return the zenith (3,) in the camera frame of a single panorama, which may be upside down.
+def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[FloatArray]:
+    """Return what may be the zenith (3,) in the camera frame of a single panorama, the most probable direction first.
 
-    Its vertical lines determine the axis, within 20° of the camera's own, which counts if there are none. Brightness
-    and texture determine which end of it is up.
+    The lines in the picture determine three axes. If one is within 20° of the camera's own up direction, it is the
+    vertical with a probability of 90 %; if not, that direction counts as one more axis. Brightness and texture tell the
+    ends of the axes apart. Those that are less probable than 10 % are left out.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
         valid: (H, W) bool; masked (False) pixels have no lines.
     """
-    lines = up_of_panorama(image, valid)
-    up = lines.up if lines else _UP
-    return -up if _log_odds(_in_picture(image, up)) > 0 else up
+    segments = find_segments({"": lambda: (image, valid)}, {"": np.eye(3)})
+    lines = up_from_lines(segments.nearly_vertical(_UP, groups=SIDES), _UP)
+    own = lines.up if lines else _UP
+    axes = orthogonal_directions(segments)
+    turned = np.zeros((0, 3)) if axes is None else axes[np.abs(axes @ _UP) < np.cos(np.radians(LEVEL_DEG))]
+    ends = np.concatenate([[own, -own], turned, -turned])
+    prior = np.full(len(ends), (1 - _LEVEL) / max(1, 2 * len(turned)))
+    prior[:2] = _LEVEL * (_OUTSIDE if len(turned) == 3 else 1) * np.array([1, np.exp(PRIOR_LOG_ODDS)])
+    chances = _chances(np.array([_in_picture(image, end) for end in ends]), prior)
+    return [ends[idx] for idx in np.argsort(-chances, kind="stable") if chances[idx] >= _LEAST]
+
+
+def most_probable_up(poses: Poses, pictures: Mapping[str, Picture], axes: FloatArray) -> tuple[FloatArray, float]:
+    """Return which end of which axis is up, a unit vector (3,) in the world, and how likely it is, in [0, 1].
+
+    Args:
+        poses: registered images and their sparse points.
+        pictures: image name to a function that loads its panorama; one is in memory at a time.
+        axes: (K, 3) unit vectors, one of which is vertical.
+    """
+    ends = np.concatenate([axes, -axes])
+    chances = _chances(np.array([differences_below(poses, pictures, end) for end in ends]), np.ones(len(ends)))
+    best = int(np.argmax(chances))
+    return ends[best], float(chances[best])
+
+
+def _chances(differences: FloatArray, prior: FloatArray) -> FloatArray:
+    """Return how likely each of several directions (K,) is up, by what is below each (K, 2 or 3) and its prior (K,)."""
+    # The odds are those against the opposite direction: half of them is due to either.
+    logs = np.log(prior) - np.array([_log_odds(one) - PRIOR_LOG_ODDS for one in differences]) / 2
+    chances = np.exp(logs - logs.max())
+    return np.asarray(chances / chances.sum())
 
 
 def differences_below(poses: Poses, pictures: Mapping[str, Picture], up: FloatArray) -> FloatArray:

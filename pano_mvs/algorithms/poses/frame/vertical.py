@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
-from pano_mvs.algorithms.poses.frame.upside_down import upside_down_probability
-from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, up_from_lines
+from pano_mvs.algorithms.poses.frame.upside_down import most_probable_up, upside_down_probability
+from pano_mvs.algorithms.poses.frame.vertical_lines import (
+    Picture,
+    Segments,
+    find_segments,
+    orthogonal_directions,
+    up_from_lines,
+)
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
@@ -146,12 +152,13 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
 def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertical:
     """Return the direction near the cameras' mean up direction to which most line segments in the pictures point.
 
-    One camera suffices: its own up direction is where the search begins.
+    One camera suffices: its own up direction is where the search begins. Cameras that were turned in all directions
+    have no common one; then brightness, texture and the floor tell which of three axes of the lines is vertical.
     """
     prior = vertical_from_cameras(poses) if len(poses.names) > 1 else _of_one_camera(poses)
-    if not prior:
-        return prior
     rotations = dict(zip(poses.names, poses.rotations, strict=True))
+    if not prior:
+        return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if rotations else prior
     lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
     if not lines:
         return _unknown(lines.reason)
@@ -160,6 +167,26 @@ def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertic
         return _unknown(reason)
     evidence = f"{lines.count} vertical lines in the pictures"
     return Vertical(lines.up, "lines", evidence, prior.disagreement_deg, uncertainty_deg=lines.uncertainty_deg)
+
+
+def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: Segments) -> Vertical:
+    """Return the vertical by segments of all directions."""
+    axes = orthogonal_directions(segments)
+    if axes is None:
+        return _unknown("the cameras were turned in all directions, and lines in the pictures have no clear directions")
+    up, chance = most_probable_up(poses, pictures, axes)
+    lines = up_from_lines(segments, up)
+    # An unlevelled world is level by chance only, so what is more likely than not is enough.
+    if not lines or chance < 0.5:
+        return _unknown(
+            "the cameras were turned in all directions, and brightness, texture and points do not tell which is up "
+            f"(probability {chance:.2f})"
+        )
+    evidence = (
+        f"{lines.count} lines in the pictures of cameras that were turned in all directions (right with probability "
+        f"{chance:.2f}, by brightness, texture and points)"
+    )
+    return Vertical(lines.up, "lines", evidence, uncertainty_deg=lines.uncertainty_deg)
 
 
 def vertical_from_structure(poses: Poses) -> Vertical:

@@ -7,7 +7,7 @@ Grompone von Gioi et al., "LSD: a line segment detector", IPOL 2012) on pinhole 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +18,7 @@ from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.faces.render import face_image, face_mask
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
 
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
@@ -27,7 +27,8 @@ _UP = np.array([0.0, -1.0, 0.0])
 _MAX_PICTURES = 24
 _MAX_FACE_PX = 512
 _FOV_DEG = 90.0
-_SIDES = 4
+SIDES = 4
+"""Views of a panorama around the horizon; the other two look up and down."""
 # Segments shorter than this share of a face do not point anywhere exactly.
 _MIN_LENGTH_SHARE = 0.06
 # Segments that are farther from pointing up than this cannot be vertical.
@@ -59,6 +60,11 @@ class Segments:
     weights: FloatArray
     groups: NDArray[np.int64]
 
+    def nearly_vertical(self, up: FloatArray, *, groups: int) -> Segments:
+        """Return the segments of the first groups that point to within 25° of `up` (3,)."""
+        near = (np.abs(self.normals @ up) < np.sin(np.deg2rad(_MAX_TILT_DEG))) & (self.groups < groups)
+        return Segments(self.normals[near], self.weights[near], self.groups[near])
+
 
 @dataclass(frozen=True, eq=False)
 class VerticalLines:
@@ -84,13 +90,15 @@ class VerticalLines:
         return not self.reason
 
 
-def find_segments(pictures: Mapping[str, Picture], rotations: Mapping[str, FloatArray], up: FloatArray) -> Segments:
+def find_segments(
+    pictures: Mapping[str, Picture], rotations: Mapping[str, FloatArray], up: FloatArray | None = None
+) -> Segments:
     """Return the nearly vertical line segments in at most 24 evenly chosen panoramas.
 
     Args:
         pictures: image name to a function that loads it; one is in memory at a time.
         rotations: image name to cam_from_world (3, 3).
-        up: (3,) approximate up direction in the world.
+        up: (3,) approximate up direction in the world; None: unknown, so that segments of all directions are returned.
     """
     names = [name for name in rotations if name in pictures]
     chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), _MAX_PICTURES)).astype(int))
@@ -98,14 +106,14 @@ def find_segments(pictures: Mapping[str, Picture], rotations: Mapping[str, Float
     for idx in chosen:
         rotation = rotations[names[idx]]
         image, valid = pictures[names[idx]]()
-        level_from_cam = rotation_from_two_vectors(rotation @ up, _UP)
-        for normals_in_cam, lengths in _in_panorama(image, valid, level_from_cam):
+        level_from_cam = np.eye(3) if up is None else rotation_from_two_vectors(rotation @ up, _UP)
+        sides = CUBE_ROTATIONS if up is None else CUBE_ROTATIONS[:SIDES]
+        for normals_in_cam, lengths in _in_panorama(image, valid, [side @ level_from_cam for side in sides]):
             found.append((normals_in_cam @ rotation, lengths))
     normals = np.concatenate([np.zeros((0, 3)), *(each for each, _ in found)])
-    near = np.abs(normals @ up) < np.sin(np.deg2rad(_MAX_TILT_DEG))
     groups = np.repeat(np.arange(len(found)), [len(each) for each, _ in found])
-    weights = np.concatenate([np.zeros(0), *(lengths for _, lengths in found)])
-    return Segments(normals[near], weights[near], groups[near])
+    segments = Segments(normals, np.concatenate([np.zeros(0), *(lengths for _, lengths in found)]), groups)
+    return segments if up is None else segments.nearly_vertical(up, groups=len(found))
 
 
 def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
@@ -131,14 +139,28 @@ def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
     return _refined(segments, best, contrast)
 
 
-def up_of_panorama(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> VerticalLines:
-    """Return the direction in the camera frame, within 20° of the camera's own up, that vertical lines point to.
+def orthogonal_directions(segments: Segments) -> FloatArray | None:
+    """Return three orthogonal directions (3, 3), one a row, to which most segments point; None if none is clear.
+
+    Walls, floors and furniture are mostly at right angles, so the vertical is one of the three (J. Coughlan and A.
+    Yuille, "Manhattan World", ICCV 1999).
 
     Args:
-        image: (H, W, 3) uint8 RGB, the full sphere.
-        valid: (H, W) bool; masked (False) pixels have no lines.
+        segments: of all directions; see `find_segments`.
     """
-    return up_from_lines(find_segments({"": lambda: (image, valid)}, {"": np.eye(3)}, _UP), _UP)
+    if len(segments.weights) < _MIN_SEGMENTS:
+        return None
+    _, step_deg, tolerance_deg = _ROUNDS[0]
+    around = spiral_rays(int(4 * 180**2 / np.pi / step_deg**2))
+    first = up_from_lines(segments, around[int(np.argmax(_support(segments, around, tolerance_deg)))])
+    if not first:
+        return None
+    angles = np.deg2rad(np.arange(0.0, 90.0))
+    across = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
+    across = across @ rotation_from_two_vectors(_UP, first.up).T
+    along = np.cross(first.up, across)
+    best = int(np.argmax(sum(_support(segments, each, tolerance_deg) for each in (across, along))))
+    return np.array([first.up, across[best], along[best]])
 
 
 def directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
@@ -156,16 +178,16 @@ def _few(count: int) -> str:
 
 
 def _in_panorama(
-    image: NDArray[np.uint8], valid: NDArray[np.bool_], level_from_cam: FloatArray
+    image: NDArray[np.uint8], valid: NDArray[np.bool_], sides: Sequence[FloatArray]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return normals in the camera frame (M, 3) and lengths (M,) of the segments in each of four views."""
+    """Return normals in the camera frame (M, 3) and lengths (M,) of the segments in each view, by its rotation."""
     small = _reduced(image, width=4 * _MAX_FACE_PX)
     mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
     size = max(16, small.shape[1] // 4)
     focal = size / 2 / np.tan(np.deg2rad(_FOV_DEG / 2))
     views = []
-    for side in CUBE_ROTATIONS[:_SIDES]:
-        view = PinholeView(side @ level_from_cam, float(focal), np.array([size / 2, size / 2]), (size, size))
+    for side in sides:
+        view = PinholeView(side, float(focal), np.array([size / 2, size / 2]), (size, size))
         views.append(_in_view(face_image(small, view), face_mask(mask, view), view))
     return views
 

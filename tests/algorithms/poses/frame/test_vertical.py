@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below, sharpest_up
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
-from pano_mvs.algorithms.poses.frame.upside_down import up_of_picture
+from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
 from pano_mvs.algorithms.poses.frame.vertical import (
     find_vertical,
     robust_mean_direction,
@@ -259,8 +259,8 @@ def test_a_capture_that_is_upside_down_is_turned_around() -> None:
 
 def test_a_single_panorama_that_is_upside_down_is_found() -> None:
     picture, valid = place(ceiling=220, floor=120, textured=True)
-    np.testing.assert_array_equal(up_of_picture(picture, valid), UP)
-    np.testing.assert_array_equal(up_of_picture(np.ascontiguousarray(picture[::-1, ::-1]), valid), -UP)
+    np.testing.assert_array_equal(ups_of_picture(picture, valid), [UP])
+    np.testing.assert_array_equal(ups_of_picture(np.ascontiguousarray(picture[::-1, ::-1]), valid), [-UP])
 
 
 def test_sensors_are_believed_against_the_pictures() -> None:

@@ -98,7 +98,7 @@ def networks(name: str) -> tuple[Callable[[Any], Any], Callable[[Any, Any], NDAr
     """Return the function from a panorama to its key points, and the one from two panoramas' to their matches."""
     if name == "aliked":
         return (
-            lambda image: extract_aliked(image, np.ones(image.shape[:2], np.bool_), up=UP, max_keypoints=KEYPOINTS),
+            lambda image: extract_aliked(image, np.ones(image.shape[:2], np.bool_), ups=[UP], max_keypoints=KEYPOINTS),
             partial(lightglue.match_learned, max_views=VIEWS),
         )
     importlib.import_module("torch").set_num_threads(1)

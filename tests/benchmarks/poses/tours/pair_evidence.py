@@ -27,7 +27,7 @@ from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
 from pano_mvs.algorithms.learned.lightglue import match_learned
 from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.poses.frame.upside_down import up_of_picture
+from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.geometry import angle_between, geodesic_angle, nearest_rotation
 from pano_mvs.scene import Features
@@ -45,7 +45,7 @@ def keypoints(picture: Path) -> Features:
     assert stored is not None, picture
     image = np.ascontiguousarray(stored[..., ::-1])
     mask = np.ones(image.shape[:2], np.bool_)
-    return joined(extract_sift(image, mask), extract_aliked(image, mask, up=up_of_picture(image, mask)))
+    return joined(extract_sift(image, mask), extract_aliked(image, mask, ups=ups_of_picture(image, mask)))
 
 
 def candidates(first: Features, second: Features) -> np.ndarray:
