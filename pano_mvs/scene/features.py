@@ -25,7 +25,7 @@ class Features(Record):
         metric: "l2" or "hamming".
         size_hw: (height, width) of the panorama in which they were detected.
         learned: number of key points, the last ones, that the network ALIKED found and LightGlue can match.
-        ups: directions in the camera frame that may be the zenith, by each of which views were levelled for the network.
+        ups: directions of the camera frame that may be the zenith; views were levelled by each for the network.
         per_up: number of learned key points in the views of each of `ups`, in their order; empty: all in the first's.
     """
 
