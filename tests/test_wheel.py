@@ -80,9 +80,9 @@ def test_the_source_distribution_builds_the_same_wheel(tmp_path: Path, names: se
     (root,) = (tmp_path / "unpacked").iterdir()
     with zipfile.ZipFile(build(root, "wheel", tmp_path / "again")) as archive:
         assert set(archive.namelist()) == names
-    needed = [*below(ROOT / "tests", "*"), *below(ROOT / "docs", "*.md")]
+    needed = [*below(ROOT / "tests", "*"), *below(ROOT / "tools", "*"), *below(ROOT / "docs", "*.md")]
     assert len(needed) > 100
-    there = below(root / "tests", "*") | below(root / "docs", "*.md")
+    there = below(root / "tests", "*") | below(root / "tools", "*") | below(root / "docs", "*.md")
     assert set(needed) == there, "its tests could not run"
     read_by_tests = {"README.md", "CHANGELOG.md", "CITATION.cff", "SECURITY.md", "Dockerfile", ".dockerignore"}
     read_by_tests |= {"pyproject.toml", ".ci", ".github", "plugins"}

@@ -24,7 +24,7 @@ from pano_mvs.engine.cache.maintenance import collect
 from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy, settle
 from tests.engine.running.test_run import ALL_UNITS
-from tests.stress.captures import deliverables
+from tools.stress.captures import deliverables
 
 Cache = Callable[..., tuple[int, str]]
 UNITS = sum(ALL_UNITS.values())

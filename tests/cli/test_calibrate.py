@@ -10,9 +10,9 @@ import pytest
 from pano_mvs.io.rig_calibration import read_rig
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import write_png
-from tests.benchmarks.poses.lens_calibration import calibration_errors, place, random_rig, write_raw_capture
 from tests.cli.conftest import Command, pano_mvs
 from tests.stages.rig_images import tiny_rig_capture
+from tools.benchmarks.poses.lens_calibration import calibration_errors, place, random_rig, write_raw_capture
 
 __all__ = ["pano_mvs"]  # a fixture
 

@@ -10,8 +10,8 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import open_session
-from tests.benchmarks.engine.simulated_capture import write_picture, write_simulated
 from tests.engine.conftest import settle
+from tools.benchmarks.engine.simulated_capture import write_picture, write_simulated
 
 COUNT = 24
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
-from tests.benchmarks.poses.placements import judge_placements
+from tools.benchmarks.poses.placements import judge_placements
 
 
 def poses_of(cameras: dict[str, Rigid3], **more: Any) -> Poses:

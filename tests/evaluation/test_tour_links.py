@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from tests.benchmarks.poses.tours.links import offsets, read_links
 from tests.evaluation.test_placements import poses_of
+from tools.benchmarks.poses.tours.links import offsets, read_links
 
 
 def test_links_are_read_from_the_scenes_of_a_tour(tmp_path: Path) -> None:

@@ -143,6 +143,6 @@ def test_the_main_presets_have_reference_times(preset: str, tmp_path: Path, monk
         if reference_times().expected_unit(name, size, settings="", threads=1, whole=False) is not None
     ]
     missing = sorted({*names} - {*known})
-    assert len(known) >= 0.75 * len(names), f"run `python -m tests.benchmarks.reference_times {preset}`: {missing}"
+    assert len(known) >= 0.75 * len(names), f"run `python -m tools benchmarks reference_times {preset}`: {missing}"
     assert {"depth.sweep", "fusion.vote"} <= {*known}
     assert reference_times().expected_unit("(report)", size, settings="", threads=1, whole=True) is not None

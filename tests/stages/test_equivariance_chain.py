@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import roll_panorama, rotation_from_rotvec
-from tests.benchmarks.dense_chain import DenseChain
-from tests.benchmarks.equivariance import (
+from tests.synthetic.scenes import SCENES, Scene, write_scene
+from tools.benchmarks.dense_chain import DenseChain
+from tools.benchmarks.equivariance import (
     Bad,
     Equivariance,
     FolderPlace,
@@ -21,7 +22,6 @@ from tests.benchmarks.equivariance import (
     smooth_truth,
     turned_picture,
 )
-from tests.synthetic.scenes import SCENES, Scene, write_scene
 
 SMALL = ["depth.planes=48", "depth.near=1.0", "depth.far=6.0"]
 SIZE = (80, 160)

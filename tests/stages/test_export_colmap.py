@@ -31,9 +31,9 @@ from pano_mvs.stages.exports.colmap import (
 )
 from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
-from tests.benchmarks.colmap_dense import deliver, fused_points, wall_distances, write_workspace
-from tests.benchmarks.dense_chain import context
 from tests.stored import read_picture
+from tools.benchmarks.colmap_dense import deliver, fused_points, wall_distances, write_workspace
+from tools.benchmarks.dense_chain import context
 
 SIZE = (256, 512)
 NAMES = ("a/000.png", "a/b/001.png", "002.jpg")

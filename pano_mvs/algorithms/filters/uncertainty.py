@@ -3,7 +3,7 @@
 A match is precise to some angle, and the parallax in the sources converts that angle into a relative error of the
 range. The angle is not known, but it shows: where matches are poor, ranges of different views disagree, and surfaces
 are rough. The factors were fitted to synthetic places with known ranges, leaving out each place in turn, and checked
-on rendered ones; `tests/benchmarks/uncertainty.py` measures them.
+on rendered ones; `tools/benchmarks/uncertainty.py` measures them.
 """
 
 from __future__ import annotations

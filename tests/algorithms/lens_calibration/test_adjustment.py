@@ -18,7 +18,7 @@ from pano_mvs.algorithms.lens_calibration.adjustment import (
 )
 from pano_mvs.geometry import geodesic_angle, rotation_from_rotvec
 from pano_mvs.testing.room import capture_poses, default_room, range_along
-from tests.benchmarks.poses.lens_calibration import random_rig
+from tools.benchmarks.poses.lens_calibration import random_rig
 
 
 def true_bundle(seed: int, *, count: int = 6, points: int = 400, noise_px: float = 0.0) -> RigBundle:

@@ -13,7 +13,7 @@ from pano_mvs.evaluation.poses import relative_pose_errors
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, TwoView
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture
-from tests.benchmarks.poses.placements import judge_placements
+from tools.benchmarks.poses.placements import judge_placements
 
 # Image 3 stands a tile further along by three of its five pairs; one more pair is false.
 FALSE = {(0, 3): 1, (1, 3): 1, (2, 3): 1, (0, 2): -1}

@@ -27,7 +27,7 @@ from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.session.running import MIN_FREE_VARIABLE
 from tests.engine.conftest import Toy
-from tests.stress.captures import deliverables, write_toy
+from tools.stress.captures import deliverables, write_toy
 
 
 class Disk:

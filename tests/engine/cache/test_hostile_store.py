@@ -31,8 +31,8 @@ from pano_mvs.engine.cache.maintenance import collect, usage_of, verify
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.running.events import RunResult
 from tests.engine.conftest import Toy, ran
-from tests.stress.captures import deliverables
-from tests.stress.damage import Patient, make_patient
+from tools.stress.captures import deliverables
+from tools.stress.damage import Patient, make_patient
 
 
 class Bomb:

@@ -3,7 +3,7 @@
 Light comes from above. Floors, furniture and the ground have more texture than ceilings and the sky. And people take
 the panoramas of a capture at one height above a floor, so that sparse points lie in a sharper layer below the cameras
 than above them. None of this holds everywhere: a black ceiling is darker than its floor, a painted one has more
-texture. So each difference is bounded, and one model weighs them, whose coefficients `tests/benchmarks/poses/
+texture. So each difference is bounded, and one model weighs them, whose coefficients `tools/benchmarks/poses/
 upside_down.py` fits to captures that are upright.
 """
 

@@ -18,9 +18,9 @@ from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
 from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
-from tests.benchmarks.poses.placements import judge_placements
 from tests.known import known
 from tests.synthetic.scenes import white_room
+from tools.benchmarks.poses.placements import judge_placements
 
 Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]
 

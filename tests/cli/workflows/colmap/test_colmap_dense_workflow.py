@@ -8,9 +8,9 @@ import cv2
 import pycolmap
 import pytest
 
-from tests.benchmarks.colmap_dense import fused_points
 from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json
 from tests.stored import read_picture
+from tools.benchmarks.colmap_dense import fused_points
 
 NAMES = ["000", "001", "002", "003"]
 

@@ -1,4 +1,4 @@
-"""The coefficients that `python -m tests.benchmarks.belief.refit` has fitted."""
+"""The coefficients that `python -m tools benchmarks belief.refit` has fitted."""
 
 from pano_mvs.algorithms.poses.verification.belief.model import Model, Term
 

@@ -1,0 +1,142 @@
+"""The model of evidence recovers what generated evidence says, and never counts a measurement against its sign."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
+from pano_mvs.algorithms.poses.verification.belief.model import steps_behind
+from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
+from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+from tools.benchmarks.belief import fitting
+from tools.benchmarks.belief.fitting import (
+    MEASURED,
+    SIGNS,
+    Cameras,
+    Outcome,
+    area_under_roc,
+    calibration_error,
+    fit,
+    left_out,
+    probabilities,
+    read_table,
+    write_table,
+)
+from tools.benchmarks.belief.measuring import evidence_of
+from tools.benchmarks.belief.refit import decidable, doubted, source_of
+
+
+def drawn(count: int, rng: np.random.Generator) -> Cameras:
+    """Return cameras whose chance to be right depends on two of three measurements."""
+    good, against, noise = (rng.normal(size=count) for _ in range(3))
+    missing = rng.random(count) < 0.2
+    logit = 1.5 + 2 * np.clip(good, -2, 2) - 1.5 * np.clip(against, -2, 2) - missing
+    right = rng.random(count) < 1 / (1 + np.exp(-logit))
+    columns = {"ratio": good, "place_rival": against, "repeats": np.where(missing, np.nan, noise)}
+    family = rng.choice(["a", "b", "c"], count)
+    return Cameras(columns, right, np.zeros(count, np.bool_), family, family)
+
+
+TABLE, LEARNED = (Path(fitting.__file__).with_name(name) for name in ("evidence.csv", "learned.csv"))
+CHOSEN = {"ratio": 1, "place_rival": -1, "repeats": -1}
+
+
+def test_families_that_were_left_out_are_calibrated() -> None:
+    cameras = drawn(3000, np.random.default_rng(0))
+    found = left_out(cameras, signs=CHOSEN)
+    assert calibration_error(found, cameras.right) < 0.04
+    assert area_under_roc(found, cameras.right) > 0.85
+
+
+def test_all_families_of_a_place_are_left_out_together() -> None:
+    cameras = drawn(600, np.random.default_rng(4))
+    large = (cameras.family == "a") & (np.arange(600) % 2 == 0)
+    cameras = replace(cameras, family=np.where(large, "a/large", cameras.family))
+    others = replace(cameras, right=np.where(large, ~cameras.right, cameras.right))
+    mine = cameras.place == "a"
+    np.testing.assert_array_equal(*(left_out(each, signs=CHOSEN)[mine] for each in (cameras, others)))
+
+
+def test_the_stored_evidence_is_calibrated_and_says_more_than_the_rules(tmp_path: Path) -> None:
+    cameras = read_table(TABLE)
+    write_table(tmp_path / "again.csv", cameras)
+    assert (tmp_path / "again.csv").read_text() == TABLE.read_text()
+    cameras = decidable(cameras)
+    again = probabilities(fit(cameras), cameras)
+    np.testing.assert_allclose(probabilities(FITTED, cameras), again, atol=0.01)
+    found = left_out(cameras)
+    assert calibration_error(found, cameras.right) < 0.03
+    assert area_under_roc(found, cameras.right) > 0.9
+    rules, model = (Outcome.of(cameras.right, one) for one in (cameras.doubted, doubted(found)))
+    assert model.right_doubted < 0.7 * rules.right_doubted
+    assert model.wrong_silent < 0.8 * rules.wrong_silent
+    assert FITTED.probability({}) == pytest.approx(cameras.right.mean(), abs=0.02)
+
+
+def test_cameras_with_learned_matches_are_judged_as_well_though_none_was_fitted() -> None:
+    cameras = read_table(LEARNED)
+    found = probabilities(FITTED, cameras)
+    assert area_under_roc(found, cameras.right) > 0.93
+    outcome = Outcome.of(cameras.right, doubted(found))
+    assert outcome.right_doubted < 0.25 * outcome.right
+    assert outcome.wrong_silent < 0.1 * outcome.wrong
+
+
+def test_a_measurement_only_counts_the_way_of_its_sign() -> None:
+    cameras = drawn(2000, np.random.default_rng(1))
+    model = fit(cameras, signs={**CHOSEN, "ratio": -1})
+    assert "ratio" not in model.terms or not any(model.terms["ratio"].losses)
+    better = fit(cameras, signs=CHOSEN)
+    row = {"ratio": 0.0, "place_rival": 0.0, "repeats": 0.0}
+    chances = [better.probability({**row, "ratio": value}) for value in np.linspace(-4, 4, 30)]
+    assert np.all(np.diff(chances) >= 0)
+    assert chances[-1] - chances[0] > 0.5
+
+
+def test_a_missing_measurement_is_never_better_than_the_best() -> None:
+    model = fit(drawn(2000, np.random.default_rng(2)), signs=CHOSEN)
+    best = {"ratio": 9.0, "place_rival": -9.0, "repeats": -9.0}
+    assert model.probability({**best, "repeats": np.nan}) < model.probability(best)
+    assert all(one <= 0 for one in model.contributions({}).values())
+
+
+def test_steps_count_from_the_best_knot() -> None:
+    behind = steps_behind(np.array([-1.0, 0.0, 1.5, 2.0, 3.0, np.nan]), (0.0, 1.0, 2.0))
+    assert behind.tolist() == [[1, 1, 0], [1, 1, 0], [0, 0.5, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]]
+
+
+def test_a_model_is_the_same_from_its_file(tmp_path: Path) -> None:
+    model = fit(drawn(500, np.random.default_rng(3)), signs=CHOSEN)
+    (tmp_path / "coefficients.py").write_text(source_of(model))
+    assert runpy.run_path(str(tmp_path / "coefficients.py"))["FITTED"] == model
+
+
+def test_outcomes_count_both_errors() -> None:
+    outcome = Outcome.of(np.array([True, True, False, False]), np.array([True, False, True, False]))
+    assert (outcome.right, outcome.wrong, outcome.right_doubted, outcome.wrong_silent) == (2, 2, 1, 1)
+
+
+@pytest.mark.slow
+def test_every_measurement_of_a_table_is_measured() -> None:
+    tiny = tiny_capture(Variant(size_hw=(128, 256)))
+    poses = Poses.without_points(dict(zip(tiny.names, tiny.poses, strict=True)), frame="x", scale="x", metric=True)
+    whole = np.ones((128, 256), np.bool_)
+    loaded = {name: (image, whole) for name, image in zip(tiny.names, tiny.pictures, strict=True)}
+    group = verified_group(
+        poses, loaded.__getitem__, features=tiny.each(Features), two_views=tiny.each(TwoView), correct=False
+    )
+    for row in evidence_of(group).values():
+        assert row.keys() == {*MEASURED} == {*SIGNS, "contradicted"}
+        assert row["contradicted"] == 0
+        assert row["ratio"] > 0.7
+        assert row["agreeing"] > 1
+    without = verified_group(poses, loaded.__getitem__, features={}, two_views={}, correct=False)
+    for row in evidence_of(without).values():
+        assert np.isnan([row["agreeing"], row["contradicted"]]).all()
+        assert row["ratio"] > 0.7
