@@ -154,10 +154,12 @@ class Side:
     Attributes:
         descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
         places: (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them.
+        ups: number of directions that may be up.
     """
 
     descriptors: Array
     places: Array
+    ups: int
 
     @classmethod
     def of(cls, features: Features) -> Side:
@@ -170,7 +172,7 @@ class Side:
                 pixels = tile.pixels_from_rays(learned.bearings)
                 seen = (of_up == number) & tile.contains(pixels)
                 views.append(np.where(seen[:, None], pixels / (TILE_PX / 2) - 1, np.nan))
-        return cls(learned.descriptors.astype(np.float32), np.array(views, np.float32))
+        return cls(learned.descriptors.astype(np.float32), np.array(views, np.float32), len(learned.ups))
 
     def inside(self, view: int) -> tuple[NDArray[np.intp], Array, Array]:
         """Return the key points in a view, their unit descriptors and their places in it."""
@@ -180,8 +182,10 @@ class Side:
 
 def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
     """Return the pairs of views with the most descriptors that are each other's nearest."""
-    nearest = match_l2(first.descriptors, second.descriptors, ratio=1)
-    seen = [~np.isnan(side.places[:, nearest[:, n], 0]) for n, side in enumerate((first, second))]
+    # With views for several directions that may be up, a share of the key points tells as much.
+    one, other = (side.descriptors[:: side.ups] for side in (first, second))
+    nearest = match_l2(one, other, ratio=1)
+    seen = [~np.isnan(side.places[:, side.ups * nearest[:, n], 0]) for n, side in enumerate((first, second))]
     counts = seen[0].astype(np.int64) @ seen[1].astype(np.int64).T
     order = np.argsort(-counts, axis=None, kind="stable")[:most]
     return [(int(one), int(other)) for one, other in zip(*np.unravel_index(order, counts.shape), strict=True)]

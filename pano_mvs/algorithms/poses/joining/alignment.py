@@ -50,6 +50,7 @@ def align_models(
     threshold_rad: float,
     has_scale: bool,
     hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]],
+    scale: float | None = None,
 ) -> Alignment | None:
     """Return the similarity of two models on which most of their matches agree; None if there is none.
 
@@ -62,12 +63,13 @@ def align_models(
         threshold_rad: maximum error of an inlier.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
         hypotheses: relative poses of pairs of images.
+        scale: of first_from_second, if it is known from elsewhere.
     """
-    proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad)
+    proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad, scale=scale)
     if not proposals:
         return None
     finalists = [
-        _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale)
+        _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale and scale is None)
         for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)
     ]
     costs = [alignment_cost(similarity, matches, threshold_rad=threshold_rad) for similarity, _ in finalists]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors, stacked
+from pano_mvs.algorithms.poses.joining.floors import scale_of_floors
 from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
@@ -24,6 +25,7 @@ _THRESHOLD_RAD = float(np.deg2rad(0.4))
 _MAX_LOG10_FALSE_ALARMS = -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
+_MIN_OF_LENGTH = 8  # known points that determine the length of a translation if the scale is known
 _MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
 _OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # evidence for the best alignment, such as matches, that a rival does not explain
 _PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
@@ -85,17 +87,38 @@ def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[in
 
 
 def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
-    """Return the alignment of two models by the matches between them; None if these do not determine it."""
+    """Return the alignment of two models by the matches between them; None if these do not determine it.
+
+    Where pairs determine everything but the lengths, the floors of both models determine the scale.
+    """
     views = _views_between(first, second)
     matches = cross_matches(
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
     hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
+    found = _of_scale(first, second, matches, views, hypotheses)
+    if found is None and len(second.cameras) > 1 and (scale := scale_of_floors(first, second)):
+        found = _of_scale(first, second, matches, views, hypotheses, scale=scale)
+    return found
+
+
+def _of_scale(
+    first: PlacedModel,
+    second: PlacedModel,
+    matches: CrossMatches,
+    views: Mapping[Edge, TwoView],
+    hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
+    *,
+    scale: float | None = None,
+) -> Alignment | None:
+    """Return the certain alignment of two models, with the given scale if it is known."""
     has_scale = len(second.cameras) > 1
-    best = _aligned(matches, hypotheses, has_scale=has_scale)
+    best = _aligned(matches, hypotheses, has_scale=has_scale, scale=scale)
     if best is None:
         return None
     evidence = _evidence_of_pairs(best, first, second, views=views)
+    if scale and best.witnesses >= _MIN_OF_LENGTH:
+        evidence = evidence._replace(has_length=True)
     if (
         not _is_significant(best, evidence, learned=any(one.learned for one in first.pairs.features.values()))
         or best.rotation_std_deg > _MAX_TURN_STD_DEG
@@ -105,7 +128,7 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | N
         return None
     # Where structure repeats, an alignment with another, similar place has matches of its own.
     rest = matches[np.flatnonzero(~best.inliers)]
-    other = _aligned(rest, hypotheses, has_scale=has_scale)
+    other = _aligned(rest, hypotheses, has_scale=has_scale, scale=scale)
     if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
         return best
     others = _evidence_of_pairs(other, first, second, views=views)
@@ -227,11 +250,15 @@ def _lengths(
 
 
 def _aligned(
-    matches: CrossMatches, hypotheses: Mapping[Edge, Sequence[PairHypothesis]], *, has_scale: bool
+    matches: CrossMatches,
+    hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
+    *,
+    has_scale: bool,
+    scale: float | None,
 ) -> Alignment | None:
     if not matches.known.any():
         return None
-    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses)
+    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, scale=scale, hypotheses=hypotheses)
 
 
 def _is_rival(

@@ -28,9 +28,13 @@ class PairHypothesis:
 
 
 def pair_proposals(
-    matches: CrossMatches, hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]], *, threshold_rad: float
+    matches: CrossMatches,
+    hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]],
+    *,
+    threshold_rad: float,
+    scale: float | None = None,
 ) -> list[FloatArray]:
-    """Return similarities from relative poses of two images, one of each model.
+    """Return similarities from relative poses of two images, one of each model, with the given scale if it is known.
 
     Returns:
         Rotation, translation and scale of first_from_second in one vector each, (13,).
@@ -40,7 +44,7 @@ def pair_proposals(
         pair = np.flatnonzero((matches.cameras == cameras).all(axis=1))
         if len(pair):
             centers = matches.centers[pair[0]]
-            found += [_with_lengths(one, centers, matches, threshold_rad=threshold_rad) for one in some]
+            found += [_with_lengths(one, centers, matches, threshold_rad=threshold_rad, scale=scale) for one in some]
     return found
 
 
@@ -53,7 +57,12 @@ def least_costly(
 
 
 def _with_lengths(
-    hypothesis: PairHypothesis, centers: FloatArray, matches: CrossMatches, *, threshold_rad: float
+    hypothesis: PairHypothesis,
+    centers: FloatArray,
+    matches: CrossMatches,
+    *,
+    threshold_rad: float,
+    scale: float | None,
 ) -> FloatArray:
     """Return the similarity with the relative pose of two cameras and, if its lengths are unknown, the best ones.
 
@@ -61,17 +70,43 @@ def _with_lengths(
     likewise in the second.
     """
     rotation, direction = hypothesis.second_from_first.rotation.T, hypothesis.second_from_first.center
-    lengths = list(hypothesis.lengths)
-    for side in np.flatnonzero(np.isnan(lengths)):
-        # Only matches of the one camera: the rest of its model is at distances that depend on both lengths.
-        of_camera = np.abs(matches.centers[:, 1 - side] - centers[1 - side]).max(axis=1) < 1e-9
-        known = matches[np.flatnonzero(of_camera & np.isfinite(matches.ranges[:, side]))]
-        turn = rotation if side == 0 else rotation.T
-        towards = direction if side == 0 else -rotation.T @ direction
-        seen = known.points[None, :, side] - (centers[side] + _LENGTHS[:, None, None] * towards)
-        cosine = np.sum((seen @ turn) * known.rays[:, 1 - side], axis=2) / np.linalg.norm(seen, axis=2)
-        costs = np.minimum(2 * (1 - cosine) / (2 * threshold_rad) ** 2, 1.0).sum(axis=1)
-        lengths[side] = float(_LENGTHS[int(np.argmin(costs))]) if len(known) else 1.0
-    scale = lengths[0] / lengths[1]
+    lengths = np.array(hypothesis.lengths)
+    costs = [
+        _costs_of_lengths(side, rotation, direction, centers, matches, threshold_rad=threshold_rad)
+        if np.isnan(lengths[side])
+        else None
+        for side in (0, 1)
+    ]
+    for side, each in enumerate(costs):
+        if each is not None:
+            lengths[side] = _LENGTHS[int(np.argmin(each))] if np.ptp(each) > 0 else 1.0
+    if scale is not None:
+        # The side whose matches determine its length better.
+        gains = [np.inf if each is None else float(np.ptp(each)) for each in costs]
+        if gains[0] >= gains[1]:
+            lengths[1] = lengths[0] / scale
+        else:
+            lengths[0] = lengths[1] * scale
+    ratio = lengths[0] / lengths[1]
     place = centers[0] + lengths[0] * direction
-    return np.concatenate([rotation.ravel(), place - scale * rotation @ centers[1], [scale]])
+    return np.concatenate([rotation.ravel(), place - ratio * rotation @ centers[1], [ratio]])
+
+
+def _costs_of_lengths(
+    side: int,
+    rotation: FloatArray,
+    direction: FloatArray,
+    centers: FloatArray,
+    matches: CrossMatches,
+    *,
+    threshold_rad: float,
+) -> FloatArray:
+    """Return the costs of the matches whose point is known in one model, for each of `_LENGTHS` in its unit."""
+    # Only matches of the one camera: the rest of its model is at distances that depend on both lengths.
+    of_camera = np.abs(matches.centers[:, 1 - side] - centers[1 - side]).max(axis=1) < 1e-9
+    known = matches[np.flatnonzero(of_camera & np.isfinite(matches.ranges[:, side]))]
+    turn = rotation if side == 0 else rotation.T
+    towards = direction if side == 0 else -rotation.T @ direction
+    seen = known.points[None, :, side] - (centers[side] + _LENGTHS[:, None, None] * towards)
+    cosine = np.sum((seen @ turn) * known.rays[:, 1 - side], axis=2) / np.linalg.norm(seen, axis=2)
+    return np.asarray(np.minimum(2 * (1 - cosine) / (2 * threshold_rad) ** 2, 1.0).sum(axis=1))
