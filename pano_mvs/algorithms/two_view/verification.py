@@ -35,6 +35,7 @@ _ROTATION_SHARE = 0.9
 _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
+_NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 MAX_LOG10_LEARNED = -50.0
 """For learned matches: about where a pair is as likely right as wrong (see docs/learned.md, False pairs)."""
 _ALIKE_DEG = 5.0
@@ -167,6 +168,46 @@ def verify_pose(
     if near.sum() >= min_inliers:
         known = refine_relative_pose(known, p[near], q[near], scale_rad=0.5 * pair.threshold_rad)
     return pair.judged(pair.evidence(known, sample=0, models=1))
+
+
+def pose_near(
+    first: Features, second: Features, matches_idx: NDArray[np.int32], pose: Rigid3, *, threshold_deg: float = 0.2
+) -> tuple[Rigid3, float, float] | None:
+    """Return the relative pose near another that most matches agree with, and how significant it is by itself.
+
+    Args:
+        first: key points of the first image.
+        second: key points of the second image.
+        matches_idx: (M, 2) positions of matching key points.
+        pose: second_from_first; its length is ignored.
+        threshold_deg: maximum spherical Sampson error of an inlier.
+
+    Returns:
+        The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
+        itself. None if hardly any match agrees, or the pose is the null motion.
+    """
+    p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
+    pair = _Pair(
+        matches_idx,
+        p,
+        q,
+        np.random.default_rng(0),
+        float(np.deg2rad(threshold_deg)),
+        _MIN_NEAR,
+        bool(first.learned and second.learned),
+    )
+    length = float(np.linalg.norm(pose.translation))
+    if length <= 0:
+        return None
+    near = Rigid3(pose.rotation, pose.translation / length)
+    for widen in _NEAR:
+        agree = agreement(near, p, q, threshold_rad=widen * pair.threshold_rad)[1]
+        if agree.sum() < _MIN_NEAR:
+            return None
+        near = refine_relative_pose(near, p[agree], q[agree], scale_rad=0.5 * widen * pair.threshold_rad)
+    minimal = SOLVERS["five_point"]
+    evidence = pair.evidence(near, sample=minimal.sample, models=minimal.models)
+    return (near, evidence.log10_false_alarms, evidence.most) if np.isfinite(evidence.log10_false_alarms) else None
 
 
 def max_log10_false_alarms(p: FloatArray, q: FloatArray, *, learned: bool) -> float:

@@ -17,7 +17,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, signific
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
-from pano_mvs.algorithms.two_view.verification import max_log10_false_alarms
+from pano_mvs.algorithms.two_view.verification import max_log10_false_alarms, pose_near
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
@@ -25,7 +25,7 @@ _THRESHOLD_RAD = float(np.deg2rad(0.4))
 _MAX_LOG10_FALSE_ALARMS = -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
-_MIN_OF_LENGTH = 8  # known points that determine the length of a translation if the scale is known
+_MIN_OF_LENGTH = 6  # known points that determine the length of a translation if the scale is known
 _MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
 _OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # evidence for the best alignment, such as matches, that a rival does not explain
 _PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
@@ -171,26 +171,37 @@ def _evidence_of_pairs(
     joined = joined_model(first, second, alignment.first_from_second)
     agreeing, disagreeing, has_length, alarms = 0.0, 0.0, False, list[float]()
     for (i, j), view in views.items():
-        geometry = view if view else next(iter(view.alternatives), None)
-        if geometry is None or view.log10_false_alarms >= 0:
-            continue
-        pose, matches = oriented(geometry, i, j)
         features = [first.pairs.features[first.pairs.names[image]] for image in (i, j)]
-        p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
-        limit = max_log10_false_alarms(p, q, learned=all(one.learned for one in features))
-        if not view and view.log10_false_alarms <= limit:
-            continue  # it was refused since its direction is open, such as for distant scenery alone
         relative = joined.cameras[j] @ joined.cameras[i].inverse()
-        turned = geodesic_angle(pose.rotation, relative.rotation)
-        off = angle_between(pose.translation, relative.translation)
-        if turned < _SAME_TURN_RAD and off < _SAME_DIRECTION_RAD:
-            agreeing += view.log10_false_alarms / limit
-            alarms.append(view.log10_false_alarms)
-            has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
-        else:
-            disagreeing += view.log10_false_alarms / limit
+        own, limit = 0.0, MAX_LOG10_FALSE_ALARMS
+        geometry = view if view else next(iter(view.alternatives), None)
+        if geometry is not None and view.log10_false_alarms < 0:
+            pose, matches = oriented(geometry, i, j)
+            p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
+            own, limit = view.log10_false_alarms, max_log10_false_alarms(p, q, learned=all(f.learned for f in features))
+            if not view and own <= limit:
+                continue  # it was refused since its direction is open, such as for distant scenery alone
+            if _is_same(pose, relative):
+                agreeing += own / limit
+                alarms.append(own)
+                has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
+                continue
+        # The best pose of weak matches is a matter of chance; they may agree with the alignment nearly as well.
+        near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], relative)
+        here = min(near[1], 0.0) if near and _is_same(near[0], relative) else 0.0
+        if near and here < 0:
+            agreeing += here / near[2]
+            alarms.append(here)
+        disagreeing += max(0.0, (own - here) / limit)
     has_length |= sum(sorted(alarms)[1:]) <= MAX_LOG10_FALSE_ALARMS
     return _PairEvidence(agreeing, disagreeing, has_length)
+
+
+def _is_same(pose: Rigid3, relative: Rigid3) -> bool:
+    """Return whether a relative pose, |t| = 1, has the rotation and the direction of another one."""
+    turned = geodesic_angle(pose.rotation, relative.rotation)
+    off = angle_between(pose.translation, relative.translation)
+    return bool(turned < _SAME_TURN_RAD and off < _SAME_DIRECTION_RAD)
 
 
 def _has_lengths(
