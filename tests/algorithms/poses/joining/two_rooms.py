@@ -72,9 +72,9 @@ def room_features(
 
 
 def with_points_of_pairs(
-    features: dict[str, Features], poses: dict[str, Rigid3], pairs: Iterable[tuple[str, str]], *, count: int
+    features: dict[str, Features], poses: dict[str, Rigid3], pairs: Iterable[tuple[str, ...]], *, count: int
 ) -> dict[str, Features]:
-    """Return features with `count` more points near the door for each of some pairs, which no other camera sees."""
+    """Return features with `count` more points near the door for each of some sets of cameras, seen by no other one."""
     rng = np.random.default_rng(5)
     found = dict(features)
     for pair in pairs:
