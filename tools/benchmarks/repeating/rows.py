@@ -9,8 +9,9 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
-from tests.repeating.fittings import Site, Wall
-from tests.repeating.visits import (
+from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.fittings import Site, Wall
+from tools.benchmarks.repeating.visits import (
     PLASTER,
     SAND,
     STONES,
@@ -23,8 +24,7 @@ from tests.repeating.visits import (
     unique_rng,
     wall_print,
 )
-from tests.repeating.walks import Ground, Rect
-from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.walks import Ground, Rect
 
 
 def facade_row(

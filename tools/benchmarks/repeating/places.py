@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from tests.repeating.halls import colonnade, tiled_hall
-from tests.repeating.rows import doors, facade_row, stairs
-from tests.repeating.twin_rooms import twin_rooms
-from tests.repeating.visits import TILES, Visit
-from tests.repeating.walks import LAYOUTS
 from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.halls import colonnade, tiled_hall
+from tools.benchmarks.repeating.rows import doors, facade_row, stairs
+from tools.benchmarks.repeating.twin_rooms import twin_rooms
+from tools.benchmarks.repeating.visits import TILES, Visit
+from tools.benchmarks.repeating.walks import LAYOUTS
 
 __all__ = [
     "REPEATS",

@@ -14,12 +14,12 @@ from pano_mvs.geometry import Rigid3, ray_grid, spiral_rays
 from pano_mvs.testing.paint import OAK
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.surfaces import Cuboid
-from tests.repeating.drawings import Drawing
-from tests.repeating.places import REPEATS, doors, draw_capture, tiled_hall, twin_rooms
-from tests.repeating.prints import Print
-from tests.repeating.walks import LAYOUTS, Ground, stands
 from tests.synthetic.bounded import Bounded
 from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.drawings import Drawing
+from tools.benchmarks.repeating.places import REPEATS, doors, draw_capture, tiled_hall, twin_rooms
+from tools.benchmarks.repeating.prints import Print
+from tools.benchmarks.repeating.walks import LAYOUTS, Ground, stands
 
 SIZE = (32, 64)
 

@@ -7,12 +7,12 @@ from typing import Literal, Unpack
 import numpy as np
 
 from pano_mvs.testing.paint import OAK, WHITE
-from tests.repeating.copies import Move
-from tests.repeating.fittings import Site, Wall
-from tests.repeating.prints import Print
-from tests.repeating.visits import STONES, TILES, Visit, captured, printed, unique_rng, wall_print
-from tests.repeating.walks import Ground, Rect
 from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.copies import Move
+from tools.benchmarks.repeating.fittings import Site, Wall
+from tools.benchmarks.repeating.prints import Print
+from tools.benchmarks.repeating.visits import STONES, TILES, Visit, captured, printed, unique_rng, wall_print
+from tools.benchmarks.repeating.walks import Ground, Rect
 
 _HALF = 0.1  # half of the partition's thickness
 _OPENING, _LINTEL, _HEIGHT = 1.4, 2.1, 2.7

@@ -11,11 +11,11 @@ from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rot
 from pano_mvs.testing.paint import Colors
 from pano_mvs.testing.room import Room
 from pano_mvs.testing.surfaces import Vector
-from tests.repeating.drawings import Drawing, Kind
-from tests.repeating.fittings import Site
-from tests.repeating.prints import Print
-from tests.repeating.walks import Ground, Layout, Rect, stands
 from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.drawings import Drawing, Kind
+from tools.benchmarks.repeating.fittings import Site
+from tools.benchmarks.repeating.prints import Print
+from tools.benchmarks.repeating.walks import Ground, Layout, Rect, stands
 
 Tiles = Literal["marble", "checker", "motif"]
 

@@ -7,10 +7,11 @@ from typing import Literal, Unpack
 import numpy as np
 
 from pano_mvs.testing.paint import OAK, WHITE
-from tests.repeating.drawings import Drawing
-from tests.repeating.fittings import Site, Wall
-from tests.repeating.prints import Print
-from tests.repeating.visits import (
+from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.drawings import Drawing
+from tools.benchmarks.repeating.fittings import Site, Wall
+from tools.benchmarks.repeating.prints import Print
+from tools.benchmarks.repeating.visits import (
     SAND,
     STONES,
     Tiles,
@@ -22,8 +23,7 @@ from tests.repeating.visits import (
     unique_rng,
     wall_print,
 )
-from tests.repeating.walks import Ground, Rect
-from tests.synthetic.scenes import Scene
+from tools.benchmarks.repeating.walks import Ground, Rect
 
 
 def tiled_hall(

@@ -8,11 +8,11 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
-from tests.repeating.fittings import Painted, Wall, corners, vector
-from tests.repeating.prints import Print
-from tests.repeating.walks import Rect
 from tests.synthetic.bounded import Bounded
 from tests.synthetic.rod import Rod
+from tools.benchmarks.repeating.fittings import Painted, Wall, corners, vector
+from tools.benchmarks.repeating.prints import Print
+from tools.benchmarks.repeating.walks import Rect
 
 
 @dataclass(frozen=True)
