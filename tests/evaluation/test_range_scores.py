@@ -28,7 +28,7 @@ from pano_mvs.evaluation.ranges.view_scores import (
     weighted_quantile,
 )
 from pano_mvs.geometry import pixel_solid_angle
-from tests.oracles import range_scores as oracle
+from tests.oracles import surfaces as oracle
 
 SIZE = (6, 12)
 BAD = (BadLimit(0.05), BadLimit(0.5), BadLimit(1.5), BadLimit(0.3, relative=False))

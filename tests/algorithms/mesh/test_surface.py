@@ -15,7 +15,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from tests.algorithms.mesh.box import BOARD, Capture, box, capture, poses
-from tests.oracles.mesh import nearest_triangles, texel_looks
+from tests.oracles.surfaces import nearest_triangles, texel_looks
 
 SIZE = (16, 32)
 
