@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.testing.room import capture_poses, default_room
-from tests.engine.conftest import toy
+from tests.engine.conftest import finished, finished_once, toy
 from tests.synthetic.capture_files import write_capture
 
-__all__ = ["toy"]
+__all__ = ["finished", "finished_once", "toy"]
 
 SIZE_HW = (160, 320)
 SMALL = ("--set", "depth.planes=32", "--set", "features.max_keypoints=1500")
