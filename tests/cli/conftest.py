@@ -44,6 +44,20 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Output folder, beside its cache, and text of a quickstart run on the rendered capture; not to be changed."""
+    folder = tmp_path_factory.mktemp("quickstart")
+    arguments = (
+        *f"run quickstart --images {rendered / 'images'} --out {folder / 'out'} --cache {folder / 'cache'}".split(),
+        *f"--set scores.truth={rendered / 'truth'}".split(),
+        *SMALL,
+    )
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    return folder / "out", result.output
+
+
 @pytest.fixture
 def capture(rendered: Path, tmp_path: Path) -> Path:
     """A copy of the rendered capture that a test may change."""

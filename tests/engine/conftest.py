@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,7 +19,12 @@ from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
-from tests.processes import heed_interrupts
+
+
+def heed_interrupts() -> None:
+    """Let a new process take interrupts, which one that a script starts in its background ignores; for `preexec_fn`."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 
 PATIENCE_S = 300.0
 """A busy machine takes long to do the quickest thing; what takes longer than this hangs."""

@@ -69,26 +69,23 @@ def test_colmap_preset_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: 
     assert len(model.points_in_world) > 50
 
 
-@pytest.mark.parametrize("settings", ["mapper: incremental", "mapper: global, cameras: faces"])
+@pytest.mark.parametrize(
+    ("solver", "most_deg"),
+    [
+        (f"{MATCHED}  poses: {{use: poses.colmap, mapper: incremental}}", 0.3),
+        (f"{MATCHED}  poses: {{use: poses.colmap, mapper: global, cameras: faces}}", 0.3),
+        pytest.param("  poses: {use: poses.colmap_sift}", 1, marks=pytest.mark.slow),
+    ],
+    ids=["incremental", "global", "sift"],
+)
 def test_every_mode_registers_all(
-    pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path, settings: str
+    pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path, solver: str, most_deg: float
 ) -> None:
-    path = workflow(tmp_path, rendered, f"{MATCHED}  poses: {{use: poses.colmap, {settings}}}")
-    result = pano_mvs("run", path, "--out", "o", "--cache", cache)
+    result = pano_mvs("run", workflow(tmp_path, rendered, solver), "--out", "o", "--cache", cache)
     assert result.code == 0, result.text
     found = errors(Path("o"), rendered)
     assert found.registered == 4
-    assert found.median_pair_deg < 0.3
-
-
-@pytest.mark.slow
-def test_colmaps_own_sift_registers_all(pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path) -> None:
-    path = workflow(tmp_path, rendered, "  poses: {use: poses.colmap_sift}")
-    result = pano_mvs("run", path, "--out", "o", "--cache", cache)
-    assert result.code == 0, result.text
-    found = errors(Path("o"), rendered)
-    assert found.registered == 4
-    assert found.median_pair_deg < 1
+    assert found.median_pair_deg < most_deg
 
 
 @pytest.mark.parametrize("solver", ["poses.extend, path", "poses.colmap, fixed"])

@@ -1,21 +1,128 @@
-"""Rooms that share too few matches for a pair are joined by all matches together, and only if these decide."""
+"""Groups of images whose poses are known become one: by views between them, and by their pictures.
+
+Errors of matches between models.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.joining.alignment import Alignment
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, errors_and_residuals, match_errors, vector_of
 from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
+from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import Rigid3, Similarity3, angle_between, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
-from tests.algorithms.poses.joining.two_rooms import matched, room_features, room_poses, with_points_of_pairs
+
+CENTERS = {
+    "a1": (-2.4, 0.0, 0.3),
+    "a2": (-1.5, 0.05, -0.8),
+    "b1": (2.3, 0.02, -0.4),
+    "b2": (1.6, -0.03, 0.9),
+}
+NOISE_RAD = 3e-4
+
+
+def room_poses(*, turned: bool = False) -> dict[str, Rigid3]:
+    """Return cam_from_world of two cameras in either room, level with any heading, or turned in any way."""
+    rng = np.random.default_rng(4)
+    poses = {}
+    for name, center in CENTERS.items():
+        heading = (0.0, rng.uniform(-np.pi, np.pi), 0.0)
+        turn = rng.uniform(-1.5, 1.5, 3) if turned else np.zeros(3)
+        poses[name] = Rigid3.from_center(rotation_from_rotvec(turn) @ rotation_from_rotvec(heading), np.array(center))
+    return poses
+
+
+def room_features(
+    poses: dict[str, Rigid3], *, door: int, own: int = 220, false: int = 0, door_seed: int = 7
+) -> dict[str, Features]:
+    """Return the key points of all cameras: those of the own room, and some of the other one seen through the door.
+
+    Args:
+        poses: cam_from_world by name.
+        door: number of points of either room that the cameras of the other room see too.
+        own: number of points of each room.
+        false: number of key points that match in all images, although they show something else in each.
+        door_seed: of the points behind the door and of the descriptors.
+    """
+    rng = np.random.default_rng(door_seed)
+    points = np.concatenate([_room_points(rng, -2.0, own), _room_points(rng, 2.0, own)])
+    through = np.concatenate([_door_points(rng, -3.0, door), _door_points(rng, 3.0, door)])
+    descriptors = rng.integers(0, 120, (len(points) + len(through) + false, 64)).astype(np.float32)
+    features = {}
+    for name, pose in poses.items():
+        mine = np.arange(own) + (0 if name[0] == "a" else own)
+        seen = np.concatenate([mine, 2 * own + np.arange(len(through) + false)])
+        elsewhere = rng.normal(size=(false, 3)) * (1.0, 0.3, 1.0)
+        rays = pose.apply(np.concatenate([points, through, elsewhere + pose.center])[seen])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays += rng.normal(0, NOISE_RAD, rays.shape)
+        features[name] = Features(
+            bearings=rays / np.linalg.norm(rays, axis=1, keepdims=True),
+            descriptors=descriptors[seen] + rng.integers(-4, 5, (len(seen), 64)).astype(np.float32),
+            sizes_rad=np.full(len(seen), 0.02, np.float32),
+            scores=np.linspace(1, 0.1, len(seen), dtype=np.float32),
+            colors_rgb=np.full((len(seen), 3), 128, np.uint8),
+            metric="l2",
+            size_hw=(512, 1024),
+        )
+    return features
+
+
+def with_points_of_pairs(
+    features: dict[str, Features], poses: dict[str, Rigid3], pairs: Iterable[tuple[str, str]], *, count: int
+) -> dict[str, Features]:
+    """Return features with `count` more points near the door for each of some pairs, which no other camera sees."""
+    rng = np.random.default_rng(5)
+    found = dict(features)
+    for pair in pairs:
+        points = np.concatenate([_door_points(rng, x, count // 2) for x in (-3.0, 3.0)])
+        descriptors = rng.integers(0, 120, (count, 64)).astype(np.float32)
+        for name in pair:
+            rays = poses[name].apply(points)
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            rays += rng.normal(0, NOISE_RAD, rays.shape)
+            added = {"bearings": rays / np.linalg.norm(rays, axis=1, keepdims=True), "descriptors": descriptors}
+            own = found[name]
+            arrays: dict[str, Any] = {
+                key: np.concatenate([getattr(own, key), added.get(key, getattr(own, key)[:count])])
+                for key in ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
+            }
+            found[name] = replace(own, **arrays)
+    return found
+
+
+def matched(features: dict[str, Features]) -> dict[tuple[str, str], TwoView]:
+    """Return all pairs of the capture."""
+    return {
+        (a, b): verify_pair(
+            features[a], features[b], match_features(features[a], features[b]), rng=np.random.default_rng(1)
+        )
+        for a, b in combinations(features, 2)
+    }
+
+
+def _room_points(rng: np.random.Generator, middle: float, count: int) -> FloatArray:
+    points = rng.uniform(-1, 1, (count, 3))
+    side = rng.integers(3, size=count)
+    points[np.arange(count), side] = np.sign(points[np.arange(count), side])
+    return np.asarray(points * (1.9, 1.3, 2.0) + (middle, 0, 0))
+
+
+def _door_points(rng: np.random.Generator, x: float, count: int) -> FloatArray:
+    points: FloatArray = rng.uniform(-1, 1, (count, 3)) * (0.8, 0.9, 0.5) + (x, 0.1, 0.0)
+    return points
 
 
 def _solved(features: dict[str, Features]) -> Poses:
@@ -173,3 +280,51 @@ def test_a_length_is_more_than_chance_if_ranges_agree() -> None:
     assert alarms < -5
     assert significant_length(pose, p, q, known_ranges=rng.permutation(ranges), rng=rng)[1] > -1
     assert significant_length(pose, p, q, known_ranges=np.full(30, np.nan), rng=rng)[1] == np.inf
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _drawn(count: int = 60) -> tuple[Similarity3, CrossMatches]:
+    rng = np.random.default_rng(8)
+    similarity = Similarity3(1.7, rotation_from_rotvec(rng.normal(size=3)), rng.normal(size=3))
+    centers = rng.normal(size=(count, 2, 3))
+    second = 4 * rng.normal(size=(count, 3))
+    offsets = np.stack([similarity.apply(second) - centers[:, 0], second - centers[:, 1]], axis=1)
+    rays = _unit(offsets + rng.normal(0, 0.02, offsets.shape))
+    ranges = np.linalg.norm(offsets, axis=2)
+    ranges[::3, 0] = np.nan
+    ranges[::4, 1] = np.nan
+    numbers = np.zeros((count, 2), np.int32)
+    return similarity, CrossMatches(numbers.astype(np.intp), numbers, centers, rays, ranges)
+
+
+def _plain_error(similarity: Similarity3, matches: CrossMatches, idx: int) -> float:
+    """The errors of one match, as the docstring states them."""
+    (c, d), (u, v), (r, s) = matches.centers[idx], matches.rays[idx], matches.ranges[idx]
+    angles = []
+    if np.isfinite(r):
+        angles.append(float(angle_between(similarity.inverse().apply((c + r * u)[None])[0] - d, v)))
+    if np.isfinite(s):
+        angles.append(float(angle_between(similarity.apply((d + s * v)[None])[0] - c, u)))
+    if angles:
+        return max(angles)
+    baseline, turned = _unit(similarity.apply(d[None])[0] - c), similarity.rotation @ v
+    e = float(np.cross(u, turned) @ baseline)
+    squares = np.sum(np.cross(baseline, u) ** 2) + np.sum(np.cross(baseline, turned) ** 2) - 2 * e**2
+    return float(abs(e) / np.sqrt(squares))
+
+
+@pytest.mark.kernel("poses.joining.kernels_alignment")
+def test_errors_are_those_of_plain_geometry() -> None:
+    similarity, matches = _drawn()
+    plain = np.array([_plain_error(similarity, matches, idx) for idx in range(len(matches))])
+    assert np.isnan(matches.ranges).all(axis=1).any()
+    np.testing.assert_allclose(match_errors(similarity, matches), plain, rtol=1e-6, atol=1e-9)
+    errors, residuals = errors_and_residuals(vector_of(similarity), matches)
+    unknown = np.isnan(matches.ranges)
+    assert (residuals[unknown[:, 0], :3] == 0).all()
+    assert (residuals[unknown[:, 1], 3:6] == 0).all()
+    alone = unknown.all(axis=1)
+    np.testing.assert_allclose(np.abs(residuals[alone, 6]), errors[alone])
