@@ -26,7 +26,7 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, room_range
 from tests.known import known
-from tests.oracles import patchmatch as oracle
+from tests.oracles import range_filters as oracle
 
 SIZE = (64, 128)
 LUMA = np.array([0.2126, 0.7152, 0.0722])

@@ -1,4 +1,7 @@
-"""Faces of a panorama: where they look, and what is seen in them."""
+"""Faces of a panorama: where they look, and what is seen in them.
+
+Faces of a cube are put in the order in which the picture continues across their edges.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.layout import covers_sphere, default_face_size, panorama_faces
+from pano_mvs.algorithms.faces.layout import arranged_faces, covers_sphere, default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import (
     face_confidence,
     face_image,
@@ -19,12 +22,14 @@ from pano_mvs.algorithms.faces.render import (
     face_z_depth,
     render_face,
 )
+from pano_mvs.algorithms.faces.sampling import CUBE
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
-from tests.oracles.faces import z_depth as slow_z_depth
+from tests.io.images.tours import face_of
+from tests.oracles.surfaces import z_depth as slow_z_depth
 
 View = tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]
 
@@ -231,3 +236,43 @@ def test_arrays_that_do_not_fit_are_named(panorama: View) -> None:
         face_image(image.astype(float), view)
     with pytest.raises(UsageError, match="ranges are"):
         face_z_depth(ranges.astype(float), view)
+
+
+Faces = dict[str, NDArray[np.uint8]]
+
+
+def rendered() -> Faces:
+    return {name: face_of(name) for name in CUBE}
+
+
+def test_a_cube_in_order_stays() -> None:
+    faces, rearranged = arranged_faces(rendered())
+    assert not rearranged
+    assert all(np.array_equal(faces[name], face) for name, face in rendered().items())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_any_order_and_quarter_turns_are_undone(seed: int) -> None:
+    """The face in front stays, as it says where the middle of the panorama is."""
+    rng = np.random.default_rng(seed)
+    names = list(CUBE)
+    order = ["f", *rng.permutation(names[1:]).tolist()]
+    mixed = {name: rendered()[other] for name, other in zip(names, order, strict=True)}
+    turned = {name: np.rot90(face, 0 if name == "f" else int(rng.integers(4))) for name, face in mixed.items()}
+    faces, rearranged = arranged_faces(turned)
+    assert rearranged
+    for name, face in rendered().items():
+        assert np.array_equal(faces[name], face), name
+
+
+def test_faces_that_fit_nowhere_stay() -> None:
+    rng = np.random.default_rng(5)
+    noise = {name: rng.integers(0, 255, (64, 64, 3)).astype(np.uint8) for name in CUBE}
+    faces, rearranged = arranged_faces(noise)
+    assert not rearranged
+    assert all(np.array_equal(faces[name], face) for name, face in noise.items())
+
+
+def test_faces_of_one_colour_stay() -> None:
+    plain = {name: np.full((8, 8, 3), 200, np.uint8) for name in CUBE}
+    assert not arranged_faces(plain)[1]

@@ -30,7 +30,7 @@ from pano_mvs.testing.paint import noise as solid_noise
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map
 from tests.known import known
-from tests.oracles import patchmatch as oracle
+from tests.oracles import range_filters as oracle
 
 Views = tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]
 

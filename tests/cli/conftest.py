@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.testing.room import capture_poses, default_room
-from tests.engine.conftest import toy
+from tests.engine.conftest import finished, finished_once, toy
 from tests.synthetic.capture_files import write_capture
 
-__all__ = ["toy"]
+__all__ = ["finished", "finished_once", "toy"]
 
 SIZE_HW = (160, 320)
 SMALL = ("--set", "depth.planes=32", "--set", "features.max_keypoints=1500")
@@ -42,6 +42,20 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rendered")
     write_capture(folder, default_room(), capture_poses(4, spread=0.4), size_hw=SIZE_HW)
     return folder
+
+
+@pytest.fixture(scope="session")
+def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Output folder, beside its cache, and text of a quickstart run on the rendered capture; not to be changed."""
+    folder = tmp_path_factory.mktemp("quickstart")
+    arguments = (
+        *f"run quickstart --images {rendered / 'images'} --out {folder / 'out'} --cache {folder / 'cache'}".split(),
+        *f"--set scores.truth={rendered / 'truth'}".split(),
+        *SMALL,
+    )
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    return folder / "out", result.output
 
 
 @pytest.fixture

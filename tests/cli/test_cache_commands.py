@@ -31,12 +31,12 @@ UNITS = sum(ALL_UNITS.values())
 
 
 @pytest.fixture
-def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cache:
     """Run a `cache` command on the toy's store."""
     monkeypatch.setenv("COLUMNS", "200")
 
     def call(*arguments: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["cache", *arguments, "--cache", str(toy.folder / "cache")])
+        result = CliRunner().invoke(app, ["cache", *arguments, "--cache", str(tmp_path / "cache")])
         return result.exit_code, " ".join(result.output.split())
 
     return call
@@ -59,9 +59,8 @@ def make_old(folder: Path) -> None:
         os.utime(path, (1e9, 1e9), follow_symlinks=False)
 
 
-def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:
-    toy.run()
-    folder = toy.folder / "cache" / "tmp"
+def test_verify_names_what_is_temporary(finished: Toy, cache: Cache) -> None:
+    folder = finished.folder / "cache" / "tmp"
     (folder / f"{temporary_prefix()}scratch").mkdir()
     (folder / ".tmp-00000000-7-log.txt").touch()
     (folder / "worker-1.txt").touch()
@@ -107,12 +106,11 @@ def test_a_cache_that_can_only_be_read_is_enough_to_plan(
         Store(toy.folder / "none")
 
 
-def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None:
-    toy.run()
+def test_usage_names_every_stage_and_the_whole(finished: Toy, cache: Cache) -> None:
     code, said = cache("du")
     assert code == 0
     assert all(name in said for name in ("toy.source", "toy.scale", "toy.pairs", "toy.mean", "toy.write"))
-    on_disk = sum(files_of(toy.folder / "cache").values())
+    on_disk = sum(files_of(finished.folder / "cache").values())
     assert f"{on_disk / 1000:.1f} kB on the disk" in said
 
 
@@ -126,15 +124,13 @@ def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:
     assert said.count(f"│ {UNITS} │") == 2
 
 
-def test_verification_of_a_sound_cache_ends_well(toy: Toy, cache: Cache) -> None:
-    toy.run()
-    blobs = len(list((toy.folder / "cache" / "blobs").rglob("*.*")))
+def test_verification_of_a_sound_cache_ends_well(finished: Toy, cache: Cache) -> None:
+    blobs = len(list((finished.folder / "cache" / "blobs").rglob("*.*")))
     assert cache("verify") == (0, f"{UNITS} records and {blobs} blobs are intact, 0 damaged")
 
 
-def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy, cache: Cache) -> None:
-    toy.run()
-    root = toy.folder / "cache"
+def test_verification_removes_what_is_damaged_and_says_what_is_missing(finished: Toy, cache: Cache) -> None:
+    root = finished.folder / "cache"
     record = sorted((root / "records").rglob("*.json"))[0]
     record.write_bytes(record.read_bytes()[:-1])
     others = [path.read_text() for path in (root / "records").rglob("*.json") if path != record]
@@ -149,7 +145,7 @@ def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy,
     assert "the next run computes the missing results again" in said
     assert not record.exists()
     assert not blob.exists()
-    toy.run()
+    finished.run()
     assert cache("verify")[0] == 0
 
 
@@ -264,18 +260,16 @@ def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cac
     assert files_of(toy.folder / "cache") == before
 
 
-def test_time_that_is_none_is_refused(toy: Toy, cache: Cache) -> None:
-    toy.run()
+def test_time_that_is_none_is_refused(finished: Toy, cache: Cache) -> None:
     for option, text in (("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")):
         code, said = cache("gc", option, text)
         assert code == 2
         assert "such as 30d" in said
 
 
-def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
+def test_foreign_files_and_links_are_left_alone(finished: Toy, cache: Cache) -> None:
     """A note in the folder of blobs was deleted by `verify` if its name was long, and by `gc` if it was old."""
-    toy.run()
-    root, outside = toy.folder / "cache", toy.folder / "outside"
+    root, outside = finished.folder / "cache", finished.folder / "outside"
     outside.mkdir()
     sound = sorted((root / "blobs").rglob("*.json"))[0]
     shutil.copy(sound, outside / "mine.json")
@@ -309,9 +303,8 @@ def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
     assert (outside / "mine.json").is_file()
 
 
-def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: Toy, cache: Cache) -> None:
-    toy.run()
-    (toy.folder / "cache" / "runs" / ".tmp-abc.json").write_text("half")
+def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(finished: Toy, cache: Cache) -> None:
+    (finished.folder / "cache" / "runs" / ".tmp-abc.json").write_text("half")
     assert cache("gc")[0] == 0
     assert cache("ls")[0] == 0
 
@@ -364,19 +357,17 @@ def test_verification_while_a_run_writes_reports_nothing_wrong(
     assert (code, said) == (0, f"{UNITS} records and 0 blobs are intact, 0 damaged")
 
 
-def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:
-    toy.run()
+def test_file_that_goes_while_it_is_looked_at_is_no_error(finished: Toy, cache: Cache) -> None:
     from pano_mvs.engine.cache import maintenance as upkeep
 
-    gone = toy.folder / "cache" / "records" / "gone"
+    gone = finished.folder / "cache" / "records" / "gone"
     assert upkeep._stat(gone) is None
     assert upkeep._read(gone) is None
     assert upkeep._digest(gone) == ""
 
 
-def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy.run()
-    root = toy.folder / "cache"
+def test_blob_that_a_run_came_to_use_is_not_swept(finished: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = finished.folder / "cache"
     shutil.rmtree(root / "runs")
     make_old(root)
     store = Store(root)
@@ -395,13 +386,12 @@ def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.
     assert files_of(root) == before
 
 
-def test_store_may_be_reached_through_another_path(toy: Toy, cache: Cache) -> None:
-    toy.run()
-    (toy.folder / "link").symlink_to(toy.folder / "cache")
-    assert toy.run(cache=toy.folder / "link").computed == 0
-    moved = toy.folder / "moved"
-    (toy.folder / "cache").rename(moved)
-    assert toy.run(cache=moved).computed == 0
+def test_store_may_be_reached_through_another_path(finished: Toy, cache: Cache) -> None:
+    (finished.folder / "link").symlink_to(finished.folder / "cache")
+    assert finished.run(cache=finished.folder / "link").computed == 0
+    moved = finished.folder / "moved"
+    (finished.folder / "cache").rename(moved)
+    assert finished.run(cache=moved).computed == 0
     assert CliRunner().invoke(app, ["cache", "verify", "--cache", str(moved)]).exit_code == 0
 
 
@@ -413,36 +403,34 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
-def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache) -> None:
-    toy.run()
+def test_layout_of_another_version_is_refused_by_all_commands(finished: Toy, cache: Cache) -> None:
     for layout in ('{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"):
-        (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
-        before = files_of(toy.folder / "cache")
+        (finished.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
+        before = files_of(finished.folder / "cache")
         for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
             code, said = cache(*command)
             assert code == 2, layout[:10]
             assert "with --cache DIR" in said
-        assert files_of(toy.folder / "cache") == before
+        assert files_of(finished.folder / "cache") == before
 
 
 @pytest.mark.slow
-def test_cache_that_cannot_be_written_says_so(toy: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_that_cannot_be_written_says_so(finished: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
     """By permissions, or, where these do not bind us, by a stand-in of the calls that would fail."""
-    toy.run()
-    root = toy.folder / "cache"
-    assert run(toy, "new")[0] == 0
+    root = finished.folder / "cache"
+    assert run(finished, "new")[0] == 0
     folders = [path for path in (root, *root.rglob("*")) if path.is_dir()]
     for path in folders:
         path.chmod(stat.S_IRUSR | stat.S_IXUSR)
     try:
         if os.access(root, os.W_OK):  # root may write everywhere
             _refuse_writes_below(root, monkeypatch)
-        code, said = run(toy, "again")
+        code, said = run(finished, "again")
         assert (code, "(nothing to compute)" in said) == (0, True), said
-        code, said = run(toy, "other", "--set", "scaled.by=5", "--executor", "serial")
+        code, said = run(finished, "other", "--set", "scaled.by=5", "--executor", "serial")
         assert code == 4
         assert f"cache {root} cannot be written: " in said
-        code, said = run(toy, "other", "--set", "scaled.by=5", "--executor", "processes")
+        code, said = run(finished, "other", "--set", "scaled.by=5", "--executor", "processes")
         assert code == 4, said
         assert f"{root}" in said
         assert cache("verify")[0] == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,11 @@ from pano_mvs.scene import Record
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+from tests.docs.pages import block, copy_plugin, text_of
 from tests.synthetic.capture_files import write_capture
 
-ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+PAGE = text_of("plugins.md")
 PLUGINS = dict(re.findall(r"<!-- plugin: (\w+) (\w+) -->\n", PAGE))
-
-
-def block(mark: str) -> str:
-    found = re.search(rf"<!-- {mark} -->\n```\w*\n(.*?)```", PAGE, re.DOTALL)
-    assert found, mark
-    return found.group(1)
 
 
 def test_the_page_has_one_plugin_of_each_kind() -> None:
@@ -47,7 +40,7 @@ def test_the_page_names_the_command_that_writes_a_plugin(kind: str) -> None:
 
 def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for command in block("commands").splitlines():
+    for command in block("plugins.md", "commands").splitlines():
         program, *arguments = command.split()
         if program == "pano-mvs":
             assert CliRunner().invoke(app, arguments).exit_code == 0
@@ -57,14 +50,13 @@ def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_test_on_the_page_is_what_is_written() -> None:
-    lines = block("test").splitlines()
+    lines = block("plugins.md", "test").splitlines()
     assert set(lines) <= set(rendered("filter", "any")[1].splitlines())
 
 
 @pytest.fixture
 def solver(tmp_path: Path) -> Path:
-    (place,) = re.findall(r"<!-- file: (\S+) -->", PAGE)
-    return Path(shutil.copy(ROOT / place, tmp_path))
+    return copy_plugin("plugins.md", tmp_path)
 
 
 def test_the_pose_solver_keeps_the_contract_and_finds_the_cameras(solver: Path) -> None:

@@ -16,17 +16,10 @@ import pano_mvs
 from pano_mvs.geometry import Rigid3
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session import progress
+from tests.docs.pages import block, text_of
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "python.md").read_text(encoding="utf-8")
-NOTEBOOK: dict[str, Any] = json.loads((DOCS / "python.ipynb").read_text(encoding="utf-8"))
-
-
-def block(mark: str) -> str:
-    """Return the Python block that follows a mark."""
-    found = re.search(rf"<!-- {mark} -->\n```python\n(.*?)```", PAGE, re.DOTALL)
-    assert found, mark
-    return found.group(1)
+PAGE = text_of("python.md")
+NOTEBOOK: dict[str, Any] = json.loads(text_of("python.ipynb"))
 
 
 def run_cell(source: str, names: dict[str, Any]) -> Any:
@@ -76,13 +69,13 @@ def test_the_notebook_runs(
     assert len(figures[0].axes[0].images) == 1
     mpl.pyplot.close("all")
     assert names["run"].poses.names == tuple(names["run"].views)
-    exec(block("points"), names)
+    exec(block("python.md", "points"), names)
     points = names["points_in_world"](names["view"])
     assert np.linalg.norm(points, axis=1).max() < 100
-    exec(block("share"), names)
-    exec(block("view"), names)
+    exec(block("python.md", "share"), names)
+    exec(block("python.md", "view"), names)
     assert names["picture"].shape == (640, 960, 3)
-    exec(block("summary"), names)
+    exec(block("python.md", "summary"), names)
     assert names["summary"] == names["run"].summary
 
 
@@ -92,7 +85,7 @@ def test_events_and_errors_that_the_page_names_are_there(capsys: pytest.CaptureF
     for name in re.findall(r"`(\w+Error)`", PAGE):
         assert issubclass(getattr(pano_mvs, name), pano_mvs.PanoMvsError)
     names: dict[str, Any] = {}
-    exec(block("progress"), names)
+    exec(block("python.md", "progress"), names)
     names["show"](progress.Warned("it is late"))
     names["show"](progress.UnitStarted("depth", "a.jpg"))
     names["show"](progress.TimeLeft(70.0, at_least=True, done=0.25))
@@ -101,10 +94,10 @@ def test_events_and_errors_that_the_page_names_are_there(capsys: pytest.CaptureF
 
 def test_the_examples_of_estimates_name_what_exists(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
-    exec(block("estimator"), names)
+    exec(block("python.md", "estimator"), names)
     assert isinstance(names["left"], progress.TimeLeft)
     assert capsys.readouterr().out == "0.0 0.0 ()\n"
-    for name in re.findall(r"plan\.(\w+)", block("plan").partition("\n")[2]):
+    for name in re.findall(r"plan\.(\w+)", block("python.md", "plan").partition("\n")[2]):
         assert hasattr(pano_mvs.RunPlan, name), name
 
 
@@ -132,7 +125,7 @@ def test_the_first_example_calls_what_there_is() -> None:
         run.__dict__ |= {"summary": RunSummary(), "views": {"a.jpg": View}, "poses": Poses, "cloud": [0]}
         return run
 
-    text = block("example").replace("pano_mvs.run(", "made_up(")
+    text = block("python.md", "example").replace("pano_mvs.run(", "made_up(")
     names: dict[str, Any] = {"made_up": made_up}
     exec(text, names)
     assert names["range_map"].shape == (2, 4)
@@ -145,6 +138,6 @@ def test_points_lie_along_the_rays() -> None:
         cam_from_world = Rigid3(np.eye(3), np.array([1.0, 0.0, 0.0]))
 
     names: dict[str, Any] = {}
-    exec(block("points"), names)
+    exec(block("python.md", "points"), names)
     points = names["points_in_world"](View)
     assert np.linalg.norm(points - (-1, 0, 0), axis=1) == pytest.approx(np.full(32, 2.0))

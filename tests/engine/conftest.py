@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +19,12 @@ from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
-from tests.processes import heed_interrupts
+
+
+def heed_interrupts() -> None:
+    """Let a new process take interrupts, which one that a script starts in its background ignores; for `preexec_fn`."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 
 PATIENCE_S = 300.0
 """A busy machine takes long to do the quickest thing; what takes longer than this hangs."""
@@ -104,6 +111,23 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Toy:
     """A toy capture, whose plugin is trusted: comparing the state of the process takes most of the time of a unit."""
     monkeypatch.setattr(execute, "has_plugins", lambda: False)
     return toy_in(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def finished_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a toy capture whose run has finished; not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(execute, "has_plugins", lambda: False)
+        assert toy_in(folder).run().exit_code == 0
+    return folder
+
+
+@pytest.fixture
+def finished(finished_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Toy:
+    """A toy capture whose run has finished, to be changed: a copy, since some tests damage what is stored."""
+    monkeypatch.setattr(execute, "has_plugins", lambda: False)
+    return Toy(Path(shutil.copytree(finished_once, tmp_path, dirs_exist_ok=True)))
 
 
 def toy_in(folder: Path) -> Toy:

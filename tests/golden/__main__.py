@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-from tests.golden.record import PLACE, case_names, made_now, read_recorded, write_recorded
-from tests.golden.summaries import differences
+from tests.golden.record import PLACE, case_names, differences, made_now, read_recorded, write_recorded
 
 
 def main(asked: list[str]) -> None:

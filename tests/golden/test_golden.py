@@ -13,11 +13,11 @@ from tests.golden.record import (
     by_other_libraries,
     case_names,
     complaint,
+    differences,
     made_now,
     read_recorded,
     write_recorded,
 )
-from tests.golden.summaries import differences
 
 BEFORE = Golden("c0de", {"numpy": "2.0"}, {"range": [100, 90, 2.0, 1.0, 1.5, 2.0, 2.5, 3.0], "metrics": [0.9]})
 OTHER_RESULT = {"range": [100, 90, 2.5, 1.0, 1.5, 2.5, 2.5, 3.0], "metrics": [0.9]}

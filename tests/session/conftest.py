@@ -1,3 +1,3 @@
-from tests.engine.conftest import toy
+from tests.engine.conftest import finished, finished_once, toy
 
-__all__ = ["toy"]
+__all__ = ["finished", "finished_once", "toy"]

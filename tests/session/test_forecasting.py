@@ -59,17 +59,16 @@ def test_images_that_cannot_be_listed_are_reported_by_the_run(toy: Toy) -> None:
     assert forecast_run(run_of(toy)) is None
 
 
-def test_damage_that_planning_finds_is_a_warning_of_the_run(toy: Toy) -> None:
-    toy.run()
-    store = Store(toy.folder / "cache")
-    key = store.runs.last_keys(toy.session().workflow.id)["pairs"][""]
+def test_damage_that_planning_finds_is_a_warning_of_the_run(finished: Toy) -> None:
+    store = Store(finished.folder / "cache")
+    key = store.runs.last_keys(finished.session().workflow.id)["pairs"][""]
     record = store.read_record(key)
     assert record is not None
     for ref in record.blobs():
         path = Path(store.blobs.path(ref))
         path.chmod(0o644)
         path.write_bytes(b"x" * ref.size_bytes)
-    run = run_of(toy)
+    run = run_of(finished)
     found = forecast_run(run)
     assert found is not None
     assert {stage.stage: stage.cached for stage in found.stages}["images"] == 0, "nothing is known of the cache"
@@ -78,10 +77,11 @@ def test_damage_that_planning_finds_is_a_warning_of_the_run(toy: Toy) -> None:
     assert result.exit_code == 0
 
 
-def test_planning_that_takes_too_long_expects_that_all_is_computed(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy.run()
+def test_planning_that_takes_too_long_expects_that_all_is_computed(
+    finished: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(forecasting, "_MAX_PLANNING_S", -1.0)
-    found = forecast_run(run_of(toy))
+    found = forecast_run(run_of(finished))
     assert found is not None
     units = {stage.stage: (stage.units, stage.cached) for stage in found.stages}
     assert (units["images"], units["mean"], units["shifted"], units["difference"]) == ((5, 0), (5, 0), (1, 0), (4, 0))

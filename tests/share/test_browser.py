@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,9 @@ import pytest
 
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.share import ShareOptions, share_run
-from tests.share.axe import barriers
+from pano_mvs.share.encoding import encode_jpeg
+from pano_mvs.share.page_folder import PageFolder
+from pano_mvs.share.scene_parts import RANGES_HW
 from tests.share.box_run import (
     NAMES,
     POINT_SIGMA,
@@ -25,9 +28,50 @@ from tests.share.box_run import (
     wall_range,
 )
 from tests.share.browser import Browser, open_browser
-from tests.share.large_page import large_page
 from tests.share.server import served
 from tests.viewer.scenes import HALF
+
+
+def large_page(folder: Path, *, panoramas: int, levels: int, present: Sequence[int]) -> Path:
+    """Write the page and return its path; of four levels, the largest is 8192 pixels wide.
+
+    The tiles have few pixels, but their number and names are those of real ones.
+
+    Args:
+        folder: a new folder.
+        panoramas: their number.
+        levels: of each panorama.
+        present: the panoramas whose tiles are written; those of the others are missing.
+    """
+    page = PageFolder(folder)
+    tile = encode_jpeg(np.full((8, 8, 3), 120, np.uint8), 80)
+    cameras = []
+    for idx in range(panoramas):
+        for level in range(levels if idx in present else 0):
+            for row in range(max(1, 1 << level >> 1)):
+                for column in range(1 << level):
+                    page.put(f"panorama/{idx}/{level}-{column}-{row}", tile)
+        center = [float(idx % 20), 0.0, float(idx // 20)]
+        camera = {"name": f"{idx:03}.jpg", "center": center, "page_from_cam": np.diag([1.0, -1.0, -1.0]).tolist()}
+        tiles = {"levels": levels, "width": 1024 << levels >> 1}
+        cameras.append({**camera, **tiles, "ranges": None, "sigmas": None, "room": ""})
+    scene = {"title": "Many", "unit": "m", "cameras": cameras, "ranges": list(RANGES_HW), "nodes": [], "bounds": []}
+    page.put("scene", {**scene, "outline": [], "sigmas": [1, 2], "coverage": False, "mesh": None, "maps": []})
+    page.finish("Many", max_single_file_bytes=0)
+    return folder / "index.html"
+
+
+_RUN = """axe.run(document, { resultTypes: ["violations"], preload: false }).then(({ violations }) =>
+  violations.flatMap(({ id, nodes }) => nodes.map(({ html }) => `${id}: ${html.slice(0, 160)}`)))"""
+
+
+def barriers(browser: Browser) -> list[str]:
+    """Return what axe-core finds wrong with the page as it is now: the rule, and the element."""
+    if not browser.evaluate("typeof axe === 'object'"):
+        script = (files("axe_playwright_python") / "axe.min.js").read_text(encoding="utf-8")
+        browser.evaluate(f"(() => {{ {script}\n }})()")
+    return list(browser.evaluate(_RUN))
+
 
 pytestmark = pytest.mark.browser
 

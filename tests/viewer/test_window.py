@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.shown_scene import open_scene
-from pano_mvs.viewer.view import quiet_vtk, require_drawing
+from pano_mvs.viewer.view import quiet_vtk, require_display, require_drawing, require_window
 from pano_mvs.viewer.viewpoint import Viewpoint, box_of
 from pano_mvs.viewer.window import TEXTURED, SceneWindow
 from tests.viewer.scenes import HALF, turned_poses, world_color, write_output
@@ -267,3 +268,25 @@ def test_a_mesh_faces_the_side_that_was_seen_and_can_be_chosen(tmp_path: Path, w
     assert share_of_red() == 0  # from below
     window.tour.key("x")
     assert share_of_red() > 0.3
+
+
+def test_without_a_display_the_remedy_is_named() -> None:
+    with pytest.raises(UsageError, match=r"no display .* --screenshot FILE"):
+        require_display({}, "linux")
+    require_display({"DISPLAY": ":0"}, "linux")
+    require_display({}, "darwin")
+    require_display({}, "win32")
+
+
+def test_a_display_that_does_not_answer_is_told_from_one_that_does() -> None:
+    with pytest.raises(UsageError, match="does not respond"):
+        require_window("vtkEGLRenderWindow")
+    require_window("vtkXOpenGLRenderWindow")
+
+
+def test_without_any_way_to_draw_the_packages_are_named() -> None:
+    with pytest.raises(UsageError, match="apt install libegl1"):
+        require_drawing({}, "linux", loads=lambda name: False)
+    require_drawing({}, "linux", loads=lambda name: "OSMesa" in name)
+    require_drawing({"DISPLAY": ":0"}, "linux", loads=lambda name: False)
+    require_drawing({}, "darwin", loads=lambda name: False)

@@ -47,7 +47,7 @@ GROUPS = {
         ),
         (
             "tests/core/test_digests.py",
-            *_engine("code/plugin_digest", "code/code_digest", "code/canonical", "code/code_reach"),
+            *_engine("code/plugin_digest", "code/code_digest", "code/code_reach"),
             *_engine("code/stage_code", "planning/resolve", "running/run"),
         ),
     ),

@@ -10,7 +10,7 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import Features
-from tests.oracles.matching import match_one_by_one
+from tests.oracles.features import match_one_by_one
 
 
 def features(descriptors: NDArray[Any], metric: Literal["l2", "hamming"] = "l2") -> Features:

@@ -12,7 +12,7 @@ from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.core.errors import UsageError
 from tests.algorithms.features.test_matching import features
-from tests.oracles.matching import match_one_by_one
+from tests.oracles.features import match_one_by_one
 
 needs_vector = pytest.mark.skipif(not HAS_VECTOR, reason="no vector instructions, or numba compiles nothing")
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features import kernels_sphorb as kernels
 from pano_mvs.algorithms.features.sphorb import NEIGHBOURS, GeodesicGrid, binary_tests, hexagon_ring, lattice_disc
-from tests.oracles import sphorb as oracle
+from tests.oracles import features as oracle
 
 STEPS, MARGIN = 12, 9
 SIDE = STEPS + 1 + 2 * MARGIN

@@ -15,7 +15,7 @@ from pano_mvs.geometry import Rigid3, angle_between, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
 from tests.algorithms.range_scenes import as_map, rolled
-from tests.oracles.bilateral import corner_weights, dense_system
+from tests.oracles.range_filters import corner_weights, dense_system
 from tools.benchmarks.depth_metrics import depth_metrics
 
 View = tuple[NDArray[np.uint8], NDArray[np.float32]]

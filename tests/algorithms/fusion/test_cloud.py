@@ -24,9 +24,7 @@ from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.algorithms.fusion.whole import fuse_reference, fuse_views, thin_by_voxels
 from tests.algorithms.range_scenes import as_map, box_range, room_range
 from tests.known import known
-from tests.oracles import fusion as fusion_oracle
-from tests.oracles import normals as oracle
-from tests.oracles import smoothing as smoothing_oracle
+from tests.oracles import surfaces as oracle
 
 SIZE = (128, 256)
 POSES = capture_poses(3, seed=2, spread=0.4)
@@ -463,7 +461,7 @@ def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> Non
             rows,
             tuple(found[name] for name in FIELDS),
         )
-    expected = fusion_oracle.add_source(
+    expected = oracle.add_source(
         (ranges, rays, normals, written), pose, (source_ranges, confidence, image, uncertainty), SOURCE_LIMITS
     )
     for name in FIELDS:  # as plain Python, quotients of ranges are float32
@@ -484,7 +482,7 @@ def test_support_of_a_surface_equals_the_plain_count(least: float) -> None:
     stretches = columns_per_step(TINY, steps=5)
     assert stretches.max() > 1
     found = find_supported(ranges, confirmed, stretches, 2, 0.03, least)
-    expected = fusion_oracle.supported(ranges, confirmed, stretches, radius=2, max_step=0.03, least=least)
+    expected = oracle.supported(ranges, confirmed, stretches, radius=2, max_step=0.03, least=least)
     np.testing.assert_array_equal(found, expected)
     assert 0 < found.sum() < (np.isfinite(ranges) & ~confirmed).sum()
 
@@ -518,7 +516,7 @@ def test_heights_equal_the_plain_fit() -> None:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sigmas = rng.uniform(0.1, 0.4, 150).astype(np.float32)
     arrays = points.astype(np.float32), normals.astype(np.float32), sigmas
-    found, expected = surface_heights(*arrays, per_column=1000, threads=2), smoothing_oracle.surface_heights(*arrays)
+    found, expected = surface_heights(*arrays, per_column=1000, threads=2), oracle.surface_heights(*arrays)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert 0.1 < (expected != 0).mean() < 0.95
 

@@ -17,7 +17,7 @@ from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
-from tests.oracles.points import sees
+from tests.oracles.surfaces import sees
 
 Room = tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]
 

@@ -22,7 +22,7 @@ from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.testing.room import default_room, render
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.known import known
-from tests.oracles.alignment import aligned_shift, sampled_patch
+from tests.oracles.poses import aligned_shift, sampled_patch
 
 Room = tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]]
 

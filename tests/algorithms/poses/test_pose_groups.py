@@ -1,4 +1,7 @@
-"""Every step on poses treats each group as if it were alone."""
+"""Every step on poses treats each group as if it were alone.
+
+A camera that only a removed one connects to the rest has no place any more, whatever it looks like there.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import pytest
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.algorithms.views import select_views
 from pano_mvs.geometry import Rigid3
@@ -97,3 +101,13 @@ def test_a_group_in_one_place_does_not_disturb_the_others() -> None:
     together.translations[:] = 0.0
     views = select_views(join_groups([_large()[0], together], order=_ORDER))
     assert list(views.neighbours) == ["b0.jpg", "b1.jpg", "b2.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("removed", "held"), [([], []), ([3], [4]), ([2], [3, 4]), ([0], []), ([1, 3], [4]), ([2, 3], [4])]
+)
+def test_images_that_hang_on_removed_ones_are_found(removed: list[int], held: list[int]) -> None:
+    """In a drawn house, the camera that one pair had placed stayed in the wrong room after its partner was removed."""
+    model = PlacedModel(Pairs.without("abcde"))
+    model.chosen = dict.fromkeys([(0, 1), (1, 2), (0, 2), (2, 3), (3, 4)], 0)
+    assert model.held_by(removed) == held

@@ -14,9 +14,9 @@ from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translatio
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
-from tests.repeating.places import colonnade, tiled_hall
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.poses.placements import judge_placements
+from tools.benchmarks.repeating.places import colonnade, tiled_hall
 
 SIZE_HW = (256, 512)
 WHOLE = np.ones(SIZE_HW, np.bool_)

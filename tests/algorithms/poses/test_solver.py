@@ -35,7 +35,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_features,
     synthetic_two_views,
 )
-from tests.oracles.bundle import reduced_system_dense
+from tests.oracles.poses import reduced_system_dense
 
 Capture = tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]]
 

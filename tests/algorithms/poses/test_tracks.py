@@ -21,7 +21,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_features,
     synthetic_two_views,
 )
-from tests.oracles.triangulation_numpy import triangulate_numpy
+from tests.oracles.poses import triangulate_numpy
 
 
 def pair(

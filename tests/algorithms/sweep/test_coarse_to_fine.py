@@ -36,7 +36,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, roll_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
-from tests.oracles.tube import follow
+from tests.oracles.sweep import follow
 from tests.synthetic.scenes import poles
 
 NEAR, FAR = 0.5, 6.0

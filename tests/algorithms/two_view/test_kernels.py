@@ -19,7 +19,7 @@ from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.algorithms.two_view.test_solvers import samples_of_five
 from tests.algorithms.two_view.test_two_view import draw, errors_deg, rng_of
 from tests.oracles import two_view as plain
-from tests.oracles.five_point import essentials_by_eigenvectors
+from tests.oracles.two_view import essentials_by_eigenvectors
 
 THRESHOLD_RAD = 0.0035
 

@@ -22,8 +22,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_matches,
 )
 from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_of
-from tests.oracles.five_point import MONOMIALS, cubic_equations
-from tests.oracles.two_view import in_front
+from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front
 
 
 def samples_of_five(

@@ -93,13 +93,12 @@ def test_verdict_and_reasons_come_before_the_next_commands(
     assert [line.split()[1] for line in lines[start + 4 :]] == ["share"]
 
 
-def test_share_names_the_cache_if_another_one_is_set(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy.run()
-    session = toy.session()
+def test_share_names_the_cache_if_another_one_is_set(finished: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = finished.session()
     output = _output(session.out, cloud=CloudSummary(points=9), cache=str(session.store_root))
     out = str(session.out)
     assert next_commands(output, session) == [shlex.join(["pano-mvs", "share", out, "--to", f"{out}_page"])]
-    monkeypatch.setenv("PANO_MVS_CACHE", str(toy.folder / "elsewhere"))
+    monkeypatch.setenv("PANO_MVS_CACHE", str(finished.folder / "elsewhere"))
     assert next_commands(output, session)[-1].endswith(f"--cache {session.store_root}")
 
 

@@ -18,7 +18,7 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges import read_range_tiff
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
-from tests.docs.test_frames import block
+from tests.docs.pages import block
 from tests.io.images.pictures import app1, exif, full_sphere, xmp
 from tests.stored import read_picture
 
@@ -73,7 +73,7 @@ def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Pa
     truth = true_poses(capture)
     baseline = float(np.linalg.norm(truth["002.png"].center - truth["000.png"].center))
     work = capture.parent
-    page = block("workflow").replace("hall.jpg", "000.png").replace("kitchen.jpg", "002.png")
+    page = block("frames_and_scale.md", "workflow").replace("hall.jpg", "000.png").replace("kitchen.jpg", "002.png")
     (work / "metres.yaml").write_text(page.replace("metres: 1.2", f"metres: {baseline:.6f}"))
     run = ("run", work / "metres.yaml", "--images", capture / "images", "--out", "out", *SMALL)
     result = pano_mvs(*run)

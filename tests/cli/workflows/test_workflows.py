@@ -28,26 +28,6 @@ def known(capture: Path) -> tuple[str, ...]:
 NAMES = ["000", "001", "002", "003"]
 
 
-@pytest.fixture(scope="module")
-def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Output folder and text of a quickstart run on the tiny capture."""
-    from typer.testing import CliRunner
-
-    from pano_mvs.cli.app import app
-
-    out = tmp_path_factory.mktemp("quickstart")
-    result = CliRunner().invoke(
-        app,
-        [
-            *f"run quickstart --images {rendered / 'images'} --out {out / 'out'} --cache {out / 'cache'}".split(),
-            *f"--set scores.truth={rendered / 'truth'}".split(),
-            *SMALL,
-        ],
-    )
-    assert result.exit_code == 0, result.output
-    return out / "out", result.output
-
-
 @pytest.mark.slow
 def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, str]) -> None:
     out, _ = quickstart

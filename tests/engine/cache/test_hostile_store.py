@@ -219,18 +219,17 @@ def test_planted_records_are_computed_again(patient: Patient, change: Callable[[
     path.write_bytes(honest)
 
 
-def test_record_that_points_at_the_blobs_of_others_is_computed_again(toy: Toy) -> None:
+def test_record_that_points_at_the_blobs_of_others_is_computed_again(finished: Toy) -> None:
     """A difference whose record names the blob of a list of pairs: the list, too, is computed again, not for ever."""
-    toy.run()
-    clean, root = toy.deliverables(), toy.folder / "cache"
+    clean, root = finished.deliverables(), finished.folder / "cache"
     (pairs,) = records(root, "toy.pairs")
     parts = json.loads(pairs.read_bytes().partition(b"\n")[2])["output"]["parts"]
     for path in records(root, "toy.difference"):
         rewrite(path, lambda record: record["output"].update(parts=parts))
     forget(root, "toy.write")
-    result = toy.run()
+    result = finished.run()
     assert (result.exit_code, result.failures) == (0, [])
-    assert toy.deliverables() == clean
+    assert finished.deliverables() == clean
 
 
 @pytest.mark.parametrize("name", ["blobs", "records", "runs", "pins", "tmp"])
@@ -244,10 +243,9 @@ def test_links_in_place_of_folders_are_refused(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("kind", ["blobs", "records"])
-def test_links_in_place_of_inner_folders_are_refused(toy: Toy, kind: str) -> None:
+def test_links_in_place_of_inner_folders_are_refused(finished: Toy, kind: str) -> None:
     """Whether what is behind them is there or not, sound or not: nothing is written or deleted behind them."""
-    toy.run()
-    root, outside = toy.folder / "cache", toy.folder / "outside"
+    root, outside = finished.folder / "cache", finished.folder / "outside"
     outside.mkdir()
     for place in (root / kind).iterdir():
         shutil.move(place, outside / place.name)
@@ -255,36 +253,34 @@ def test_links_in_place_of_inner_folders_are_refused(toy: Toy, kind: str) -> Non
     for path in outside.rglob("*.json"):
         path.write_bytes(path.read_bytes()[:-1] + b"x")
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in outside.rglob("*") if path.is_file()}
-    shutil.rmtree(toy.folder / "out")
+    shutil.rmtree(finished.folder / "out")
     with pytest.raises(StoreError, match="is a link, but caches have no links"):
-        toy.run("scaled.by=7")
+        finished.run("scaled.by=7")
     verify(Store(root))
     collect(Store(root), unused_s=0.0, forget_after_s=0.0, delete=True)
     after = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in outside.rglob("*") if path.is_file()}
     assert after == before
 
 
-def test_link_in_place_of_a_blob_is_replaced_and_what_it_leads_to_stays(toy: Toy) -> None:
-    toy.run()
-    clean, root = toy.deliverables(), toy.folder / "cache"
-    precious = toy.folder / "precious"
+def test_link_in_place_of_a_blob_is_replaced_and_what_it_leads_to_stays(finished: Toy) -> None:
+    clean, root = finished.deliverables(), finished.folder / "cache"
+    precious = finished.folder / "precious"
     for path in [*(root / "blobs").rglob("*.*"), *(root / "records").rglob("*.json")]:
         size = path.stat().st_size
         precious.write_bytes(b"p" * size)
-        target = precious.rename(toy.folder / f"precious-{path.name}")
+        target = precious.rename(finished.folder / f"precious-{path.name}")
         path.unlink()
         path.symlink_to(target)
-    shutil.rmtree(toy.folder / "out")
-    assert toy.run().exit_code == 0
-    assert toy.deliverables() == clean
-    assert all(set(path.read_bytes()) <= {ord("p")} for path in toy.folder.glob("precious-*"))
+    shutil.rmtree(finished.folder / "out")
+    assert finished.run().exit_code == 0
+    assert finished.deliverables() == clean
+    assert all(set(path.read_bytes()) <= {ord("p")} for path in finished.folder.glob("precious-*"))
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
-def test_what_stands_in_place_of_a_record_is_replaced(toy: Toy, kind: str) -> None:
+def test_what_stands_in_place_of_a_record_is_replaced(finished: Toy, kind: str) -> None:
     """A pipe in place of a record stopped the run for ever, and a folder ended it."""
-    toy.run()
-    clean, root = toy.deliverables(), toy.folder / "cache"
+    clean, root = finished.deliverables(), finished.folder / "cache"
     assert records(root, "toy.scale")
     for path in records(root, "toy.scale"):
         path.unlink()
@@ -295,14 +291,13 @@ def test_what_stands_in_place_of_a_record_is_replaced(toy: Toy, kind: str) -> No
         else:
             os.mkfifo(path)
     verify(Store(root))
-    assert toy.run().exit_code == 0
-    assert toy.deliverables() == clean
-    assert ran(toy.run()) == {}
+    assert finished.run().exit_code == 0
+    assert finished.deliverables() == clean
+    assert ran(finished.run()) == {}
 
 
-def test_records_of_a_clock_that_was_wrong_are_collected(toy: Toy) -> None:
-    toy.run()
-    root = toy.folder / "cache"
+def test_records_of_a_clock_that_was_wrong_are_collected(finished: Toy) -> None:
+    root = finished.folder / "cache"
     future = time.time() + 1e8
     for path in (root / "records").rglob("*.json"):
         os.utime(path, (future, future))

@@ -1,4 +1,7 @@
-"""Caches whose records and blobs are in packs, and caches with what is no file in the place of one."""
+"""Caches whose records and blobs are in packs, and caches with what is no file in the place of one.
+
+Packed references to blobs are those that were packed.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,9 @@ import pytest
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache import maintenance
-from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError, PackedRefs
 from pano_mvs.engine.cache.maintenance import collect, pack, usage_of, verify
-from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.cache.store import ItemRef, Store
 from tests.engine.conftest import Toy
 
 
@@ -294,3 +297,49 @@ def test_a_process_that_is_killed_while_it_packs_loses_nothing(tmp_path: Path) -
     assert not verify(store).removed
     collect(store, unused_s=0.0, delete=True)
     assert not [*files(tmp_path, "*"), *loose(tmp_path)]
+
+
+PARTS = {
+    "meta": BlobRef("0" * 32, 0, ".json"),
+    "image": BlobRef("f0" * 16, 123, ".jpg", external=True),
+    "array": BlobRef("0123456789abcdef" * 2, (1 << 50) - 1, ".npy"),
+    "0": BlobRef("1" * 32, 255, ""),
+}
+
+
+@pytest.mark.parametrize("names", [[], ["array"], list(PARTS), list(reversed(PARTS))])
+def test_packed_references_equal_a_dict_of_the_same(names: list[str]) -> None:
+    parts = {name: PARTS[name] for name in names}
+    packed = PackedRefs(parts)
+    assert list(packed.items()) == list(parts.items())
+    assert packed == parts
+    assert parts == packed
+    assert packed == PackedRefs(parts)
+    assert repr(packed) == repr(parts)
+
+
+def test_packed_references_differ_in_any_field() -> None:
+    packed = PackedRefs(PARTS)
+    for name, ref in PARTS.items():
+        others = [
+            BlobRef("2" * 32, ref.size_bytes, ref.suffix, ref.external),
+            BlobRef(ref.digest, ref.size_bytes ^ 1, ref.suffix, ref.external),
+            BlobRef(ref.digest, ref.size_bytes, ".other", ref.external),
+            BlobRef(ref.digest, ref.size_bytes, ref.suffix, not ref.external),
+        ]
+        assert all(packed != PackedRefs(PARTS | {name: other}) for other in others)
+    with pytest.raises(KeyError, match="nothing"):
+        packed["nothing"]
+
+
+def test_a_reference_has_what_it_was_made_of() -> None:
+    ref = ItemRef("Kind", "0f" * 16, PARTS)
+    assert (ref.kind, ref.digest, dict(ref.parts)) == ("Kind", "0f" * 16, PARTS)
+    assert ref == ItemRef.from_json(ref.to_json())
+    assert ref == ItemRef("Kind", "0f" * 16, dict(reversed(PARTS.items())))
+    others = ItemRef("Other", "0f" * 16, PARTS), ItemRef("Kind", "00" * 16, PARTS), ItemRef("Kind", "0f" * 16, {})
+    assert all(ref != other for other in (*others, "Kind"))
+    assert repr(ref).startswith("ItemRef(kind='Kind', digest='0f0f")
+    for wrong in ("", "0f", "0F" * 16, "0f" * 17, "none" * 8):
+        with pytest.raises(ValueError, match="not a digest"):
+            ItemRef("Kind", wrong, PARTS)

@@ -72,10 +72,9 @@ def test_value_that_breaks_its_kind_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
-def test_damaged_blobs_are_noticed_and_computed_again(toy: Toy, damage: str) -> None:
-    toy.run()
-    clean = toy.deliverables()
-    blobs = sorted(p for p in (toy.folder / "cache" / "blobs").rglob("*") if p.is_file())
+def test_damaged_blobs_are_noticed_and_computed_again(finished: Toy, damage: str) -> None:
+    clean = finished.deliverables()
+    blobs = sorted(p for p in (finished.folder / "cache" / "blobs").rglob("*") if p.is_file())
     for blob in blobs:
         data = blob.read_bytes()
         match damage:
@@ -85,11 +84,11 @@ def test_damaged_blobs_are_noticed_and_computed_again(toy: Toy, damage: str) -> 
                 blob.write_bytes(data[:-1])
             case "delete":
                 blob.unlink()
-    (toy.folder / "out" / "all.txt").unlink()
-    toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 3.0"))
-    result = toy.run()
+    (finished.folder / "out" / "all.txt").unlink()
+    finished.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 3.0"))
+    result = finished.run()
     assert result.exit_code == 0
-    assert toy.deliverables() == clean
+    assert finished.deliverables() == clean
     for blob in blobs:
         assert blob.is_file()
 

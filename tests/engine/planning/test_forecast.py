@@ -40,26 +40,24 @@ def test_without_experience_only_the_number_of_units_is_known(toy: Toy) -> None:
     assert found["difference"].after == ("pairs", "scaled")
 
 
-def test_a_run_leaves_times_for_the_next_one(toy: Toy) -> None:
-    toy.run()
-    assert {(one.units, one.seconds, one.stored_bytes) for one in forecast_of(toy).values()} == {(0, 0.0, 0.0)}
-    changed = forecast_of(toy, "scaled.by=7")
+def test_a_run_leaves_times_for_the_next_one(finished: Toy) -> None:
+    assert {(one.units, one.seconds, one.stored_bytes) for one in forecast_of(finished).values()} == {(0, 0.0, 0.0)}
+    changed = forecast_of(finished, "scaled.by=7")
     assert (changed["images"].units, changed["scaled"].units, changed["difference"].units) == (0, 5, 4)
     for name in ("scaled", "difference", "mean", "all"):
         unit_s = changed[name].unit_s
         assert unit_s is not None, name
         assert unit_s > 0
         assert changed[name].stored_bytes
-    (toy.folder / "capture" / "6.txt").write_text("60")
-    more = forecast_of(toy)
+    (finished.folder / "capture" / "6.txt").write_text("60")
+    more = forecast_of(finished)
     assert (more["scaled"].cached, more["scaled"].units) == (5, 1)
     assert more["difference"].units == 5, "which pairs is not known yet, but how many there were per image"
 
 
-def test_open_pairs_are_expected_as_in_earlier_runs(toy: Toy) -> None:
-    toy.run()
-    (toy.folder / "cache" / "records").rename(toy.folder / "records")
-    found = forecast_of(toy)
+def test_open_pairs_are_expected_as_in_earlier_runs(finished: Toy) -> None:
+    (finished.folder / "cache" / "records").rename(finished.folder / "records")
+    found = forecast_of(finished)
     assert found["difference"].units == 4, "consecutive pairs: four of five images"
 
 

@@ -47,11 +47,10 @@ def test_part_of_a_run_deletes_no_file_of_the_whole(toy: Toy) -> None:
     assert toy.deliverables() == files
 
 
-def test_refresh_computes_again_and_what_turns_out_the_same_ends_there(toy: Toy) -> None:
-    toy.run()
-    assert ran(run(toy, RunOptions(refresh=("scaled",)))) == {"scaled": 5}
-    assert ran(run(toy, RunOptions(refresh=("mean:1.txt",)))) == {"mean": 1}
-    assert ran(toy.run()) == {}
+def test_refresh_computes_again_and_what_turns_out_the_same_ends_there(finished: Toy) -> None:
+    assert ran(run(finished, RunOptions(refresh=("scaled",)))) == {"scaled": 5}
+    assert ran(run(finished, RunOptions(refresh=("mean:1.txt",)))) == {"mean": 1}
+    assert ran(finished.run()) == {}
 
 
 def test_refresh_of_a_unit_that_there_is_not_says_so(toy: Toy) -> None:
@@ -60,27 +59,27 @@ def test_refresh_of_a_unit_that_there_is_not_says_so(toy: Toy) -> None:
 
 
 @pytest.mark.slow
-def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
-    toy.run()
-    toy.edit("plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by"))
-    assert ran(toy.run("scaled.by=4"))["scaled"] == 5
-    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
-    toy.run()
-    toy.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
+def test_accepted_code_keeps_what_was_computed(finished: Toy) -> None:
+    finished.edit(
+        "plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by")
+    )
+    assert ran(finished.run("scaled.by=4"))["scaled"] == 5
+    finished.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    finished.run()
+    finished.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
     options = RunOptions(accept_code=True)
-    session = toy.session()
+    session = finished.session()
     plans = make_plan(session.workflow, session.graph, Store(session.store_root), options=options)
     assert sum(len(plan.run) + len(plan.may_run) for plan in plans) == 0
-    assert toy.plan()["images"].run, "a plan that accepts keeps nothing"
-    assert ran(run(toy, options)) == {}
-    assert ran(toy.run()) == {}, "what was accepted once is cached"
+    assert finished.plan()["images"].run, "a plan that accepts keeps nothing"
+    assert ran(run(finished, options)) == {}
+    assert ran(finished.run()) == {}, "what was accepted once is cached"
 
 
-def test_code_that_changed_with_a_setting_is_not_accepted(toy: Toy) -> None:
-    toy.run()
-    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
-    toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 5"))
-    assert ran(run(toy, RunOptions(accept_code=True)))["scaled"] == 5
+def test_code_that_changed_with_a_setting_is_not_accepted(finished: Toy) -> None:
+    finished.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    finished.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 5"))
+    assert ran(run(finished, RunOptions(accept_code=True)))["scaled"] == 5
 
 
 def test_an_upgraded_library_costs_what_uses_it_and_can_be_accepted(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +132,8 @@ def test_unit_that_is_not_there_is_named(toy: Toy) -> None:
         run(toy, RunOptions(only=("mean:9.txt",)))
 
 
-def test_plan_says_what_was_asked_for(toy: Toy) -> None:
-    toy.run()
-    session = toy.session()
+def test_plan_says_what_was_asked_for(finished: Toy) -> None:
+    session = finished.session()
     options = RunOptions(until=("mean",), refresh=("scaled:1.txt",))
     workflow, graph = options.applied_to(session.workflow, session.graph)
     plans = make_plan(workflow, graph, Store(session.store_root), options=options)

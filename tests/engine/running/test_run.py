@@ -40,9 +40,8 @@ def test_first_run_computes_every_unit_and_the_second_none(toy: Toy) -> None:
     assert toy.deliverables() == before
 
 
-def test_values_flow_through_every_cardinality(toy: Toy) -> None:
-    toy.run()
-    files = toy.deliverables()
+def test_values_flow_through_every_cardinality(finished: Toy) -> None:
+    files = finished.deliverables()
     assert files["mean/1.txt"] == b"45.0"  # (30 + 60) / 2
     assert files["mean/3.txt"] == b"90.0"
     assert b"(('1.txt', '2.txt'), 30.0)" in files["all.txt"]
@@ -71,34 +70,30 @@ def test_a_stage_for_every_image_loses_none_of_them(toy: Toy) -> None:
     assert ran(toy.run())["around"] == 2
 
 
-def test_touching_one_item_runs_exactly_what_depends_on_it(toy: Toy) -> None:
-    toy.run()
-    toy.number("3.txt", "31")
-    plan = toy.plan()
+def test_touching_one_item_runs_exactly_what_depends_on_it(finished: Toy) -> None:
+    finished.number("3.txt", "31")
+    plan = finished.plan()
     assert list(plan["images"].run) == ["3.txt"]
     assert plan["images"].run["3.txt"] == "input 3.txt"
     assert set(plan["mean"].may_run) == {"2.txt", "3.txt", "4.txt"}
     assert set(plan["mean"].cached) == {"1.txt", "5.txt"}
     expected = {"images": 1, "scaled": 1, "difference": 2, "shifted": 1, "mean": 3, "each": 3, "all": 1}
-    assert ran(toy.run()) == expected
+    assert ran(finished.run()) == expected
 
 
-def test_same_value_from_other_bytes_cuts_off_early(toy: Toy) -> None:
-    toy.run()
-    toy.number("3.txt", "30.000")
-    assert ran(toy.run()) == {"images": 1}
+def test_same_value_from_other_bytes_cuts_off_early(finished: Toy) -> None:
+    finished.number("3.txt", "30.000")
+    assert ran(finished.run()) == {"images": 1}
 
 
-def test_touching_without_changing_runs_nothing(toy: Toy) -> None:
-    toy.run()
-    toy.number("3.txt", "30")
-    assert toy.run().computed == 0
+def test_touching_without_changing_runs_nothing(finished: Toy) -> None:
+    finished.number("3.txt", "30")
+    assert finished.run().computed == 0
 
 
-def test_adding_an_item_runs_its_units_and_those_beside_it(toy: Toy) -> None:
-    toy.run()
-    toy.number("6.txt", "60")
-    counts = ran(toy.run())
+def test_adding_an_item_runs_its_units_and_those_beside_it(finished: Toy) -> None:
+    finished.number("6.txt", "60")
+    counts = ran(finished.run())
     assert counts == {
         "images": 1,
         "scaled": 1,
@@ -112,45 +107,41 @@ def test_adding_an_item_runs_its_units_and_those_beside_it(toy: Toy) -> None:
     }
 
 
-def test_moving_and_renaming_recomputes_only_what_sees_names(toy: Toy) -> None:
-    toy.run()
-    shutil.move(toy.folder / "capture", toy.folder / "elsewhere")
-    toy.edit("wf.yaml", lambda text: text.replace("path: capture", "path: elsewhere"))
-    assert toy.run().computed == 0
-    (toy.folder / "elsewhere" / "5.txt").rename(toy.folder / "elsewhere" / "5b.txt")
-    assert ran(toy.run()) == {"images": 1, "pairs": 1, "views": 1, "shifted": 1, "all": 1}
+def test_moving_and_renaming_recomputes_only_what_sees_names(finished: Toy) -> None:
+    shutil.move(finished.folder / "capture", finished.folder / "elsewhere")
+    finished.edit("wf.yaml", lambda text: text.replace("path: capture", "path: elsewhere"))
+    assert finished.run().computed == 0
+    (finished.folder / "elsewhere" / "5.txt").rename(finished.folder / "elsewhere" / "5b.txt")
+    assert ran(finished.run()) == {"images": 1, "pairs": 1, "views": 1, "shifted": 1, "all": 1}
 
 
-def test_setting_changes_run_from_there_on_and_the_plan_says_why(toy: Toy) -> None:
-    toy.run()
-    plan = toy.plan("scaled.by=7")
+def test_setting_changes_run_from_there_on_and_the_plan_says_why(finished: Toy) -> None:
+    plan = finished.plan("scaled.by=7")
     assert set(plan["scaled"].run.values()) == {"param by 3.0 → 7.0"}
     assert plan["images"].run == {}
-    counts = ran(toy.run("scaled.by=7"))
+    counts = ran(finished.run("scaled.by=7"))
     assert counts == {"scaled": 5, "difference": 4, "shifted": 1, "mean": 5, "each": 5, "all": 1}
-    assert toy.run().computed == 0, "the first setting's results are still there"
+    assert finished.run().computed == 0, "the first setting's results are still there"
 
 
-def test_plugin_is_cached_by_its_code_and_that_of_its_helper(toy: Toy) -> None:
-    toy.run()
-    toy.edit("plug.py", lambda text: "# a comment\n" + text.replace('"""Multiply."""', '"""Multiply, as ever."""'))
-    assert toy.run().computed == 0, "comments and docstrings are free"
-    toy.edit("helper.py", lambda text: text.replace("2 * x", "x + x"))
-    plan = toy.plan()
+def test_plugin_is_cached_by_its_code_and_that_of_its_helper(finished: Toy) -> None:
+    finished.edit("plug.py", lambda text: "# a comment\n" + text.replace('"""Multiply."""', '"""Multiply, as ever."""'))
+    assert finished.run().computed == 0, "comments and docstrings are free"
+    finished.edit("helper.py", lambda text: text.replace("2 * x", "x + x"))
+    plan = finished.plan()
     assert "code" in plan["images"].run["1.txt"]
     assert "plug.py" in plan["images"].run["1.txt"]
-    assert ran(toy.run())["scaled"] == 5
+    assert ran(finished.run())["scaled"] == 5
 
 
-def test_deleted_and_edited_deliverables_are_written_again_from_the_store(toy: Toy) -> None:
-    toy.run()
-    before = toy.deliverables()
-    (toy.folder / "out" / "all.txt").unlink()
-    (toy.folder / "out" / "mean" / "2.txt").write_text("vandalism")
-    result = toy.run()
+def test_deleted_and_edited_deliverables_are_written_again_from_the_store(finished: Toy) -> None:
+    before = finished.deliverables()
+    (finished.folder / "out" / "all.txt").unlink()
+    (finished.folder / "out" / "mean" / "2.txt").write_text("vandalism")
+    result = finished.run()
     assert result.computed == 0
     assert sorted(result.written) == ["all.txt", "mean/2.txt"]
-    assert toy.deliverables() == before | {"mean/2.txt.bak": b"vandalism"}
+    assert finished.deliverables() == before | {"mean/2.txt.bak": b"vandalism"}
 
 
 def test_deliverables_of_removed_items_go_but_edited_ones_stay(toy: Toy) -> None:
@@ -207,13 +198,12 @@ def test_empty_source_of_failures_only_is_an_input_error(toy: Toy) -> None:
         toy.run()
 
 
-def test_two_stores_in_different_folders_give_the_same_bytes(toy: Toy, tmp_path: Path) -> None:
-    toy.run()
-    before = toy.deliverables()
-    shutil.rmtree(toy.folder / "out")
-    result = toy.run(cache=tmp_path / "another")
+def test_two_stores_in_different_folders_give_the_same_bytes(finished: Toy, tmp_path: Path) -> None:
+    before = finished.deliverables()
+    shutil.rmtree(finished.folder / "out")
+    result = finished.run(cache=tmp_path / "another")
     assert ran(result) == ALL_UNITS
-    assert toy.deliverables() == before
+    assert finished.deliverables() == before
 
 
 def test_stages_that_write_one_file_are_told_so(toy: Toy) -> None:
@@ -260,14 +250,13 @@ def test_names_that_meet_after_the_extension_is_dropped_stay_apart(toy: Toy) -> 
     assert len(names) == 3
 
 
-def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy.run()
+def test_store_that_cannot_be_written_still_serves_what_it_has(finished: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def refuse(*_: object, **__: object) -> None:
         raise StoreError("read only")
 
     monkeypatch.setattr(RunHistory, "remember", refuse)
-    result = toy.run()
+    result = finished.run()
     assert result.exit_code == 0
     assert any("cannot give the reasons" in warning for warning in result.warnings)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from pathlib import Path
 
 import pytest
 
@@ -76,8 +77,9 @@ def run_with(toy: Toy, shelf: Shelf, *overrides: str, observer: Observer | None 
 
 
 @pytest.fixture
-def shelf(toy: Toy) -> Shelf:
-    return Shelf(Store(toy.folder / "cache"))
+def shelf(tmp_path: Path) -> Shelf:
+    """Records of the toy's store."""
+    return Shelf(Store(tmp_path / "cache"))
 
 
 def summary(result: RunResult) -> Mapping[str, tuple[int, int, int, int]]:
@@ -97,10 +99,9 @@ def test_as_many_units_are_out_as_the_executor_takes_and_the_result_is_that_of_o
     assert len(shelf.submitted) == len(set(shelf.submitted)) == sum(ran(result).values())
 
 
-def test_what_is_in_the_store_is_not_handed_out(toy: Toy, shelf: Shelf) -> None:
-    toy.run()
+def test_what_is_in_the_store_is_not_handed_out(finished: Toy, shelf: Shelf) -> None:
     heard = Heard()
-    result = run_with(toy, shelf, observer=heard)
+    result = run_with(finished, shelf, observer=heard)
     assert shelf.submitted == heard.started == []
     assert all(counts[0] == 0 and counts[1] > 0 for counts in summary(result).values())
     assert {status for _, status in heard.finished} == {"cached"}
@@ -223,24 +224,22 @@ def test_units_wait_for_memory_and_nothing_overtakes_them(
     assert [one for one in shelf.submitted if one.startswith("scaled")] == [f"scaled:{n}.txt" for n in range(1, 6)]
 
 
-def test_results_of_units_that_were_out_when_a_pass_ended_count_as_computed(toy: Toy, shelf: Shelf) -> None:
-    toy.run()
-    store = toy.folder / "cache"
+def test_results_of_units_that_were_out_when_a_pass_ended_count_as_computed(finished: Toy, shelf: Shelf) -> None:
+    store = finished.folder / "cache"
     for blob in (store / "blobs").rglob("*.json"):
         blob.write_bytes(b"x" * blob.stat().st_size)
-    toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 4"))
-    result = run_with(toy, shelf)
+    finished.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 4"))
+    result = run_with(finished, shelf)
     assert result.exit_code == 0
     assert result.warnings
     assert summary(result)["scaled"] == (5, 0, 0, 0)
-    assert toy.run().computed == 0
+    assert finished.run().computed == 0
 
 
-def test_a_damaged_record_is_reported_with_its_path_and_computed_again(toy: Toy, shelf: Shelf) -> None:
-    toy.run()
-    key = next(iter((toy.folder / "cache" / "records").rglob("*.json")))
+def test_a_damaged_record_is_reported_with_its_path_and_computed_again(finished: Toy, shelf: Shelf) -> None:
+    key = next(iter((finished.folder / "cache" / "records").rglob("*.json")))
     key.write_bytes(b"nothing")
-    result = run_with(toy, shelf)
+    result = run_with(finished, shelf)
     assert result.warnings == [f"{key} is damaged; computing it again"]
     assert len(shelf.submitted) == 1
 
@@ -297,16 +296,15 @@ def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf, monke
     assert shelf.submitted.count("scaled:5.txt") == 1
 
 
-def test_a_file_whose_stored_bytes_are_damaged_is_computed_and_delivered_again(toy: Toy, shelf: Shelf) -> None:
-    toy.run()
-    files = toy.deliverables()
-    shutil.rmtree(toy.folder / "out")
-    damaged = sorted((toy.folder / "cache" / "blobs").rglob("*.txt"))
+def test_a_file_whose_stored_bytes_are_damaged_is_computed_and_delivered_again(finished: Toy, shelf: Shelf) -> None:
+    files = finished.deliverables()
+    shutil.rmtree(finished.folder / "out")
+    damaged = sorted((finished.folder / "cache" / "blobs").rglob("*.txt"))
     for blob in damaged:
         blob.write_bytes(b"x" * blob.stat().st_size)
-    result = run_with(toy, shelf)
+    result = run_with(finished, shelf)
     assert result.exit_code == 0
-    assert toy.deliverables() == files
+    assert finished.deliverables() == files
     assert len(result.warnings) == len(damaged)
     assert {name: counts[0] for name, counts in summary(result).items() if counts[0]} == {"each": 5, "all": 1}
 

@@ -132,14 +132,13 @@ def test_values_of_a_run_are_loaded_by_stage_and_item(toy: Toy, shelf: Shelf) ->
     assert run.load("nothing", kind) is None
 
 
-def test_a_run_that_ends_forgets_the_units_that_are_no_more(toy: Toy, shelf: Shelf) -> None:
+def test_a_run_that_ends_forgets_the_units_that_are_no_more(finished: Toy, shelf: Shelf) -> None:
     """Also with failed units; one that was stopped, or that was a part, has not reached the others."""
-    toy.run()
     everything = {f"{number}.txt" for number in range(1, 6)}
-    (toy.folder / "capture" / "5.txt").unlink()
-    assert run_with(toy, shelf, "scaled.gate={value: {max: 1}}").exit_code == RunStoppedError.exit_code
-    assert remembered(toy)["images"] == everything
-    session = toy.session()
+    (finished.folder / "capture" / "5.txt").unlink()
+    assert run_with(finished, shelf, "scaled.gate={value: {max: 1}}").exit_code == RunStoppedError.exit_code
+    assert remembered(finished)["images"] == everything
+    session = finished.session()
     Run(
         session.workflow,
         session.graph,
@@ -148,33 +147,31 @@ def test_a_run_that_ends_forgets_the_units_that_are_no_more(toy: Toy, shelf: She
         executor=shelf,
         options=RunOptions(until=("scaled",)),
     ).execute()
-    assert remembered(toy)["images"] == everything
-    toy.number("2.txt", "13")
-    assert run_with(toy, shelf).exit_code == 3
-    assert remembered(toy)["images"] == everything - {"5.txt"}
-    assert remembered(toy)["scaled"] == everything - {"5.txt"}
+    assert remembered(finished)["images"] == everything
+    finished.number("2.txt", "13")
+    assert run_with(finished, shelf).exit_code == 3
+    assert remembered(finished)["images"] == everything - {"5.txt"}
+    assert remembered(finished)["scaled"] == everything - {"5.txt"}
 
 
-def test_a_run_without_failures_forgets_them_too(toy: Toy, shelf: Shelf) -> None:
-    toy.run()
-    (toy.folder / "capture" / "5.txt").unlink()
-    assert run_with(toy, shelf).exit_code == 0
-    assert "5.txt" not in remembered(toy)["images"]
+def test_a_run_without_failures_forgets_them_too(finished: Toy, shelf: Shelf) -> None:
+    (finished.folder / "capture" / "5.txt").unlink()
+    assert run_with(finished, shelf).exit_code == 0
+    assert "5.txt" not in remembered(finished)["images"]
 
 
-def test_an_error_forgets_nothing(toy: Toy, shelf: Shelf) -> None:
+def test_an_error_forgets_nothing(finished: Toy, shelf: Shelf) -> None:
     """A disk that was full, or not there, let a later collection delete the results of the run before."""
-    toy.run()
-    everything = remembered(toy)
+    everything = remembered(finished)
     shelf.answers["scaled:1.txt"] = JobOutcome("stopped", cause="the disk is full", error="StoreError")
     with pytest.raises(StoreError, match="the disk is full"):
-        run_with(toy, shelf, "scaled.by=4")
-    assert remembered(toy) == everything
+        run_with(finished, shelf, "scaled.by=4")
+    assert remembered(finished) == everything
     for number in range(1, 6):
-        toy.number(f"{number}.txt", "not a number")
+        finished.number(f"{number}.txt", "not a number")
     with pytest.raises(InputError, match="none of the 5 items can be used"):
-        run_with(toy, shelf)
-    assert remembered(toy) == everything
+        run_with(finished, shelf)
+    assert remembered(finished) == everything
 
 
 def test_files_of_earlier_runs_are_removed_or_named(toy: Toy, shelf: Shelf) -> None:

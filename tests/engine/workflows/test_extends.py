@@ -95,15 +95,16 @@ def test_paths_are_relative_to_the_file_that_states_them(toy: Toy) -> None:
     assert own.stages["images"].params.model_dump()["path"] == inner / "mine"
 
 
-def test_the_cache_does_not_know_of_files(toy: Toy) -> None:
-    toy.run()
-    (toy.folder / "inner").mkdir()
-    (toy.folder / "inner" / "wf.yaml").write_text("pano_mvs: 1\nname: toy\nextends: ../wf.yaml\n")
-    plain = toy.folder
-    toy.folder = plain / "inner"
-    assert ran(toy.run(cache=plain / "cache")) == {}
-    (toy.folder / "wf.yaml").write_text("pano_mvs: 1\nname: toy\nextends: ../wf.yaml\nstages: {mean: {retries: 3}}\n")
-    assert ran(toy.run(cache=plain / "cache")) == {}, "what happens on errors does not count"
+def test_the_cache_does_not_know_of_files(finished: Toy) -> None:
+    (finished.folder / "inner").mkdir()
+    (finished.folder / "inner" / "wf.yaml").write_text("pano_mvs: 1\nname: toy\nextends: ../wf.yaml\n")
+    plain = finished.folder
+    finished.folder = plain / "inner"
+    assert ran(finished.run(cache=plain / "cache")) == {}
+    (finished.folder / "wf.yaml").write_text(
+        "pano_mvs: 1\nname: toy\nextends: ../wf.yaml\nstages: {mean: {retries: 3}}\n"
+    )
+    assert ran(finished.run(cache=plain / "cache")) == {}, "what happens on errors does not count"
 
 
 def test_presets_may_be_extended_by_name(toy: Toy) -> None:

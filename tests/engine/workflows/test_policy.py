@@ -37,10 +37,9 @@ def test_thresholds_have_a_minimum_and_a_maximum(toy: Toy, gate: str, requires: 
     assert ("mean" in ran(result)) != bool(requires), "what reads from the stage waits until it has passed"
 
 
-def test_a_gate_that_is_changed_computes_nothing_again(toy: Toy) -> None:
-    toy.run()
-    assert ran(toy.run("scaled.gate={value: {max: 99}}", "scaled.retries=2", "scaled.timeout_s=100")) == {}
-    assert toy.run("scaled.gate={value: {max: 9}}").exit_code == 4, "a cached stage is held to it too"
+def test_a_gate_that_is_changed_computes_nothing_again(finished: Toy) -> None:
+    assert ran(finished.run("scaled.gate={value: {max: 99}}", "scaled.retries=2", "scaled.timeout_s=100")) == {}
+    assert finished.run("scaled.gate={value: {max: 9}}").exit_code == 4, "a cached stage is held to it too"
 
 
 @pytest.mark.parametrize(("share", "code"), [(0.8, 3), (0.81, 4)])

@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_rotvec
-from tests.repeating.places import REPEATS, draw_sizes
-from tests.repeating.walks import LAYOUTS
 from tests.synthetic import scenes
 from tests.synthetic.places import large_plain_room
 from tests.synthetic.scenes import Scene
@@ -21,6 +19,8 @@ from tools.benchmarks.poses.house_walk import walk_poses, walk_view
 from tools.benchmarks.poses.suite_of_rooms import suite_poses, suite_view
 from tools.benchmarks.poses.tours.plan import Style, build
 from tools.benchmarks.poses.tours.rendering import lit, panorama
+from tools.benchmarks.repeating.places import REPEATS, draw_sizes
+from tools.benchmarks.repeating.walks import LAYOUTS
 
 WIDTH = 384
 SIZE_HW = (WIDTH // 2, WIDTH)

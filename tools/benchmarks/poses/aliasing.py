@@ -3,7 +3,7 @@
 Run it with `python -m tools benchmarks poses.aliasing --captures 50 --width 768`.
 
 Captures of places in which floors, columns, doors or whole rooms repeat are drawn
-(`tests.repeating.places`) and rendered. For each method and capture the table has the number of cameras
+(`tools.benchmarks.repeating.places`) and rendered. For each method and capture the table has the number of cameras
 that are registered, of those that are right (rotation within 1°, centre within 2 % of the capture's extent, after
 alignment to the largest consistent subset), of those that are wrong, of those that are wrong without being doubted,
 and CPU-seconds. `--colmap` adds COLMAP on its own: EQUIRECTANGULAR cameras, its SIFT, its defaults. The folder
@@ -34,11 +34,11 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.testing import paint, room, surfaces
-from tests.repeating import drawings, fittings, prints
-from tests.repeating.places import draw_arguments, draw_capture
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.poses.captures_with_truth import MAPPERS, SEED, Cameras, Pictures, matched, native
 from tools.benchmarks.poses.placements import judge_placements
+from tools.benchmarks.repeating import drawings, fittings, prints
+from tools.benchmarks.repeating.places import draw_arguments, draw_capture
 
 OURS = "ours"
 

@@ -3,7 +3,7 @@
 Run it with `python -m tools benchmarks poses.rooms --seeds 0 1 2`.
 
 The captures are houses whose rooms see each other through doors only (`house_of_rooms`), the same houses with the first
-and the last room furnished alike ("twins"), and places with repeated structure (`tests.repeating.places`). Each is
+and the last room furnished alike ("twins"), and places with repeated structure (`repeating.places`). Each is
 solved and verified. The table has the groups, the cameras that are right within their group (see `placements`), wrong,
 doubted, and wrong without being doubted, and CPU-seconds.
 """
@@ -23,11 +23,11 @@ from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
-from tests.repeating.places import REPEATS
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.poses.captures_with_truth import SEED, Pictures, matched
 from tools.benchmarks.poses.house_of_rooms import House
 from tools.benchmarks.poses.placements import judge_placements
+from tools.benchmarks.repeating.places import REPEATS
 
 Views = dict[tuple[str, str], TwoView]
 Truth = dict[str, Rigid3]

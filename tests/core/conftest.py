@@ -1,0 +1,3 @@
+from tests.engine.conftest import toy
+
+__all__ = ["toy"]
