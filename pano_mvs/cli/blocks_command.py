@@ -42,10 +42,6 @@ def run_decided(
     """Run a workflow, in blocks if that was decided, print progress and a summary, and return the exit code.
 
     Args:
-        execution: how units are computed.
-        decision: whether the capture is divided.
-        as_json: print events instead.
-        dry_run: only print the plan.
         advise: whether to print the commands that can follow.
 
     Raises:
@@ -158,7 +154,6 @@ def show_blocks(
     Args:
         session: over the whole capture.
         decision: with a division.
-        console: where to print.
 
     Raises:
         UsageError: if the session cannot be run in blocks.

@@ -34,17 +34,6 @@ def calibrate(
 ) -> None:
     """Write the calibration of the camera that took some raw pictures.
 
-    Args:
-        photos: their folder.
-        out: the file to write.
-        names: names of the lenses, separated by a comma.
-        layout: how the pictures of both lenses are stored.
-        distance: distance between the lenses, with its unit; empty if unknown.
-        field_of_view_deg: start value; 0 for that of the camera.
-        up: side of the first lens's picture where the top of the scene is.
-        captures: maximum number of captures to use.
-        console: where to print.
-
     Raises:
         UsageError: if an option is wrong.
         InputError: if the pictures do not determine the lenses.

@@ -34,15 +34,7 @@ _SHOWN = 6
 
 @dataclass(frozen=True)
 class PixelWanted:
-    """The pixel to inspect.
-
-    Attributes:
-        image: name of the image, or a unique part of it.
-        x: column of the pixel from the left, at the resolution of the sweep; fractions are dropped.
-        y: row of the pixel from the top.
-        stage: name of the sweep in the workflow; empty for the first.
-        truth: folder with poses.json and depth.npz; None for the workflow's own.
-    """
+    """The pixel to inspect."""
 
     image: str
     x: float
@@ -78,7 +70,6 @@ class _Found:
     units: dict[str, dict[str, UnitFound]] = field(default_factory=dict)
 
     def look(self, unit: Unit, record: UnitRecord | None, _reason: str) -> None:
-        """Add a unit."""
         if unit.source is not None:
             self.images.append(unit.item)
         if issubclass(unit.entry.spec.output, RangeMap):

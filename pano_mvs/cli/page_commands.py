@@ -93,15 +93,7 @@ def share_output(
 
 @dataclass(frozen=True)
 class TourWanted:
-    """What a tour is made of, and where.
-
-    Attributes:
-        images: folder of panoramas or of a virtual tour, or a video.
-        out: output folder; None for `out/` and the name of `images`. The page is beside it.
-        workflow: a preset or a workflow file; empty for `mesh`, or `walk` for a video.
-        overrides: settings, as `--set` takes them.
-        cache: folder of the cache; None for the default.
-    """
+    """What a tour is made of, and where."""
 
     images: Path
     out: Path | None = None
@@ -112,11 +104,6 @@ class TourWanted:
 
 def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
     """Run a workflow, write the page of its results unless it ended early, and return the exit code of the run.
-
-    Args:
-        wanted: what the tour is made of.
-        console: where to print.
-        opens: whether to open the page in a browser.
 
     Raises:
         UsageError: if the workflow, a setting or a folder cannot be used.

@@ -51,7 +51,6 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
     """Print for each stage the units that are cached and that would or may run, with reasons, times and sizes.
 
     Args:
-        console: where to print.
         workers: number of units at a time, for the times; 0 for the default.
         threads: of each worker; 0 for the default.
     """
@@ -204,10 +203,6 @@ def show_status(
 
     Args:
         target: a workflow, or an output folder, whose run.json states workflow, settings, images and cache.
-        out: output folder of a workflow; None for the default.
-        overrides: settings.
-        images: folder of panoramas.
-        console: where to print.
 
     Raises:
         InputError: if an output folder has no run.json, or its workflow is missing.

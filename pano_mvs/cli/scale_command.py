@@ -33,14 +33,6 @@ def scale_output(
 
     Without a measurement, only the scale that a usual camera height would give is printed.
 
-    Args:
-        out: the output folder of a run.
-        known: two ends and the distance between them, or nothing.
-        camera_height: height of the cameras above the floor, with its unit; empty if unknown.
-        group: group of poses, if points or a height were measured.
-        cache: folder of the cache; None for that of the run.
-        console: where to print.
-
     Raises:
         UsageError: if the measurement cannot be used, or the results are merged from blocks.
         InputError: if the folder holds no run.

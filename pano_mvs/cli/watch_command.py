@@ -89,8 +89,6 @@ def _updated(view: View, reader: EventReader, since_s: float = 0.0) -> View:
     """Return the view after the new events; another one if another run has begun.
 
     Args:
-        view: of the run so far.
-        reader: reads its events.
         since_s: in seconds since 1970; earlier events are of an earlier run, which this one has not replaced yet.
 
     Raises:
@@ -181,7 +179,6 @@ class RunView:
     """What the events of a run say about it.
 
     Attributes:
-        folder: its output folder.
         end: its last event; None while it runs.
     """
 

@@ -60,7 +60,6 @@ class _Encoder:
         self._chunks: list[bytes] = []
 
     def digest(self) -> str:
-        """Return the hex digest of what was added."""
         self._flush()
         return self._hasher.hexdigest()
 

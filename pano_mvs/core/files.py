@@ -212,7 +212,6 @@ def write_given(path: Path, text: str, what: str) -> None:
     """Write the first file of a place that the user names, as `write_text` does.
 
     Args:
-        text: what to write.
         what: the option and the place that it names, for messages.
 
     Raises:

@@ -29,11 +29,7 @@ _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/C
 
 @dataclass(slots=True)
 class CompilationTime:
-    """Time that this process has spent on compiling kernels, waiting for another process that does, and loading them.
-
-    Attributes:
-        seconds: in total.
-    """
+    """Time that this process has spent on compiling kernels, waiting for another that does, and loading them."""
 
     seconds: float = 0.0
 

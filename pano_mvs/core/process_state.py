@@ -261,7 +261,6 @@ class _Libraries:
             return False
 
     def put_back(self) -> Iterator[str]:
-        """Put back what was replaced, and yield the names."""
         for name, module in self.modules.items():
             if sys.modules.get(name) is not module:
                 sys.modules[name] = module
@@ -298,7 +297,6 @@ _CHOSEN: list[dict[str, ModuleType]] = []
 
 
 def _library(name: str) -> Any:
-    """Return a library if it is loaded."""
     return sys.modules.get(name)
 
 
@@ -333,7 +331,6 @@ def _blocked_signals() -> set[int] | None:
 
 
 def _timers() -> tuple[bool, ...] | None:
-    """Return which interval timers run."""
     return tuple(signal.getitimer(timer)[0] > 0 for timer in _TIMERS) if _TIMERS else None
 
 
@@ -347,7 +344,6 @@ _TIMERS = [getattr(signal, name) for name in ("ITIMER_REAL", "ITIMER_VIRTUAL", "
 
 
 def _limits() -> dict[int, tuple[int, int]] | None:
-    """Return the limits of the system for this process."""
     resource = _resource()
     if resource is None:
         return None
@@ -405,7 +401,6 @@ def _numba_options() -> dict[str, Any] | None:
 
 
 def _decimals() -> tuple[Any, ...] | None:
-    """Return precision, rounding and limits of decimal numbers."""
     context = _library("decimal") and _library("decimal").getcontext()
     return context and tuple(getattr(context, name) for name in _DECIMAL)
 

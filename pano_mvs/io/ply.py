@@ -86,8 +86,6 @@ def write_ply(
     The cloud is written in chunks, so that memory-mapped arrays need not fit in memory.
 
     Args:
-        path: the file to write.
-        cloud: the points.
         quality: also write `views`, the number of views that agree on the point, and `confidence` (uchar).
         uncertainty: also write `uncertainty`, the standard deviation of the position in scene units (float); NaN if
             unknown.
@@ -155,7 +153,6 @@ def write_ply_mesh(path: Path, mesh: MeshArrays, *, file_from_world: FloatArray 
     """Write a mesh as binary little-endian PLY: x y z red green blue, and triangles as lists of three corners.
 
     Args:
-        path: the file to write.
         mesh: vertices (V, 3) float32, colours (V, 3) uint8, triangles (F, 3) int32.
         file_from_world: as in `write_ply`.
     """
@@ -215,8 +212,6 @@ class PlyPoints:
     """The vertices of a PLY file, which need not fit in memory.
 
     Attributes:
-        count: number of vertices.
-        has_normals: whether they have nx, ny, nz.
         vertices: (N,) with a field for each property, memory-mapped if the file is binary; as in the file.
         world_from_file: rotation (3, 3) into the world of the run that wrote the file; None if the header states none.
     """

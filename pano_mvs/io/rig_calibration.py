@@ -52,7 +52,6 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_d
     """Return the rig that a calibration file describes.
 
     Args:
-        file: the YAML file.
         stitch_distance_m: the distance at which the pictures are stitched.
         blend_deg: width of the strip around the seam in which both pictures are mixed.
 

@@ -259,7 +259,6 @@ def manifest_document(
     """Return the contents of manifest.json.
 
     Args:
-        views: all images.
         groups: by number: frame and unit of the world, and the files of each variant.
         depth_unit: scene units per step of the depths.
         photographs: photographs without distortion beside the faces, in the world of group 0.

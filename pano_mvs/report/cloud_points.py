@@ -35,7 +35,6 @@ class TurnableCloud:
 
     Attributes:
         key: of the encoded points among the facts of the page; see `encoded`.
-        points: number of points that are drawn.
         total: number of points of the cloud.
         cameras: (x, y, z, doubtful, name) in the frame of the viewer; names of at most 200 evenly spaced cameras, the
             others are "".

@@ -92,7 +92,6 @@ class CaptureFacts:
     Attributes:
         name: of the folder with the images, or else of the workflow.
         date: when the run began, in words; "" if unknown.
-        panoramas: number of images of the capture.
         sizes: ((height, width) of the full sphere in the file, number of images), the most frequent size first.
         measured: number of images whose size was looked up: at most 100, evenly spaced.
         working_hw: (height, width) at which most images are processed; None if that is the size of the files.
@@ -206,7 +205,6 @@ class Row:
     """One panorama.
 
     Attributes:
-        name: of the image.
         registered: whether it has a pose; None if no stage computed poses.
         reason: why it was left out, or "".
         doubtful: why its pose is doubtful, or "".
@@ -306,10 +304,8 @@ class Content:
         cloud: pictures of the cloud.
         turnable: the cloud for the viewer in the page; None if there is none.
         cards: views shown in full.
-        total_views: number of views.
         masked: what is masked in the panoramas.
         rows: one for each panorama.
-        total_rows: number of panoramas.
         mean_shares: of the sphere, over all measured views.
         measured_views: number of these.
         residuals: of the points.

@@ -66,7 +66,6 @@ class MaskedAreas:
     Attributes:
         counts: one for each reason that occurs.
         examined: number of panoramas that were examined, at most 100, evenly spaced.
-        total: number of panoramas.
         pictures: (image, reason to share of the sphere, picture), at most twelve, with at least one for each reason.
     """
 

@@ -35,7 +35,6 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
     Args:
         out_dir: the output folder; previews are read from it, and the images of an existing page are
             reused if they show the same values.
-        summary: of the run.
         values: the values of the run; None if only the summary is known.
     """
     report = gather_report(out_dir, summary, values)

@@ -179,7 +179,6 @@ class ViewCard:
     """One view as the page shows it in full.
 
     Attributes:
-        name: of the image.
         pictures: the available images among `panorama`, `range`, `confidence` and `uncertainty`.
         shares: of the sphere, or None.
         ticks: (position on the colour scale from 0 to 1, range); the scale is common to all views of a group.
@@ -225,8 +224,6 @@ def view_cards(
 
     Args:
         out_dir: the output folder, whose previews replace values that are not in the cache.
-        views: of the run.
-        kept: the earlier page's.
         groups: number of the group of each image; the views of a group share a colour scale, those of different groups
             do not, because their units of length differ. None: one group.
     """

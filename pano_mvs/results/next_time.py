@@ -147,8 +147,6 @@ class Suggestion:
 
 @dataclass
 class _Between:
-    """Reasons for a panorama between two images."""
-
     severity: _Severity
     group: int
     at: Direction | None
@@ -160,7 +158,6 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
     """Return what to do when the place is captured again, the most urgent first.
 
     Args:
-        summary: of the run.
         coverage: what the views see, as far as known; see `pano_mvs.results.coverage`.
     """
     found = _Collected()
@@ -204,7 +201,6 @@ class _Collected:
         entry.reasons.append(reason)
 
     def add(self, severity: _Severity, suggestion: Suggestion) -> None:
-        """Add a suggestion that is not about two images."""
         self._others.append((severity, suggestion))
 
     def in_order(self) -> tuple[Suggestion, ...]:

@@ -27,7 +27,6 @@ class Picture:
 
     Attributes:
         uri: `data:image/jpeg;base64,…`.
-        size_hw: (height, width) in pixels.
         key: by which a later page can reuse it; "" if it cannot.
     """
 
@@ -43,7 +42,6 @@ def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str =
         image: (H, W, 3) uint8 RGB.
         width: in pixels, at most.
         most_bytes: of the JPEG, before base64 encoding.
-        key: see `Picture`.
     """
     shown = resized(image, width)
     while True:

@@ -80,7 +80,6 @@ class StageOutcome(UnitCounts):
         use: the registered stage, such as `depth.sweep`.
         version: of the registered stage.
         params: its settings, as JSON values.
-        units: number of units of work.
         seconds: from the start of its first unit to the end of its last.
         unit_seconds: sum over its computed units; None in files of early versions.
         metrics: mean over its units of each figure that the stage reports.
@@ -141,8 +140,6 @@ class PairLink(NamedTuple):
     """A pair of images that was matched.
 
     Attributes:
-        first: one image.
-        second: the other.
         inliers: matches that agree with one geometry; 0 if the pair was rejected.
         candidates: matches before verification, if known.
         residual_deg: median epipolar residual, if known.
@@ -175,7 +172,6 @@ class PoseGroup(Entry):
     """A group of cameras with a world frame and a unit of length of its own.
 
     Attributes:
-        images: names of its images.
         frame: what the world frame is.
         scale: what the unit of length is.
         metric: whether lengths are in metres.

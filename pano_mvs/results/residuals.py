@@ -24,7 +24,6 @@ class Histogram:
     Attributes:
         upper_deg: nominal end of the last bin.
         p95_deg: 95 % are smaller.
-        total: number of values.
     """
 
     counts: tuple[int, ...]

@@ -149,12 +149,7 @@ class Views(Mapping[str, "RunView"]):
 
 
 class RunView:
-    """One view of a run.
-
-    Attributes:
-        name: of the image.
-        summary: the entry of the view in run.json.
-    """
+    """One view of a run."""
 
     def __init__(self, run: RunOutput, summary: ViewSummary) -> None:
         self.name = summary.name

@@ -60,10 +60,6 @@ class StoredValues:
     def of_folder(out: Path, summary: RunSummary, store: Store) -> StoredValues:
         """Return the values of the latest run into a folder, using the list of runs in the cache.
 
-        Args:
-            out: the output folder.
-            summary: its run.json.
-
         Raises:
             StoreError: if the list of runs is damaged.
         """

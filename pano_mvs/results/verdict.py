@@ -120,7 +120,6 @@ def _cloud(summary: RunSummary) -> list[Tile]:
 
 
 def _accuracy(summary: RunSummary) -> list[Tile]:
-    """Return the errors against ground truth, if known."""
     scores = summary.scores
     tiles = []
     error_deg = median([scores.poses.get("median_pair_error_deg")])
@@ -150,7 +149,6 @@ def mood_of(value: float, good: float, fair: float) -> str:
     """Return "good", "fair" or "bad".
 
     Args:
-        value: the figure to judge.
         good: threshold of "good"; a lower bound if it is greater than `fair`, else an upper bound.
         fair: threshold of "fair".
     """

@@ -71,8 +71,6 @@ def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX
     """Return an image as OpenCV decodes it, BGR, or None if OpenCV does not know its format.
 
     Args:
-        data: the file's bytes.
-        path: the file, for error messages.
         flags: `cv2.IMREAD_…`.
         max_pixels: the limit of pixels, which is compared with the header before memory is allocated.
 

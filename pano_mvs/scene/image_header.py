@@ -203,7 +203,6 @@ class Tiff:
     """A TIFF in memory.
 
     Attributes:
-        data: its bytes.
         order: "<" or ">".
         first: offset of its first directory.
         is_big: whether it is a BigTIFF.

@@ -44,14 +44,12 @@ def calibrate_camera(
 
     Args:
         folder: the pictures, as for source.dual_fisheye.
-        names: names of the lenses.
         layout: see `list_rig_pictures`.
         distance_m: distance between the centres of the lenses; None if unknown, then the rig is not metric.
         field_of_view_deg: about the full angle of the image circles; None for that of the camera in the EXIF data.
         up: side of the first lens's picture where the top of the scene is, one of QUARTER_TURNS; the panoramas are
             then upright.
         max_captures: number of captures that are used, the first ones.
-        progress: is called with each step.
 
     Raises:
         InputError: if there are fewer than two captures, or they do not determine the lenses.

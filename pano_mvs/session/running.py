@@ -222,7 +222,6 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
 
     Args:
         run: after `execute`, also if it raised.
-        started: when it began.
         clock: the same by `time.perf_counter`.
 
     Raises:

@@ -90,7 +90,6 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
     """Return the measurement of a distance between two cameras or two points.
 
     Args:
-        run: the output of a run.
         first: name of a registered image, or coordinates `x,y,z`, as the viewer and other programs show them.
         second: the other end.
         group: the group of poses in which points were measured; images state theirs.
@@ -172,7 +171,6 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     ranges and clouds. A run that is in metres already is corrected: its factor changes.
 
     Args:
-        known: the length.
         cache: folder of the cache; None for that of the run.
 
     Raises:
@@ -246,7 +244,6 @@ class _Rewiring:
         self.added: dict[str, StageEntry] = {}
 
     def workflow(self) -> Workflow:
-        """Return the workflow."""
         changed = {}
         for name, entry in self.stages.items():
             if name not in self.upstream:

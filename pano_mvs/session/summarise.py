@@ -53,8 +53,6 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
 
     Args:
         run: after `execute`, also if it raised.
-        started: when it began.
-        seconds: that it took.
     """
     workflow, result = run.workflow, run.result
     scores = _scores(run)
@@ -186,10 +184,6 @@ def poses_summary(
     """Return the summary of poses.
 
     Args:
-        rejected: image without a pose to the reason.
-        doubts: registered image whose pose is doubtful to the reason.
-        links: the pairs that were matched.
-        blocked: units that could not run.
         heights: group to the height of its cameras above the floor, where it is known.
     """
     groups = split_groups(poses)
@@ -251,7 +245,6 @@ def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[P
     Args:
         largest: images of the largest group.
         other: images of another one.
-        links: the pairs that were matched.
 
     Returns:
         The pair; None if no image of one group was compared with one of the other.

@@ -52,7 +52,6 @@ class StageProgress:
     """What is known of one stage.
 
     Attributes:
-        forecast: from earlier runs.
         units: number of its units; None until the stage has started.
         done: number of settled units.
         computed: number of these that were computed.
@@ -136,18 +135,10 @@ class StageProgress:
 
 
 class TimeEstimator:
-    """Keeps track of a run by its events; several threads may use it at a time.
-
-    Attributes:
-        stages: what is known of each stage, in order.
-    """
+    """Keeps track of a run by its events; several threads may use it at a time."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin to estimate.
-
-        Args:
-            clock: returns the time in seconds.
-        """
+        """Begin to estimate."""
         self.stages: dict[str, StageProgress] = {}
         self._clock = clock
         self._lock = threading.Lock()

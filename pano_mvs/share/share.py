@@ -71,8 +71,6 @@ class Shared:
     Attributes:
         page: the page to open, which needs its folder.
         single_file: the same as one file; None if it would be too large.
-        points: number of points of the cloud.
-        panoramas: number of panoramas.
         triangles: number of triangles of the mesh; 0 without one.
         total_bytes: size of the data.
         notes: what is missing.

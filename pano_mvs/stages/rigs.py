@@ -172,7 +172,6 @@ def _decoded(file: FilePart, data: bytes, params: DualFisheyeParams) -> NDArray[
 def _by_lens(
     pictures: list[NDArray[np.uint8]], rig: LensRig, item: SourceItem, *, params: DualFisheyeParams
 ) -> list[NDArray[np.uint8]]:
-    """Return the picture of each lens."""
     assert params.calibration is not None
     sizes = [lens.size_hw for lens in rig.lenses]
     if len(pictures) == 2:

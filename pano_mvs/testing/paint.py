@@ -63,8 +63,6 @@ def albedo_at(
     Args:
         points: in world coordinates; a point has the same colour from every viewpoint.
         colors_rgb: the two colours between which the hue varies.
-        texture: kind of texture.
-        seed: seed of the texture.
         footprint: (N,) width of a pixel at each point. The texture "outdoor" fades where a pixel averages over its
             waves, since a far wall would otherwise flicker between views; the others do not depend on it.
     """

@@ -52,7 +52,6 @@ class Variant:
     """A variant of the tiny capture.
 
     Attributes:
-        size_hw: (height, width) of the images.
         rolled: number of columns by which all images are rolled to the right, with rotated cameras.
         masked: whether the tripod and a patch across the seam are masked in every image.
         scribbled: whether masked pixels show noise instead of the room.
@@ -76,7 +75,6 @@ class TinyCapture:
 
     Attributes:
         folder: folder with images/ and truth/poses.json.
-        names: image names.
         poses: cam_from_world of each image.
         pictures: the images, equal to the files unless these are cropped or scribbled.
         ranges: true ranges, (H, W) float32.

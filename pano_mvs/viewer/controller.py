@@ -50,7 +50,6 @@ class TourState:
     """State of the viewer.
 
     Attributes:
-        viewpoint: position and direction of view.
         surface: "cloud", "mesh" or "both".
         coloring: name of the cloud's colouring.
         inside: index of the camera whose panorama surrounds the viewer, or None.
@@ -58,15 +57,11 @@ class TourState:
         measuring: whether clicks pick points.
         picked: none, one or two points (3,) in the world.
         hovered: index of the camera under the pointer, or None.
-        labels: whether all cameras are named.
-        cameras: whether cameras are shown.
         blended: whether the cloud is shown inside a panorama.
         ranges: whether a camera's ranges are shown inside it instead of its panorama.
         backs: whether points and triangles that face away from the viewer are shown; hiding them opens rooms
             to view.
         all_points: whether all points of the file are drawn.
-        help: whether the keys are listed.
-        message: the latest message.
     """
 
     viewpoint: Viewpoint
@@ -97,7 +92,6 @@ class Tour:
         box: (2, 3) that contains nearly everything.
         aspect: width of the window as a multiple of its height.
         corners: (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh.
-        state: current state.
     """
 
     scene: ShownScene
@@ -234,7 +228,6 @@ class Tour:
         }
 
     def _look(self, viewpoint: Viewpoint) -> None:
-        """Look from outside."""
         self.state = replace(self.state, viewpoint=viewpoint, inside=None, outside=None, message="")
 
     def _toggle(self, name: str) -> None:

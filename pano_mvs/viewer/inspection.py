@@ -31,8 +31,6 @@ class StageRange:
     """Range of the pixel after one stage.
 
     Attributes:
-        stage: its name in the workflow.
-        use: of the stage in the registry.
         range: in scene units; NaN if it has none.
         confidence: 0–255.
     """
@@ -71,7 +69,6 @@ class Inspection:
     """One pixel of one image.
 
     Attributes:
-        image: its name.
         column: of the pixel, from 0; its centre is at column + ½.
         row: likewise.
         size_hw: of the image at the resolution of the sweep.
@@ -82,10 +79,7 @@ class Inspection:
         stages: its range after each stage that produces ranges, as far as stored.
         sweep: name of the stage whose cost curve is shown.
         settings: of that sweep.
-        curve: its costs.
-        sources: its neighbours.
         true_range: in scene units; NaN if unknown.
-        notes: further remarks.
     """
 
     image: str

@@ -32,8 +32,6 @@ class ShownCamera:
     """A camera to step into.
 
     Attributes:
-        name: of its image.
-        cam_from_world: its pose.
         picture: its panorama, or None if the file is missing.
         preview: a small image whose upper half is the panorama, or None.
         range_file: its ranges as float32 TIFF, or None.

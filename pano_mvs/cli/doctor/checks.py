@@ -34,9 +34,6 @@ class Finding:
 
     Attributes:
         group: packages, libraries, machine, disk or plugins.
-        what: the subject of the check.
-        state: the verdict.
-        detail: what was found.
         remedy: what to do; given with every warning and failure.
     """
 
@@ -161,7 +158,6 @@ def package_findings(
 
     Args:
         requirements: requirements as in a distribution's metadata; by default the program's own.
-        version_of: returns the version of a distribution.
     """
     yield Finding("packages", "Python", "ok", sys.version.split()[0])
     if requirements is None and not installed_version(_DISTRIBUTION):
@@ -233,13 +229,7 @@ _REINSTALL = "pip install --force-reinstall pano-mvs"
 def plugin_findings(
     registry: Registry, presets: Path, environment: Mapping[str, str] = os.environ
 ) -> Iterator[Finding]:
-    """Yield the state of the stages, the presets, the plugins and the folders of plugins.
-
-    Args:
-        registry: the stages and plugins that were found.
-        presets: the folder of the shipped workflows.
-        environment: the environment variables.
-    """
+    """Yield the state of the stages, the presets, the plugins and the folders of plugins."""
     if _BUILTIN in registry.stages:
         count = len(registry.plugins)
         origins = f"{count} {plural(count, 'package or file', 'packages and files')}"

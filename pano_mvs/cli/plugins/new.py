@@ -27,7 +27,6 @@ class PluginKind:
 
     Attributes:
         prefix: of the stage's name; empty for a part of the sweep.
-        what: its purpose.
         use: how a workflow uses it, with `{name}` for its name.
         contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
     """

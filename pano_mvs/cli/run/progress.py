@@ -155,14 +155,12 @@ class ProgressDisplay:
         return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
 
     def _print_failure(self, failure: UnitFailed) -> None:
-        """Print a failure and the last lines of the unit's output."""
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
         self.console.say(f"[red]failed[/] {escape(label)}")
         for line in failure.said[-_SHOWN_LINES:]:
             self.console.say(f"  | {escape(line)}")
 
     def _print_stage(self, summary: StageFinished) -> None:
-        """Print what a stage did."""
         parts = [f"{summary.run} run", f"{summary.cached} cached"]
         parts += [
             f"{count} {what}" for what, count in (("failed", summary.failed), ("blocked", summary.blocked)) if count

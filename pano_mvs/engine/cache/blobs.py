@@ -46,7 +46,6 @@ class BlobRef:
 
     Attributes:
         digest: of the bytes.
-        size_bytes: length.
         suffix: `.npy`, `.json`, or that of the stored file.
         external: whether the bytes are in a file of the user rather than in the cache.
     """

@@ -30,11 +30,7 @@ class RunEntry:
 
     Attributes:
         name: the id of the run, or the name of the pin.
-        workflow: name of the workflow.
-        out: folder of the results.
         when: end of the run, ISO 8601, UTC.
-        keys: cache keys of its units.
-        pinned: whether it is a pin.
     """
 
     name: str

@@ -42,9 +42,6 @@ class Packed(NamedTuple):  # created for each value that is looked up, four time
     """One value in a pack.
 
     Attributes:
-        pack: the file.
-        offset: of its first byte.
-        size_bytes: its length.
         digest: of a blob, or the key of a record.
         kind: `RECORD`, `ARRAY` or `JSON`.
         time_s: when it was stored, in seconds since the epoch; 0 where this was not asked for.

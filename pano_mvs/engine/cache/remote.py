@@ -49,8 +49,6 @@ class Copied:
     """What was copied.
 
     Attributes:
-        files: number of files that were copied.
-        size_bytes: their size.
         present: number of files that were there already.
     """
 

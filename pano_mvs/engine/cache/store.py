@@ -195,15 +195,10 @@ class UnitRecord:
     """The result of one finished unit of work.
 
     Attributes:
-        key: its cache key.
         identity: what the key was made of, for the reasons in plans.
-        output: the value.
         items: the items of a collection, by image.
-        metrics: figures of the unit.
-        notes: what a user should know.
         rejected: image name to the reason why the result leaves it out.
         doubts: image name to the reason why the result is doubtful there.
-        seconds: computing time.
     """
 
     key: str
@@ -278,7 +273,6 @@ class Store:
         """Open or create a store.
 
         Args:
-            root: its folder.
             durable: flush every blob and record to the disk at once, so that they survive a power cut.
             min_free_bytes: no unit is started with less free space on the disk; 0 to disable this.
             for_reading: also accept a folder that cannot be written or created.

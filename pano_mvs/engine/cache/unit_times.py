@@ -32,7 +32,6 @@ class CaptureSize:
     """The size of a capture, by which times are scaled.
 
     Attributes:
-        images: number of images.
         pixels: of one image in the median; the bytes of its file if it is not an image file.
     """
 
@@ -54,9 +53,6 @@ class Sample:
     Attributes:
         settings: digest of the settings of the stage.
         threads: that each unit could use.
-        images: number of images of the capture.
-        pixels: of one image; see `CaptureSize`.
-        units: number of units of the stage.
         seconds: that a unit took in the mean.
         stored_bytes: that a unit stored in the mean.
     """
@@ -118,9 +114,6 @@ class UnitTimes:
 
         Args:
             stage: name of the stage in the registry.
-            size: of the capture.
-            settings: digest of the settings.
-            threads: that a unit may use.
             whole: whether the unit reads the whole capture, so that the number of images counts too.
         """
         similar = self._similar(stage, size, settings=settings, threads=threads)

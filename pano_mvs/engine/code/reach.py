@@ -40,7 +40,6 @@ class Reach:
     """The code that a function reaches.
 
     Attributes:
-        digest: of all definitions.
         definitions: `module:name` of each definition, to its digest.
         libraries: top-level names of other packages that these use, except the standard library.
     """
@@ -91,7 +90,6 @@ class _Module:
     _definitions: dict[int, _Definition] = field(default_factory=dict)
 
     def definition(self, name: str) -> _Definition:
-        """Return what a name stands for."""
         whole = _Definition()
         for statement in self.statements.get(name, ()):
             if id(statement) not in self._definitions:
@@ -275,8 +273,6 @@ def _analysed(text: str | bytes, package: str, followed: frozenset[str]) -> _Mod
     """Return what a module holds.
 
     Args:
-        text: the source.
-        package: from which relative imports start.
         followed: the packages that are followed, whose decorators may register something.
 
     Raises:

@@ -52,9 +52,7 @@ class DaskExecutor:
 
         Args:
             store: the cache; for an existing cluster, in a folder with the same path on all hosts.
-            workers: number of workers, for a new cluster on this host.
             threads: threads of each worker; 0 for an equal share of the cores of its host.
-            scheduler: address of an existing scheduler.
 
         Raises:
             UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
@@ -270,7 +268,6 @@ def introduce(store: str, token: str) -> dict[str, Any]:
     """Return what is checked about a worker before it gets units.
 
     Args:
-        store: folder of the cache.
         token: name of a file among the temporary files of the cache; an answer is written beside it.
     """
     path = Path(store) / "tmp" / token

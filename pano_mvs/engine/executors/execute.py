@@ -182,7 +182,6 @@ class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
     Args:
         refs: key to the reference that `load` takes, in the order of iteration.
         load: reads one value; its exceptions are raised by the access.
-        max_kept: number of values to keep.
     """
 
     def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value], *, max_kept: int = 64) -> None:

@@ -18,8 +18,6 @@ class Job:
     """A unit to be computed.
 
     Attributes:
-        number: identifies the job in this run.
-        threads: number of threads that it may use.
         timeout_s: time after which it is ended; 0 for no limit.
         log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.
         plugins: the plugin files of the workflow, with the digests of their code.
@@ -51,12 +49,10 @@ class JobOutcome:
             `changed`: an input file has changed since it was listed; `stopped`: the run cannot go on (the disk is full,
             or the stage raised RunStoppedError).
         record: the stored result, if the status is `done`.
-        cause: what went wrong otherwise.
         trace: the Python traceback, if the code of the stage failed.
         error: name of the class of the error, if the run has to raise it again.
         exit_code: exit code of an error that the user can fix, otherwise 0.
         died: whether the worker process died, or must not compute anything else.
-        seconds: how long the job took.
         changed: input files that have changed since they were listed, with the reasons.
     """
 
@@ -95,7 +91,6 @@ class Executor(Protocol):
     """Computes units, several at a time or one.
 
     Attributes:
-        name: as chosen on the command line.
         capacity: number of jobs that it takes at a time.
         threads: number of threads for a unit while `capacity` units run.
         cores: number of threads for a unit that runs alone.

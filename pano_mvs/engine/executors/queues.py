@@ -209,7 +209,6 @@ class QueueExecutor(DaskExecutor):
 
         Args:
             store: the cache, in a folder with the same path on all hosts.
-            queue: settings of the jobs.
             threads: threads for a unit; 0 for an equal share of the cores.
 
         Raises:

@@ -22,9 +22,7 @@ class StageForecast:
     """What a stage is expected to take.
 
     Attributes:
-        stage: its name in the workflow.
         after: the stages that feed it.
-        cached: number of units that are in the cache.
         units: expected number of units to compute; None if unknown.
         unit_s: expected seconds of one unit; None if no earlier run computed the stage.
         unit_bytes: expected bytes that a unit adds to the cache; None likewise.
@@ -69,11 +67,7 @@ def forecast(
     """Return what each stage of a plan is expected to take, in the order of the plan.
 
     Args:
-        plans: of `make_plan`.
-        workflow: the workflow that was planned.
-        size: of the capture.
         histories: times of earlier runs; the first that has samples of a stage counts.
-        threads: that a unit may use.
     """
     return tuple(
         _of_stage(
@@ -96,11 +90,6 @@ def expected_memory(
     """Return the bytes that the units for the whole capture are expected to need in memory, by stage.
 
     Only stages that declare it are included, unless the workflow states the memory of a unit.
-
-    Args:
-        workflow: that would be run.
-        histories: as in `forecast`.
-        threads: that a unit may use.
     """
     found = {}
     for name in graph.order:

@@ -180,9 +180,6 @@ class StagePlan:
     """What a run would do in one stage.
 
     Attributes:
-        name: of the stage in the workflow.
-        use: of the stage in the registry.
-        cached: units that are in the cache.
         run: unit that would be computed, to the reason.
         may_run: units that depend on units that would be computed; they run if these give other results.
         blocked: unit to the reason why it cannot run.
@@ -210,8 +207,6 @@ def make_plan(
     """Return what a run would do, stage by stage, without running anything.
 
     Args:
-        workflow: with the options applied.
-        store: the cache.
         listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 

@@ -145,7 +145,6 @@ def resolve_source(
     """List the items of a source, and return a unit for each.
 
     Args:
-        store: the cache.
         only: names of the items to return; None for all.
         listing: what the run has listed so far; None to list the items again.
 

@@ -29,11 +29,9 @@ class Unit:
     """One unit of work, for an image, a pair, a view, or the whole capture.
 
     Attributes:
-        entry: its stage in the workflow.
         item: its name within the stage; `WHOLE` if the stage has only one unit.
         members: the images that it concerns.
         inputs: port to the item that it reads, or to items by name for Near, All and Names.
-        key: cache key.
         identity: what the key is made of.
         source: the item to read, for units of a source.
     """
@@ -64,7 +62,6 @@ class StageState:
     """The results of a stage, in a run or in a plan.
 
     Attributes:
-        axis: of its units.
         items: unit to its stored value.
         exploded: image to its item, where the value is a collection.
         members: unit to the images that it concerns.

@@ -34,7 +34,6 @@ class FinishedJob:
     """A job that has ended, after all its retries.
 
     Attributes:
-        unit: the unit that was to be computed.
         outcome: what became of the last attempt.
         log: file with what the unit printed; None if it printed nothing.
         said: the last lines of the log.
@@ -61,11 +60,7 @@ class Dispatcher:
         """Prepare.
 
         Args:
-            executor: computes the units.
-            store: the cache.
             out: the output folder, for logs.
-            plugins: the plugin files of the workflow, with the digests of their code.
-            isolate: whether each unit of a plugin's stage gets a process of its own.
         """
         self._executor = executor
         self._isolate = isolate

@@ -18,7 +18,6 @@ class Failure:
     """A unit without a result.
 
     Attributes:
-        stage: name of the stage in the workflow.
         item: the unit; empty if the stage has one only.
         cause: what went wrong and what to do.
         trace: the Python traceback, if the code of the stage failed.
@@ -55,18 +54,12 @@ class StageSummary:
     Attributes:
         name: of the stage in the workflow.
         use: of the stage in the registry.
-        units: number of its units.
-        cached: number of units that were found in the cache.
-        run: number of units that were computed.
-        failed: number of units that failed.
-        blocked: number of units that did not run because an input failed.
         seconds: time during which at least one of its units was being computed; other stages may have run too.
         unit_seconds: computing time of its units together.
         slowest_s: computing time of its slowest unit.
         stored_bytes: bytes of the results that its computed units stored in the cache.
         metrics: mean of each metric over the units.
         unit_metrics: unit to its own metrics.
-        notes: what a user should know.
     """
 
     name: str
@@ -109,7 +102,6 @@ class RunResult:
         doubts: image to the stage that finds it doubtful and the reason; see `Record.doubted`.
         stopped: why the run ended early; empty if it did not.
         exit_code: 0 ok, 3 finished with failed or doubtful items, 4 stopped by a threshold or by `on_error: stop`.
-        written: files that this run wrote into the output folder.
         removed: files of earlier runs that this run deleted.
         published: every file of the results, with its digest.
         left_over: files of earlier runs, with their digests, that are not part of the results and still exist.
@@ -200,9 +192,7 @@ class StageFinished:
     """A stage is done.
 
     Attributes:
-        stage: its name in the workflow.
         use: the registered stage, such as `depth.sweep`.
-        units: number of units.
         run: of these computed.
         cached: taken from the cache.
         failed: without a result.

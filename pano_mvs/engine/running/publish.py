@@ -151,8 +151,6 @@ class Publisher:
     """Writes the files of one run into one folder.
 
     Attributes:
-        store: the cache.
-        written: the files that were written.
         published: every file of the run, and its digest.
         earlier: file to digest, as an earlier run or an earlier pass of this run wrote them.
         set_aside: files of the user that were renamed to make room: original name to new name.
@@ -225,8 +223,6 @@ class Publisher:
         the order in which the units are computed.
 
         Args:
-            stage: name of the stage.
-            item: name of the unit.
             to: folder for them inside the output folder.
 
         Returns:
@@ -280,7 +276,6 @@ class Publisher:
         return self._ranks.get(owner.item, len(self._ranks)), owner.item
 
     def _withdraw(self, files: Iterable[str]) -> None:
-        """Delete the files of a unit from the output folder."""
         for name in files:
             del self.published[name]
             with suppress(ValueError):

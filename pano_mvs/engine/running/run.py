@@ -65,7 +65,6 @@ class Run:
 
     Attributes:
         keys: stage to unit to cache key, of all units that were looked up.
-        computed: keys of the units that this run computed.
         refreshed: labels of the units that `--refresh` named and that were reached.
     """
 
@@ -83,13 +82,7 @@ class Run:
         """Prepare a run.
 
         Args:
-            workflow: what to run.
-            graph: how its stages are connected.
-            store: the cache.
-            out: folder of the results.
-            observer: is notified of progress.
             executor: computes the units; by default one after another with all threads. The caller closes it.
-            options: what the user asked for beyond the workflow.
 
         Raises:
             UsageError: if the output folder cannot be written, the options name a stage that does not exist, or units
@@ -282,7 +275,6 @@ class RunPass:
     """One pass over a workflow, with a result and statistics of its own.
 
     Attributes:
-        result: what happened in this pass.
         queue: the units that can run, and the results so far.
         damaged: damaged files of the cache (which have been removed) and changed input files that this pass met.
             Units that need any of them are left to the next pass, while the others go on, so that much damage takes no
@@ -383,7 +375,6 @@ class RunPass:
         return True
 
     def _end(self, finished: FinishedJob) -> None:
-        """Act on what became of a job."""
         outcome, unit = finished.outcome, finished.unit
         duplicates = self._duplicates.pop(unit.key)
         if outcome.status == "damaged":

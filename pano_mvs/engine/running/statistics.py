@@ -59,8 +59,6 @@ class RunStatistics:
 
         Args:
             result: is filled in.
-            observer: is notified.
-            states: returns the state of a stage.
             name_items: is called with the names of a source's images once they are known.
         """
         self._result = result

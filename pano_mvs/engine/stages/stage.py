@@ -136,9 +136,6 @@ class StageSpec:
         name: the `use:` name, such as `depth.sweep`.
         version: the author raises it if results change for a reason that is not in the code.
         function: called with the ports by name, `params` and `ctx`.
-        ports: what it reads.
-        params_type: model of its settings.
-        output: the kind that it returns.
         list_items: the function that lists the items, for sources.
         origin: where it is defined, `file:line`.
         code_digest: digest of the code, for stages from user files; otherwise empty, see `stage_code`.

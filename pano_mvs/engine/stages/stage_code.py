@@ -82,7 +82,6 @@ def reach_of_function(module: str, name: str, graph: CodeGraph) -> Reach:
     Args:
         module: dotted name of its module.
         name: its qualified name there.
-        graph: of its package and pano_mvs.
     """
     if "." in name:
         # It is made by another function with unknown arguments: its whole package counts.

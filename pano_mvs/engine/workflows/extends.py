@@ -27,8 +27,6 @@ class WorkflowFile:
     Attributes:
         shown_as: its name in messages.
         base: folder that its relative paths start from.
-        text: the YAML.
-        root: the top-level mapping.
     """
 
     shown_as: str
@@ -84,9 +82,7 @@ class ExtendsReader:
     """Reads a workflow file and all files that it extends, each once, the extended ones first.
 
     Attributes:
-        problems: the errors found.
         presets: folder of the workflows that can be extended by name, or None.
-        files: the files that were read.
     """
 
     problems: Problems
@@ -98,9 +94,6 @@ class ExtendsReader:
         """Read a workflow and, before it, the files that it extends.
 
         Args:
-            text: the YAML.
-            shown_as: its name in messages.
-            base: folder that its relative paths start from.
             chain: the files that extend each other up to this one, which is last; empty if the text is not a file.
         """
         root = parse_yaml(text, shown_as, self.problems)

@@ -24,10 +24,6 @@ def resolved_yaml(workflow: Workflow, graph: Graph) -> str:
 
     All settings of each stage have values, paths are absolute, and `in:` names what feeds each port. Other reserved
     keys, such as `gate`, are included where they differ from their defaults.
-
-    Args:
-        workflow: the workflow, with the overrides applied.
-        graph: how its stages are connected.
     """
     root: dict[str, Any] = {"pano_mvs": FORMAT_VERSION, "name": workflow.name}
     if workflow.plugins:
@@ -77,7 +73,6 @@ class _Representer(RoundTripRepresenter):
     """Writes None as `null` rather than as nothing."""
 
     def represent_none(self, _data: None) -> Any:
-        """Return the node of None."""
         return self.represent_scalar("tag:yaml.org,2002:null", "null")
 
 

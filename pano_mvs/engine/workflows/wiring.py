@@ -59,7 +59,6 @@ def wire(workflow: Workflow, *, unknown: Collection[str] = ()) -> Graph:
     """Connect every port as `in:` says, or else to the nearest earlier stage that produces its kind.
 
     Args:
-        workflow: its stages.
         unknown: names of further stages of which nothing is known, because they have errors. What they may produce or
             need is not reported.
 

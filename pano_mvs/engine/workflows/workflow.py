@@ -29,10 +29,6 @@ class StageEntry:
     """One stage of a workflow, validated.
 
     Attributes:
-        name: its name in this workflow.
-        spec: the stage it uses.
-        params: its settings.
-        policy: the reserved keys.
         place: `file:line:column` of its name.
         places: port or setting to `file:line:column`.
     """
@@ -51,7 +47,6 @@ class Workflow:
 
     Attributes:
         name: for the output folder and the report.
-        path: the file, or None.
         text: the YAML, followed by that of the files that it extends.
         stages: in the order of the file.
         overrides: the `--set` and `--images` options that were applied.
@@ -84,9 +79,6 @@ def load_workflow(
     Args:
         path: the YAML file; relative paths in it start from its folder.
         registry: the known stages; the plugin files of the workflow are added to it.
-        overrides: `STAGE.PARAM=VALUE`, with values in YAML.
-        images: folder that replaces the path of the stage `images`; None to keep it.
-        presets: folder of the workflows that can be extended by name.
 
     Raises:
         InputError: if the file cannot be read.
@@ -258,10 +250,6 @@ def report_invalid(
     """Add a line for each setting that does not fit a model.
 
     Args:
-        error: of the validation.
-        node: the mapping with the settings.
-        problems: receives the lines.
-        known: the settings that exist.
         subject: what the settings belong to, at the beginning of each line.
     """
     for problem in error.errors(include_url=False):
@@ -287,7 +275,6 @@ def _name_of(shown_as: str) -> str:
 
 
 def _all_texts(files: Sequence[WorkflowFile]) -> str:
-    """Return the text of a workflow, followed by those of the files that it extends."""
     *below, own = files
     return own.text + "".join(f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in below)
 

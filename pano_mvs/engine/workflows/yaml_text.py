@@ -101,7 +101,6 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
     """Return the document in a YAML 1.2 text.
 
     Args:
-        text: the YAML.
         name: name of the text in messages, such as its path.
         problems: receives errors that leave the rest readable, such as a key that occurs twice; None raises them.
 

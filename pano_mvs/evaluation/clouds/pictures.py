@@ -46,7 +46,6 @@ def write_error_cloud(
     """Write points as binary little-endian PLY: x y z, red green blue, and their distance as a scalar (float).
 
     Args:
-        path: the file to write; its folder is made.
         points: the points in chunks (K, 3), N in all, one chunk in memory at a time.
         distances: (N,) of each; larger ones than `farthest` are written as `farthest`.
         limits: tolerances in rising order, for the colours (see `distance_colors`).

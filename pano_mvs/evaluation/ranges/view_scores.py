@@ -404,7 +404,7 @@ def score_view(
     mask: NDArray[np.bool_] | None = None,
     settings: ScoreSettings | None = None,
 ) -> ViewScores:
-    """Return the scores of a range map.
+    """Return the scores of a range map; see `scored_pixels` for the maps and the scale.
 
     Each prefix of `PROTOCOLS` precedes mse, psnr_db, rmse, mae, abs_rel, the deltas and the bads of `range_errors`.
     completeness and w_completeness are the shares of pixels with an estimate; median_relative_error and
@@ -412,11 +412,6 @@ def score_view(
     sparsification_oracle_area and ause, by solid angle, and plain_ause with equal weights.
 
     Args:
-        estimated: (H, W) ranges in scene units; values that are not positive and finite count as missing.
-        truth: (H, W) true ranges; pixels with anything but a positive finite one are ignored.
-        confidence: (H, W), the larger the more confident.
-        scale: factor from scene units to the truth's unit.
-        mask: (H, W), False excludes a pixel.
         settings: how to score; by default those of `ScoreSettings`.
 
     Raises:

@@ -47,7 +47,6 @@ def write_face(
     """Write the four files of one face of one panorama, and return their paths by target in the output folder.
 
     Args:
-        face: the name of the face.
         suffix: suffix of the image, ".jpg" or ".png".
         image: (h, w, 3) uint8 RGB.
         mask: (h, w) bool, False is ignored.

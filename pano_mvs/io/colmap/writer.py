@@ -37,7 +37,6 @@ def write_colmap_model(
     observations, in pixels of the given size. The same poses give the same bytes.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each image by name.
         photographs: ordinary photographs, in the same world; see `_add_photographs`.
@@ -104,7 +103,6 @@ def write_rig_model(
     face. Points that no face observes are omitted, because OpenMVS stops reading at the first of them.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: poses of the panoramas with points and tracks. Errors become pixels at a face's centre (f per radian).
         cuts: panorama name to its faces; panoramas without an entry are omitted.
         photographs: ordinary photographs, in the same world; see `_add_photographs`.
@@ -146,7 +144,6 @@ def write_lens_rig_model(
     axis of their lens are omitted, because COLMAP's model cannot project beyond 90°, and so are points without others.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: poses of the panoramas, in metres, with points and tracks.
         pictures: panorama name to its pictures; panoramas without an entry are omitted.
         form: "bin", "txt" or "both".
@@ -340,7 +337,6 @@ class _ModelPoints:
     """Collect the observations of images in tracks, and add the points to a pycolmap model."""
 
     def __init__(self, poses: Poses) -> None:
-        """Create empty tracks."""
         import pycolmap
 
         self._poses = poses
@@ -398,7 +394,6 @@ def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int,
 
 
 def _rigid(rotation: FloatArray, translation: FloatArray) -> Any:
-    """Return a pycolmap.Rigid3d."""
     import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(rotation)), np.asarray(translation))

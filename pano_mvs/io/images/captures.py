@@ -243,7 +243,6 @@ def list_rig_pictures(
     """Return the captures in a folder and its subfolders, in natural order.
 
     Args:
-        lens_names: names of the two lenses.
         layout: "side_by_side": each file shows both lenses, the first on the left; "folders": one of the folders in
             the path of a file has the name of its lens, as in front/000.jpg; "suffixes": file names end with a
             separator and the name of the lens, as in 000_front.jpg. "auto": folders if a folder has the name of a lens,

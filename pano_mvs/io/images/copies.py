@@ -55,7 +55,6 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
 
     Args:
         paths: of the pictures, by name. Those that OpenCV does not read are compared with none.
-        max_pixels: limit of a picture.
         read: whether to read the pictures that no earlier command has read, which takes long; else they are not copies.
     """
     found = {name: _magnitudes(path, max_pixels, read=read) for name, path in paths.items()}

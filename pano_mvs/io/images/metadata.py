@@ -257,8 +257,6 @@ class GPano:
         full_size_hw: (height, width) of the whole sphere in pixels, or None.
         crop_ltwh: (left, top, width, height) of the part in the image, in the same pixels, or None.
         heading_deg: compass heading of the image centre, or None.
-        pitch_deg: pitch of the camera, or None.
-        roll_deg: roll of the camera, or None.
     """
 
     projection_type: str = "equirectangular"
@@ -386,7 +384,6 @@ def add_level_gpano(path: Path, size_hw: tuple[int, int], *, heading_deg: float 
 
     Args:
         path: the file, as OpenCV writes it.
-        size_hw: (height, width) of the picture.
         heading_deg: compass heading of its middle; None is not stated.
         level: whether to state that pitch and roll are 0.
     """

@@ -36,7 +36,6 @@ def write_preview(
     Weak ranges are pale and filled ones striped, with a legend; see `mark_unconfirmed`.
 
     Args:
-        path: the file to write.
         image: (H, W, 3) uint8 RGB.
         range_map: (h, w) float32 range in scene units, NaN where invalid (shown grey).
         mask: (H, W), False where the picture is to be ignored (shown grey), or None.

@@ -34,7 +34,6 @@ class VideoInfo:
 
     Attributes:
         size_hw: (height, width) of a frame as stored.
-        frames: number of frames.
         frames_per_s: average frame rate.
         is_turned: whether the header asks players to rotate the frames.
         stereo: how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
@@ -143,9 +142,7 @@ def frames_between(
     Iteration ends at a frame that cannot be decoded.
 
     Args:
-        path: the video.
         begin_s: the first time, from the start of the video.
-        end_s: the last time.
         min_step_s: minimum time between two frames; frames in between are left out. 0 yields all.
         threads: number of threads of the decoder, each of which may hold a frame in memory.
         stereo: how a frame shows both eyes, of which one is returned.

@@ -48,11 +48,8 @@ def decision_of(
     """Return the division that the options of `run` state, or without a size the one that `decide_blocks` finds.
 
     Args:
-        execution: how units are computed.
         size: maximum number of images of a block; 0 for no blocks; None to decide.
         overlap: images that consecutive blocks share; 0 for the default.
-        loop: whether the path ends where it began.
-        poses: rough poses.
 
     Raises:
         UsageError: if the options do not fit together.
@@ -75,9 +72,6 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
     The memory of this machine, or that of a job of a queueing system, is compared with what the units for the whole
     capture are expected to need. Blocks are as large as memory permits. Nothing is divided for workers of a dask
     scheduler, whose memory is not known.
-
-    Args:
-        execution: how units are computed.
 
     Raises:
         InputError: if the file with the settings of the jobs cannot be read.

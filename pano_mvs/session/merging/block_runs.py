@@ -64,7 +64,6 @@ def split_images(images: Path, to: Path, division: Division) -> list[ImageBlock]
     Args:
         images: the folder of the capture, in natural order.
         to: folder to write to; new or empty.
-        division: how to divide it.
 
     Raises:
         UsageError: if a setting or a folder cannot be used.
@@ -83,7 +82,6 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
 
     Args:
         images: the folder of the capture, in natural order.
-        division: how to divide it.
         ignored: files and folders in it that do not belong to the capture, such as masks.
 
     Raises:
@@ -159,7 +157,6 @@ class BlockRun:
         names: of its images, in the order of the capture.
         folder: of all blocks; the block's output folder is in it.
         number: of the block, from 1.
-        blocks: number of all blocks.
     """
 
     session: Session
@@ -244,8 +241,6 @@ def block_runs(
 
     Args:
         session: over the whole capture.
-        blocks: the images of each.
-        folder: of all blocks.
         within: folder in it in which the links and the results are.
 
     Raises:

@@ -39,7 +39,6 @@ class Block:
     """One block, with its largest group of cameras.
 
     Attributes:
-        run: its output.
         left_out: names of the cameras in other groups.
     """
 
@@ -149,9 +148,7 @@ class MergeFiles:
     """Writes a merged capture.
 
     Attributes:
-        out: the output folder.
         world_from_block: the similarity of each.
-        merged: the merged cameras.
         written: files that depend on the images and the stages of the blocks, relative to the folder.
     """
 

@@ -58,7 +58,6 @@ class MergeResult:
     """What a merge found and wrote.
 
     Attributes:
-        summary: what run.json holds.
         blocks: the blocks, as given.
         alignment: their similarities and their agreement.
         merged: the cameras, and to which block each belongs.
@@ -79,7 +78,6 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     are not connected, or disagree.
 
     Args:
-        outs: output folders of runs.
         to: folder to write to: new, empty, or the result of an earlier merge.
         cache: folder of the cache that all runs used; None for those that their run.json name.
 

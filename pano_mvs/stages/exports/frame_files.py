@@ -51,8 +51,6 @@ _MUCH = 0.01
 
 @params_from(panorama_faces)
 class _CutParams(Params):
-    """How panoramas are cut into faces."""
-
     variants: tuple[Variant, ...] = Field(
         default=("equirectangular", "faces"), min_length=1, description="whole panoramas, pinhole faces, or both"
     )
@@ -243,9 +241,7 @@ def write_transforms(
 
     Args:
         root: folder of the variants in the output folder.
-        group: poses and frames.
         cloud: of the group; None: the sparse points of its poses.
-        ctx: of the stage.
         file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
     """
     files: dict[str, Path] = {}
@@ -293,9 +289,7 @@ def write_photographs(
     Args:
         root: folder of the variants in the output folder.
         group: poses and frames of the panoramas in whose world the photographs are.
-        photographs: the photographs; their files are copied unchanged.
         seed: whether there are initial points.
-        ctx: of the stage.
         file_from_world: as in `write_transforms`.
     """
     faces = group.listed().get("faces", [])
