@@ -44,16 +44,17 @@ class PixelWanted:
 
 
 def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Path | None, as_json: bool) -> None:
-    """Print the analysis of a pixel.
-
-    Raises:
-        UsageError: if there is no such sweep, image or pixel.
-        InputError: if an input of the sweep is not computed yet.
-        StoreError: if the plot cannot be written.
-    """
+    """Print the analysis of a pixel."""
     found = _inspection(session, wanted)
     if plot is not None:
-        _write_plot(plot, found)
+        from pano_mvs.viewer.curves import write_curve_picture
+
+        if plot.suffix.lower() != ".png":
+            raise UsageError(f"--plot {plot}: the plot is a PNG image, so the file name must end in .png")
+        try:
+            write_curve_picture(plot, found)
+        except OSError as error:
+            raise StoreError(f"--plot {plot}: cannot be written ({error.strerror}). Choose another place") from error
     if as_json:
         print_json(as_json_value(found))
         return
@@ -138,17 +139,6 @@ def _truth_of(session: Session, image: str) -> Path | None:
         if isinstance(folder, Path) and is_file(folder / "poses.json"):
             return folder if read_truth(folder).match([image]) else None
     return None
-
-
-def _write_plot(path: Path, found: Inspection) -> None:
-    from pano_mvs.viewer.curves import write_curve_picture
-
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")
-    try:
-        write_curve_picture(path, found)
-    except OSError as error:
-        raise StoreError(f"--plot {path}: cannot be written ({error.strerror}). Choose another place") from error
 
 
 _BLOCKS = "▁█△"

@@ -31,11 +31,7 @@ _SHOWN_REASONS = 5
 
 
 def show_dry_run(session: Session, console: Console, *, execution: Execution, as_json: bool) -> None:
-    """Print the plan of a run, for its number of workers.
-
-    Raises:
-        UsageError: if the output folder cannot be used, or JSON is requested.
-    """
+    """Print the plan of a run, for its number of workers."""
     if as_json:
         raise UsageError("--dry-run prints a table, not events: leave out --json")
     check_output(session)
@@ -123,11 +119,7 @@ _SHOWN = 8
 
 
 def explain_unit(session: Session, label: str, console: Console) -> None:
-    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit.
-
-    Raises:
-        UsageError: if there is no such stage or unit.
-    """
+    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit."""
     stage, _, item = label.partition(":")
     workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
     store = Store(session.store_root, for_reading=True)
@@ -203,9 +195,6 @@ def show_status(
 
     Args:
         target: a workflow, or an output folder, whose run.json states workflow, settings, images and cache.
-
-    Raises:
-        InputError: if an output folder has no run.json, or its workflow is missing.
     """
     if is_folder(Path(target)):
         latest = _print_latest(Path(target), console)

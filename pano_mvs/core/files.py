@@ -43,7 +43,6 @@ def _umask() -> int:
 _UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
-_ABANDONED_AFTER_S = 7 * 24 * 3600.0
 
 
 def set_aside(path: Path) -> Path:
@@ -115,7 +114,7 @@ def _is_abandoned(path: Path) -> bool:
     match = _TEMPORARY.fullmatch(path.name)
     if match and match[1] == process_place() and os.name == "posix":
         return start_of(int(match[2])) is None  # also for a process that has ended but is not reaped yet
-    return is_older(path, _ABANDONED_AFTER_S)
+    return is_older(path, 7 * 24 * 3600.0)
 
 
 def is_older(path: Path, seconds: float) -> bool:

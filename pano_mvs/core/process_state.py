@@ -206,10 +206,8 @@ def _is_guarded(owner: ModuleType | type, name: str, value: object) -> bool:
 def _is_of_library(kind: type) -> bool:
     """Return whether a class belongs to a library whose classes stages use, and can be changed."""
     library = str(kind.__module__).partition(".")[0]
-    return library in _LIBRARIES and library != "numba" and not kind.__flags__ & _IMMUTABLE
-
-
-_IMMUTABLE = 1 << 8  # Py_TPFLAGS_IMMUTABLETYPE
+    immutable = 1 << 8  # Py_TPFLAGS_IMMUTABLETYPE
+    return library in _LIBRARIES and library != "numba" and not kind.__flags__ & immutable
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 
 DXF_REMEDY = "DXF files need the package ezdxf: pip install 'pano-mvs[dxf]'"
-_METRES, _UNITLESS = 6, 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +102,7 @@ def write_dxf(path: Path, plan: PlanDrawing) -> None:
     before = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True  # no dates and no random identifiers
     try:
-        document = new("R2010", units=_METRES if plan.is_metric else _UNITLESS)
+        document = new("R2010", units=6 if plan.is_metric else 0)  # metres, or none
         document.layers.add("WALLS", color=7)
         document.layers.add("CAMERAS", color=1)
         space = document.modelspace()

@@ -39,9 +39,7 @@ MeshArrays = tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]
 
 _FRAME_KEY = b"comment file_from_world "
 _FRAME_MEANING = "comment x_in_file = file_from_world x_in_world; poses and COLMAP models are in the world\n"
-_ROTATION_TOLERANCE = 1e-6
 _MARK = b"end_header"
-_MAX_HEADER_BYTES = 1 << 20
 # PLY's names of number types, old and new.
 _NUMBERS = {
     "char": "i1",
@@ -293,7 +291,7 @@ def open_ply_points(path: Path) -> PlyPoints:
     """
     try:
         with path.open("rb") as stream:
-            head, mark, rest = stream.read(_MAX_HEADER_BYTES).partition(_MARK)
+            head, mark, rest = stream.read(1 << 20).partition(_MARK)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     if not mark:
@@ -350,7 +348,7 @@ def _world_from_file(head: bytes, path: Path) -> FloatArray | None:
         rotation = np.array([float(word) for word in line[len(_FRAME_KEY) :].split()]).reshape(3, 3)
     except ValueError:
         rotation = np.zeros((3, 3))
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_ROTATION_TOLERANCE)
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6)
     if not (orthonormal and np.linalg.det(rotation) > 0):
         raise InputError(f"{path}: file_from_world in its header is not a rotation. Write the file again")
     return rotation.T

@@ -120,8 +120,6 @@ class SplatFrames(PanoramaFrames):
 CAMERA_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DISTORTED = "OPENCV"
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
-_OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
-_PNG_RGB_8_BIT = bytes([8, 2])
 
 
 def transforms_document(
@@ -179,7 +177,7 @@ def is_common_picture(path: Path) -> bool:
         start = stream.read(26)
         if start[:2] == JPEG_START:
             return _jpeg_channels(start + stream.read()) == 3
-    return start[:8] == PNG_START and start[24:26] == _PNG_RGB_8_BIT
+    return start[:8] == PNG_START and start[24:26] == bytes([8, 2])  # 8 bits, RGB
 
 
 def _jpeg_channels(data: bytes) -> int:
@@ -195,7 +193,7 @@ def _listed(
 ) -> dict[str, Any]:
     world_from_frame = frame.cam_from_world(cam_from_world).inverse()
     matrix = np.eye(4)
-    matrix[:3, :3] = world_from_frame.rotation @ _OPENGL_FROM_CAM
+    matrix[:3, :3] = world_from_frame.rotation @ np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera frame
     matrix[:3, 3] = world_from_frame.translation
     entry: dict[str, Any] = {"file_path": frame.image.replace("{name}", name)}
     if masked:
@@ -220,7 +218,6 @@ def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
 ROOT = "splat_bundle"
 """Folder of the bundle in the output folder."""
 
-MANIFEST_VERSION = 1
 
 _MANIFEST_DEPTHS = {"equirectangular": "range along the ray", "faces": "z-depth"}
 _CONVENTIONS = {
@@ -265,7 +262,7 @@ def manifest_document(
     """
     masked = {view.frame.variant for view in views if view.frame.mask}
     document = {
-        "schema": MANIFEST_VERSION,
+        "schema": 1,
         "program": "pano_mvs",
         "conventions": _CONVENTIONS,
         "layers": _layers(depth_unit),

@@ -43,15 +43,13 @@ from pano_mvs.scene.two_view import pair_name
 MAX_SUGGESTIONS = 12
 """Suggestions that the page shows."""
 
-_MAX_COMPARED = 60
-
 
 def advice(
     summary: RunSummary, values: StoredValues, earlier: EarlierPage, *, chosen: Sequence[str]
 ) -> tuple[Suggestion, ...]:
     """Return what to do next time, the most urgent first."""
     names = [view.name for view in summary.views]
-    return suggestions(summary, _coverage(values, earlier, names if len(names) <= _MAX_COMPARED else chosen))
+    return suggestions(summary, _coverage(values, earlier, names if len(names) <= 60 else chosen))
 
 
 def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) -> dict[str, ViewCoverage]:
@@ -65,8 +63,6 @@ def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) 
     return known
 
 
-_MAX_MEASURED = 100
-_MAX_SIZES = 4
 # Names of folders that do not say which capture it is: the name of the folder above comes first.
 _GENERIC = {
     "images",
@@ -108,7 +104,7 @@ class CaptureFacts:
 def capture_facts(summary: RunSummary, values: StoredValues, *, panoramas: int) -> CaptureFacts:
     """Return what is known of the capture of a run; `panoramas` is its number of images."""
     names = list(values.refs.get("images", {}))
-    known = [values.panorama(name) for name in names[:: -(-len(names) // _MAX_MEASURED) or 1]]
+    known = [values.panorama(name) for name in names[:: -(-len(names) // 100) or 1]]
     found = [panorama for panorama in known if panorama is not None]
     sizes = Counter(panorama.source_size_hw for panorama in found)
     working = Counter(panorama.size_hw for panorama in found).most_common(1)
@@ -117,7 +113,7 @@ def capture_facts(summary: RunSummary, values: StoredValues, *, panoramas: int) 
         capture_name(summary),
         date_in_words(summary.started),
         panoramas,
-        tuple(sizes.most_common(_MAX_SIZES)),
+        tuple(sizes.most_common(4)),
         len(found),
         working[0][0] if working and not same else None,
     )
@@ -154,9 +150,7 @@ def date_in_words(started: str) -> str:
 
 
 MAX_THUMBNAILS = 1000
-MAX_MEASURED = 1000
 MAX_BYTES = 6_000
-_THREADS = 2
 _VERSION = 2
 
 
@@ -165,7 +159,7 @@ def thumbnails(
 ) -> dict[str, Picture]:
     """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = evenly_spaced(views, MAX_THUMBNAILS)
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(2) as pool:
         found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept=kept), chosen)
         return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
 
@@ -173,7 +167,7 @@ def thumbnails(
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
     """Return the shares of the sphere of at most 1,000 evenly spaced views, by name; the sky does not count."""
     found: dict[str, Shares] = {}
-    for view in evenly_spaced(views, MAX_MEASURED):
+    for view in evenly_spaced(views, 1000):
         name = view.name
         key = key_of(results, name, "s", version=_VERSION)
         shares = shares_from_fact(kept.fact(key)) if key else None
@@ -195,9 +189,6 @@ def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept:
         return known
     panels = preview_panels(out_dir, view.preview, small=True)
     return picture(np.vstack(panels), width=160, most_bytes=MAX_BYTES, key=key) if panels else None
-
-
-MAX_ROWS = 5000
 
 
 @dataclass(frozen=True)
@@ -262,7 +253,7 @@ def panorama_rows(
     doubts = summary.doubtful_images
     order = [*poses.registered, *figures, *poses.rejected, *summary.rejected, *doubts]
     rows = []
-    for name in list(dict.fromkeys(order))[:MAX_ROWS]:
+    for name in list(dict.fromkeys(order))[:5000]:
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
         view = figures.get(name, ViewSummary())
         rows.append(
@@ -283,9 +274,6 @@ def panorama_rows(
             )
         )
     return tuple(rows)
-
-
-_MAX_REASONS = 300
 
 
 @dataclass(frozen=True)
@@ -402,7 +390,7 @@ def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tu
             link.first,
             link.second,
             link.candidates,
-            values.pair_reason(pair_name(link.first, link.second)) if idx < _MAX_REASONS else "",
+            values.pair_reason(pair_name(link.first, link.second)) if idx < 300 else "",
         )
         for idx, link in enumerate(rejected)
     )

@@ -22,8 +22,6 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-_ROWS = 256
-
 
 @dataclass(frozen=True)
 class Shares:
@@ -56,7 +54,7 @@ class Shares:
 
 def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Shares:
     """Return the shares of a view by the solid angle of its pixels; large maps are sampled."""
-    step = max(1, confidence.shape[0] // _ROWS)
+    step = max(1, confidence.shape[0] // 256)
     sampled = np.asarray(confidence[step // 2 :: step, step // 2 :: step])
     height, width = sampled.shape
     elevation_rad = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
@@ -80,7 +78,6 @@ def fact_of(shares: Shares) -> list[float]:
     return list(astuple(shares))
 
 
-_TICKS_APART = 0.09
 # Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
 UNCERTAINTY_LIMITS = 0.001, 0.2
 # A view has a scale of its own only if an end of it differs from the common scale by more than this factor.
@@ -136,7 +133,7 @@ def range_ticks(near: float, far: float) -> Ticks:
     found: list[tuple[float, float]] = []
     for value in scale_ticks(near, far):
         at = round(float(np.log(value / near) / np.log(far / near)), 4)
-        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= _TICKS_APART):
+        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= 0.09):
             found.append((at, value))
     return tuple(found)
 
@@ -170,7 +167,6 @@ WIDTH = 768
 MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}
 """Largest size of each image, before base64 encoding."""
 
-_DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
 
 
@@ -228,7 +224,7 @@ def view_cards(
             do not, because their units of length differ. None: one group.
     """
     group_of = groups or {}
-    with ThreadPoolExecutor(_DECODERS) as pool:
+    with ThreadPoolExecutor(2) as pool:  # a large panorama takes 100 MB while it is decoded
         own = dict(
             zip(
                 (view.name for view in views),

@@ -23,11 +23,8 @@ VERSION = 1
 """Raise it when the figures change: those of earlier pages are then computed again."""
 
 _POINTS_HW, _SURFACES_HW = (32, 64), (64, 128)
-_MAX_OTHERS = 8
 # A point is hidden from a camera if a surface is nearer by more than this share of its distance.
 _TOLERANCE = 0.1
-_MIN_AREA = 0.02
-_MAX_AREAS = 2
 
 
 @dataclass(frozen=True)
@@ -174,8 +171,8 @@ def _areas(alone: Mask, ranges: FloatArray, pose: Rigid3, *, weights: NDArray[np
     shares = np.bincount(labels.ravel(), weights.ravel(), minlength=1)
     shares[0] = 0
     found = []
-    for label in np.argsort(-shares)[:_MAX_AREAS]:
-        if shares[label] < _MIN_AREA:
+    for label in np.argsort(-shares)[:2]:
+        if shares[label] < 0.02:
             break
         inside = labels == label
         rays = ray_grid((alone.shape[0], alone.shape[1]))[inside]
@@ -204,7 +201,7 @@ def _labels(pixels: Mask) -> NDArray[np.int64]:
 def _nearest(group: Poses, idx: int, with_ranges: Sequence[int]) -> list[int]:
     others = [at for at in with_ranges if at != idx]
     distances = np.linalg.norm(group.centers[others] - group.centers[idx], axis=1)
-    return [others[at] for at in np.argsort(distances, kind="stable")[:_MAX_OTHERS]]
+    return [others[at] for at in np.argsort(distances, kind="stable")[:8]]
 
 
 def _cached(small: dict[str, _Small | None], values: StoredValues, idx: int, *, group: Poses) -> _Small | None:

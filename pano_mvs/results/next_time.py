@@ -20,8 +20,6 @@ from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import FAIR_CONSISTENT, compares_views
 
-_KNOWN_NEIGHBOURS = 6
-
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
@@ -79,7 +77,7 @@ class CameraGroup:
 def nearest_neighbours(centers: FloatArray) -> NDArray[np.intp]:
     """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
     count = len(centers)
-    found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
+    found = cKDTree(centers).query(centers, k=min(count, 7))
     distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
     near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
     own = near == np.arange(count)[:, None]
@@ -117,11 +115,8 @@ LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 
 _USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
 _GOOD_BASELINE = 0.05, 0.2
-_NEIGHBOURS = 4
 _WEAK = 0.5  # of the median share that other views confirm
-_MAX_ADDED = 20
 _MAX_UNREGISTERED = 4
-_MAX_AREAS = 3
 
 
 class _Severity(IntEnum):
@@ -289,7 +284,7 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"
             )
-            count = min(_MAX_ADDED, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
+            count = min(20, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
             _stand_between(group, found, (first, second), severity=_Severity.SPACING, reason=reason, count=count)
     for idx, name in enumerate(group.names):
         known = group.typical_range(idx)
@@ -312,7 +307,7 @@ def _too_close(group: CameraGroup, first: int, second: int) -> bool:
 def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
     known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
-    farthest = {idx: group.distance(idx, int(group.nearest(idx)[:_NEIGHBOURS][-1])) for idx in known}
+    farthest = {idx: group.distance(idx, int(group.nearest(idx)[:4][-1])) for idx in known}
     ratios = {idx: length / (group.typical_range(idx) or 1.0) for idx, length in farthest.items()}
     close = [idx for idx in known if ratios[idx] < SHORT_BASELINE]
     if not close:
@@ -380,7 +375,7 @@ def _lonely(group: CameraGroup, found: _Collected) -> None:
         for area in group.coverage[name].areas
     ]
     areas.sort(key=lambda pair: -pair[0].share)
-    for area, idx in areas[:_MAX_AREAS]:
+    for area, idx in areas[:3]:
         name, where = group.names[idx], direction_words(area)
         reason = (
             f"{share(area.share)} of the sphere around {name}, {where}, about {group.length(area.distance)} away, is "

@@ -11,10 +11,8 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 
-_MAX_OBSERVATIONS = 2_000_000
 _BLOCK = 250_000
 _BINS = 30
-_MAX_TICKS = 5
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class Histogram:
         largest = max(1, *self.counts)
         power = 10 ** (len(str(largest)) - 1)
         steps = [step for step in (power // 5, power // 2, power, 2 * power) if step] or [1]
-        step = next(step for step in (*steps, 5 * power) if -(-largest // step) <= _MAX_TICKS)
+        step = next(step for step in (*steps, 5 * power) if -(-largest // step) <= 5)
         return tuple(range(0, step * -(-largest // step) + 1, step))
 
 
@@ -82,7 +80,7 @@ def reprojection_residuals(poses: Poses) -> Residuals | None:
     total = len(poses.track_point_idx)
     if not total:
         return None
-    step = -(-total // _MAX_OBSERVATIONS)
+    step = -(-total // 2_000_000)
     image_idx = np.asarray(poses.track_image_idx[::step])
     residuals_deg = _residuals_deg(poses, step)
     overall = histogram(residuals_deg)

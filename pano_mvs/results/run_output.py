@@ -218,7 +218,6 @@ class RunView:
         return next((self._run.out / name for name in candidates if self._run.has_file(name)), None)
 
 
-_MAX_VIEWS = 6
 _WIDTH = 320
 _MAX_BYTES = 40_000
 _COLORS = {"good": "#1a7f37", "fair": "#9a6700", "bad": "#cf222e", "": "inherit"}
@@ -235,7 +234,7 @@ def run_html(run: RunOutput) -> str:
         f"<p>{title} {judgement} {escape(verdict.sentence)}</p>",
         f"<p>{tiles}</p>" if tiles else "",
         f"<ul>{findings}</ul>" if findings else "",
-        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), _MAX_VIEWS)),
+        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), 6)),
         _stages_html(run),
         f"<p>{escape(str(run.out))}</p>",
     ]

@@ -157,7 +157,6 @@ def mood_of(value: float, good: float, fair: float) -> str:
     return "good" if value <= good else "fair" if value <= fair else "bad"
 
 
-_FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
 _NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
@@ -305,7 +304,7 @@ def _graph(summary: RunSummary) -> Iterator[Finding]:
     if len(names) < 4 or not links:
         return
     count = Counter(name for link in links if link.inliers for name in link[:2])
-    loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
+    loose = [name for name in names if 0 < count[name] < 2]
     if not loose:
         return
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")

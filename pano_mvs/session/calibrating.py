@@ -23,7 +23,6 @@ ASSUMED_DISTANCE_M = 0.03
 
 _FIELDS_OF_VIEW_DEG = {"theta s": 202.0, "gear 360": 195.0}
 """Field of view of the image circles by parts of the camera's name in EXIF: start values."""
-_USUAL_FIELD_OF_VIEW_DEG = 195.0
 
 QUARTER_TURNS = {"top": 0, "right": 1, "bottom": 2, "left": -1}
 """Turn of the rig about the axis of the first lens by the side of its picture where the top of the scene is."""
@@ -63,7 +62,7 @@ def calibrate_camera(
     if field_of_view_deg is None:
         camera = camera_from_exif(read_container(captures[0].files[0].read_bytes()).exif).lower()
         known = (field for part, field in _FIELDS_OF_VIEW_DEG.items() if part in camera)
-        field_of_view_deg = next(known, _USUAL_FIELD_OF_VIEW_DEG)
+        field_of_view_deg = next(known, 195.0)
     try:
         found = calibrate_lenses(
             _loader(captures),

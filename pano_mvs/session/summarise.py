@@ -358,7 +358,6 @@ PLAUSIBLE_HEIGHT_M = 1.6
 """A usual height of a camera on a tripod or a stick."""
 
 _BLOCKS, _BLOCK_POINTS = 300, 1000
-_MIN_POINTS = 1000
 
 
 def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
@@ -370,7 +369,7 @@ def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
         poses: of one group.
         cloud: of the same group.
     """
-    if not poses.names or len(cloud) < _MIN_POINTS:
+    if not poses.names or len(cloud) < 1000:
         return None
     turn = z_up_from_world(world_up(poses))
     chosen = _sample(len(cloud))

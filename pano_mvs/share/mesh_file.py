@@ -16,8 +16,6 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 
-_TEXELS = 4  # along a side, of which a vertex of a coarser mesh shows the mean
-
 TEXTURED = "mesh_textured.glb"
 COLORED = "mesh.ply"
 
@@ -92,7 +90,8 @@ def coarser(mesh: SharedMesh, max_faces: int) -> SharedMesh | None:
         return None
     colors = mesh.colors_rgb
     if mesh.texture is not None and mesh.uv is not None:
-        height, width = (max(1, side // _TEXELS) for side in mesh.texture.shape[:2])
+        # A vertex of a coarser mesh shows the mean of some texels.
+        height, width = (max(1, side // 4) for side in mesh.texture.shape[:2])
         means = cv2.resize(mesh.texture, (width, height), interpolation=cv2.INTER_AREA)
         places = (mesh.uv * [width, -height] + [0, height]).astype(int)
         colors = np.asarray(means[places[:, 1].clip(0, height - 1), places[:, 0].clip(0, width - 1)], np.uint8)

@@ -50,7 +50,6 @@ _HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
     "outdoor": ((0.25, 0.8),),
     "none": (),
 }
-_CLOUDS = ((0.06, 0.8),)
 # Mean wavelength of the noise in cells.
 _WAVELENGTH = 7.0
 
@@ -93,14 +92,12 @@ def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: in
     clear: FloatArray = height * zenith + (1 - height) * horizon
     if not clouds:
         return clear
-    cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=_CLOUDS, seed=seed + 0x5C))[:, None]
+    cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=((0.06, 0.8),), seed=seed + 0x5C))[:, None]
     mixed: FloatArray = clear + clouds * cloud * (1 - clear)
     return mixed
 
 
 _CELLS = 64
-# Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
-_SHORTEST, _LONGEST = 4.0, 12.0
 
 
 def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int) -> FloatArray:
@@ -149,6 +146,7 @@ def _volume() -> FloatArray:
     white = np.random.default_rng(0x3D).normal(size=(_CELLS,) * 3)
     frequency = np.fft.fftfreq(_CELLS)
     radius = np.sqrt(np.sum(np.stack(np.meshgrid(frequency, frequency, frequency)) ** 2, axis=0))
-    band = (radius >= 1 / _LONGEST) & (radius <= 1 / _SHORTEST)
+    # Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
+    band = (radius >= 1 / 12) & (radius <= 1 / 4)
     filtered = np.fft.ifftn(np.fft.fftn(white) * band).real
     return np.asarray(filtered / filtered.std())

@@ -278,8 +278,6 @@ class Overlay:
 
 
 SMALL_WIDTH, LARGE_WIDTH = 512, 4096
-# Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
-_SKY, _GROUND = (150, 160, 175), (90, 95, 105)
 
 
 def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
@@ -295,8 +293,12 @@ def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
             picture = _panorama_in(path, preview=path == camera.preview)
         except InputError:
             continue
-        return _at_most(picture, width)
-    rows = np.linspace(_SKY, _GROUND, 64)[:, None]
+        if picture.shape[1] <= width:
+            return np.ascontiguousarray(picture)
+        size = width, max(1, round(picture.shape[0] * width / picture.shape[1]))
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    # Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
+    rows = np.linspace((150, 160, 175), (90, 95, 105), 64)[:, None]
     return np.ascontiguousarray(np.broadcast_to(rows, (64, 128, 3)).astype(np.uint8))
 
 
@@ -311,10 +313,3 @@ def _panorama_in(path: Path, *, preview: bool) -> NDArray[np.uint8]:
     sphere = np.zeros((*info.size_hw, 3), np.uint8)
     sphere[top : top + height, left : left + width] = picture
     return sphere
-
-
-def _at_most(picture: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    if picture.shape[1] <= width:
-        return np.ascontiguousarray(picture)
-    size = width, max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -23,7 +23,6 @@ from pano_mvs.scene.files import group_file
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
-_HEAD_BYTES = 1 << 14
 _NAMED_DOUBTS = 5
 
 
@@ -169,7 +168,7 @@ def has_faces(path: Path) -> bool:
     """Return whether a PLY file contains faces."""
     try:
         with path.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES)
+            head = stream.read(1 << 14)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     counted = re.search(rb"^element face ([0-9]{1,18})\s*$", head.partition(b"end_header")[0], re.MULTILINE)

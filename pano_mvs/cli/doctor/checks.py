@@ -48,7 +48,6 @@ KNOWN_VARIABLES = (
     *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER"),
     "PANO_MVS_WORKER",  # marks what a worker starts
 )
-_MIN_MEMORY_BYTES, _MIN_DISK_BYTES = 3_000_000_000, 5_000_000_000
 
 
 def machine_findings(environment: Mapping[str, str] = os.environ) -> Iterator[Finding]:
@@ -62,7 +61,7 @@ def machine_findings(environment: Mapping[str, str] = os.environ) -> Iterator[Fi
         if value.isdigit() and 0 < int(value) < threads:
             yield Finding("machine", name, "warning", f"limits threads to {value} of {threads}", f"unset {name}")
     free = free_memory_bytes()
-    if free and free < _MIN_MEMORY_BYTES:
+    if free and free < 3_000_000_000:
         remedy = "close other programs, or set a smaller images.max_width: a sweep of 2048 px takes up to 3 GB"
         yield Finding("machine", "memory", "warning", f"{size_text(free)} free", remedy)
     else:
@@ -117,7 +116,7 @@ def folder_finding(what: str, folder: Path, option: str) -> Finding:
         return finding("failed", detail, f"correct its permissions, or choose another folder with {option}")
     text = f"{folder}: {size_text(free)} free"
     remedy = f"free space, or choose another folder with {option}; a panorama of 2048 px takes about 60 MB in the cache"
-    return finding("ok", text) if free >= _MIN_DISK_BYTES else finding("warning", text, remedy)
+    return finding("ok", text) if free >= 5_000_000_000 else finding("warning", text, remedy)
 
 
 VersionOf: TypeAlias = Callable[[str], str | None]

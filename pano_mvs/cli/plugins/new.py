@@ -65,11 +65,7 @@ KINDS = {
 
 
 def rendered(kind: str, name: str) -> tuple[str, str]:
-    """Return the text of a new plugin and that of its test.
-
-    Raises:
-        UsageError: if there is no such kind, or the name cannot be that of a Python file.
-    """
+    """Return the text of a new plugin and that of its test."""
     if kind not in KINDS:
         raise UsageError(f"unknown kind of plugin {kind!r}; known kinds: {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
@@ -99,12 +95,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
 
 
 def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> None:
-    """Write a new plugin and its test into a folder, and print how to use it.
-
-    Raises:
-        UsageError: if a file with that name exists or cannot be written, or as for `rendered`.
-        StoreError: if the disk is full.
-    """
+    """Write a new plugin and its test into a folder, and print how to use it."""
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:

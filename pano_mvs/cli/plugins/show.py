@@ -53,9 +53,6 @@ def show_stage(name: str, console: Console, *, workflow: str | None = None, file
     Args:
         workflow: a workflow whose plugin files may define it.
         files: more plugin files that may define it.
-
-    Raises:
-        UsageError: if there is no such stage; with the traceback, if its plugin is broken.
     """
     registry, mistakes = _registry(workflow, files)
     spec = registry.stages.get(name)

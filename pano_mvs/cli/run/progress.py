@@ -24,10 +24,6 @@ from pano_mvs.engine.running.events import StageFinished, UnitFailed, Warned
 from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
-_COMPILING_S = 20.0
-"""Kernels are shown to be compiled for this long after one was: some take so long."""
-
-_SHOWN_LINES = 5
 _SHOWN_STAGES = 6
 _SHOWN_UNITS = 2
 _BAR_WIDTH = 20
@@ -141,7 +137,8 @@ class ProgressDisplay:
 
     def _compiling(self) -> str:
         """Return how many kernels have been compiled, while they are; else nothing."""
-        is_current = self._clock() - self._kernels_at < _COMPILING_S
+        # Kernels are shown to be compiled for this long after one was: some take so long.
+        is_current = self._clock() - self._kernels_at < 20.0
         return f"compiling kernels (once): {self._kernels} so far" if is_current else ""
 
     def _left_text(self, left: TimeLeft, shown: str, seconds: float) -> str:
@@ -157,7 +154,7 @@ class ProgressDisplay:
     def _print_failure(self, failure: UnitFailed) -> None:
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
         self.console.say(f"[red]failed[/] {escape(label)}")
-        for line in failure.said[-_SHOWN_LINES:]:
+        for line in failure.said[-5:]:
             self.console.say(f"  | {escape(line)}")
 
     def _print_stage(self, summary: StageFinished) -> None:

@@ -26,9 +26,7 @@ from pano_mvs.core.paths import children, is_file, is_link
 
 RECORD, ARRAY, JSON = "record", ".npy", ".json"
 _KINDS = (RECORD, ARRAY, JSON)
-_ALIGNMENT = 64  # of arrays in memory, and so of .npy headers
 _MAX_PACK_BYTES = 1 << 30  # collection rewrites a pack as a whole, and needs this much free space
-_CHUNK_BYTES = 1 << 20
 _ENTRY = np.dtype(
     [("high", ">u8"), ("low", ">u8"), ("offset", "<u8"), ("size", "<u8"), ("time", "<f8"), ("kind", "u1")]
 )
@@ -157,7 +155,7 @@ class Packs:
             with replacing(pack, temporary_in=self._temporary, durable=True) as temporary, temporary.open("wb") as out:
                 while following is not None and (not entries or out.tell() < _MAX_PACK_BYTES):
                     value, path = following
-                    out.write(bytes(-out.tell() % _ALIGNMENT))
+                    out.write(bytes(-out.tell() % 64))  # the alignment of arrays in memory, and so of .npy headers
                     offset = out.tell()
                     if _copied(value, path, out):
                         used_s = max(value.time_s, _mtime(value.pack) if path is None else 0.0)
@@ -291,7 +289,7 @@ def _copied(value: Packed, path: Path | None, out: IO[bytes]) -> bool:
 def _copy(stream: IO[bytes], value: Packed, write: Callable[[bytes], object]) -> int:
     stream.seek(value.offset)
     left = value.size_bytes
-    while left and (chunk := stream.read(min(left, _CHUNK_BYTES))):
+    while left and (chunk := stream.read(min(left, 1 << 20))):
         write(chunk)
         left -= len(chunk)
     return value.size_bytes - left

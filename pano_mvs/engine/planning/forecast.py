@@ -14,8 +14,6 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
 
-_ROUNDING = 1e-9
-
 
 @dataclass(frozen=True, slots=True)
 class StageForecast:
@@ -186,7 +184,7 @@ def makespan(
         total_s += step_s
         for stage, rate in rates.items():
             rest_s = left[stage] - rate * step_s
-            left[stage] = rest_s if rest_s > _ROUNDING * seconds[stage] else 0.0
+            left[stage] = rest_s if rest_s > 1e-9 * seconds[stage] else 0.0
 
 
 def _rates(

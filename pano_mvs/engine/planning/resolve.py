@@ -404,6 +404,7 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
     """Return the part of the identity that all units of a stage share."""
     plain, paths = key_fields(entry.params)
     code = stage_code(entry.spec, entry.params)
+    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
     return {
         "schema": KEY_SCHEMA,
         "stage": entry.spec.name,
@@ -411,10 +412,5 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
         "code": code.digest,
         "libraries": dict(code.libraries),
         "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
-        "kinds": _kind_versions(entry),
+        "kinds": {kind.kind_name(): kind.kind_version for kind in kinds},
     }
-
-
-def _kind_versions(entry: StageEntry) -> dict[str, int]:
-    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
-    return {kind.kind_name(): kind.kind_version for kind in kinds}

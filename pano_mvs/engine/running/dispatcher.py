@@ -23,9 +23,6 @@ from pano_mvs.engine.planning.units import PENDING, Unit
 from pano_mvs.scene import Record
 
 LOG_FOLDER = "logs"
-_SHOWN_LINES = 20
-_RETRIES_AFTER_DEATH = 2
-_MIN_COUNTED_BYTES = 300_000_000  # memory for reading inputs counts only above this; every worker has that much
 _INVALID_CHARACTERS = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
@@ -128,7 +125,7 @@ class Dispatcher:
             number, outcome = found
             running = self._running[number]
             # The system may kill a process through no fault of the unit.
-            retries = max(running.job.unit.entry.policy.retries, _RETRIES_AFTER_DEATH if outcome.died else 0)
+            retries = max(running.job.unit.entry.policy.retries, 2 if outcome.died else 0)
             if outcome.status == "failed" and running.attempts <= retries:
                 running.attempts += 1
                 self._executor.submit(running.job)
@@ -152,7 +149,8 @@ class Dispatcher:
         """Return the bytes that a unit needs; 0 if neither the workflow, the stage nor the inputs state it."""
         if self._latest[0] != unit.key:
             loading = 0 if unit.entry.policy.memory_bytes else self._loading_of(unit)
-            counted = loading if loading >= _MIN_COUNTED_BYTES else 0
+            # Every worker has as much as this for reading inputs.
+            counted = loading if loading >= 300_000_000 else 0
             self._latest = unit.key, memory_of(unit, self._store) + counted
         return self._latest[1]
 
@@ -172,7 +170,7 @@ class Dispatcher:
         """Move a unit's log into the output folder, where it replaces that of an earlier run."""
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
-        said = tail(job.log, _SHOWN_LINES)
+        said = tail(job.log, 20)
         if not is_inside(path.parent, self._logs.parent):
             return None, said  # a link, or the name of an item of a plugin, leads outside
         with suppress(OSError):  # the run does not fail because of a log

@@ -8,8 +8,6 @@ from typing import ClassVar, Literal
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-_MIN_UNITS_WITHOUT_SLOWEST = 4
-
 UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
@@ -80,7 +78,7 @@ class StageSummary:
     @property
     def typical_unit_s(self) -> float:
         """Mean time of its computed units; of four or more without the slowest, which may include compilation."""
-        if self.run >= _MIN_UNITS_WITHOUT_SLOWEST:
+        if self.run >= 4:
             return max(0.0, self.unit_seconds - self.slowest_s) / (self.run - 1)
         return self.unit_seconds / self.run if self.run else 0.0
 

@@ -28,8 +28,6 @@ from pano_mvs.engine.running.events import (
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-_MAX_SHOWN_CAUSES = 10
-
 
 @dataclass(slots=True)
 class _StageCount:
@@ -169,7 +167,7 @@ class RunStatistics:
         summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
         self._observer(summary.event())
         if entry.spec.list_items is not None and not state.items:
-            shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_MAX_SHOWN_CAUSES])
+            shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:10])
             listed = len(state.members)
             raise InputError(f"{entry.name}: none of the {listed} {plural(listed, 'item')} can be used{shown}")
         _check_thresholds(entry, summary)

@@ -15,7 +15,6 @@ from pano_mvs.engine.workflows.extends import FORMAT_VERSION
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 
-_WIDTH = 1000  # no line breaks inside values
 _FIRST_KEYS = ("use", "in")
 
 
@@ -31,7 +30,7 @@ def resolved_yaml(workflow: Workflow, graph: Graph) -> str:
     root["stages"] = {name: _entry(entry, graph) for name, entry in workflow.stages.items()}
     stream = StringIO()
     yaml = YAML()
-    yaml.width = _WIDTH
+    yaml.width = 1000  # no line breaks inside values
     yaml.indent(mapping=2, sequence=4, offset=2)
     yaml.Representer = _Representer
     yaml.dump(_commented(root), stream)

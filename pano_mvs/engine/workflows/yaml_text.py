@@ -17,7 +17,6 @@ from pano_mvs.core.file_names import is_printable
 MAX_DEPTH = 40
 MAX_VALUES = 100_000
 MAX_PROBLEMS = 100
-_MAX_DIGITS = 400
 _SHOWN_CHARACTERS = 40
 _CORE = "tag:yaml.org,2002:"
 _KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float", "merge", "value")}
@@ -239,7 +238,7 @@ class _Builder:
         return None
 
     def _number(self, node: ScalarNode, text: str, tag: str) -> int | float | None:
-        digits = text.replace("_", "") if len(text) <= _MAX_DIGITS else ""
+        digits = text.replace("_", "") if len(text) <= 400 else ""
         try:
             if tag == "int":
                 return int(digits, 0) if digits[:2] in ("0x", "0o") else int(digits)

@@ -19,8 +19,6 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.photographs import Photographs
 
 ModelForm = Literal["bin", "txt", "both"]
-# COLMAP's OPENCV_FISHEYE cannot project points at 90° from the axis or beyond.
-MAX_ANGLE_DEG = 89.0
 
 
 def write_colmap_model(
@@ -314,7 +312,8 @@ def _pixels(
     """Return which bearings a lens observes, and their pixels in its picture, (n, 2)."""
     lens = rig.lenses[lens_idx]
     rays = rig.points_in_lens(bearings, lens_idx)
-    kept = np.flatnonzero((labels == lens_idx) & (lens.angle_from_axis(rays) < np.radians(MAX_ANGLE_DEG)))
+    # COLMAP's OPENCV_FISHEYE cannot project points at 90° from the axis or beyond.
+    kept = np.flatnonzero((labels == lens_idx) & (lens.angle_from_axis(rays) < np.radians(89.0)))
     return kept, lens.pixel_from_ray(rays[kept]).reshape(-1, 2)
 
 

@@ -24,7 +24,6 @@ FACES = "frblud"
 NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top": "u", "down": "d", "bottom": "d"}
 """Faces of a cube by their names in files of others."""
 
-_MAX_BYTES = 8 << 20
 _MAX_LEVELS = 24  # of 512 px tiles, this is more than 10^9 px along an edge
 
 
@@ -67,7 +66,7 @@ def stated_scenes(file: Path) -> list[StatedScene]:
         ValueError: if it seems to be a configuration, but cannot be parsed.
     """
     suffix = file.suffix.lower()
-    if suffix not in {".js", ".json", ".xml", ".html", ".htm"} or file.stat().st_size > _MAX_BYTES:
+    if suffix not in {".js", ".json", ".xml", ".html", ".htm"} or file.stat().st_size > 8 << 20:
         return []
     data = file.read_bytes()
     try:

@@ -21,7 +21,6 @@ from pano_mvs.io.images.tour_configurations import FACES, NAMES, Grid, StatedSce
 
 Tiles: TypeAlias = dict[tuple[str, int, int], Path]
 
-_MAX_CONFIGURATIONS = 200
 _FACE = "|".join([*NAMES, *FACES])
 _SKYBOX = dict(zip("012345", "ufrbld", strict=True))
 # Scene, level, face, row and column in the path of a tile without its extension.
@@ -209,7 +208,7 @@ def _likely_configurations(capture: _Capture) -> list[Path]:
     """Return the files that may be configurations, those nearest to the folder first."""
     files = [path for path in capture.files if path.suffix.lower() in {".js", ".json", ".xml", ".html", ".htm"}]
     files.sort(key=lambda path: (len(path.parts), natural_key(path.relative_to(capture.folder).as_posix())))
-    return files[:_MAX_CONFIGURATIONS]
+    return files[:200]
 
 
 def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Tiles, Path | None]:

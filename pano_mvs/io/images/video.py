@@ -24,7 +24,6 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace 
 
 _UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
-_MAX_HEADER_BYTES = 64 << 20
 _SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
 
@@ -121,7 +120,7 @@ def _movie_header(path: Path) -> bytes:
             size, kind = int.from_bytes(head[:4], "big"), head[4:8]
             size = int.from_bytes(head[8:], "big") if size == 1 else size
             if kind == b"moov":
-                return head + file.read(min(size, _MAX_HEADER_BYTES))
+                return head + file.read(min(size, 64 << 20))
             if not 8 <= size <= length:  # it ends with the file, or is damaged
                 break
             file.seek(size - 16, os.SEEK_CUR)

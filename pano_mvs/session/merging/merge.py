@@ -261,7 +261,6 @@ def _links(blocks: Sequence[Block]) -> tuple[PairLink, ...]:
 # As shares of the distance between neighbouring cameras, and in degrees: medians over the common cameras of two blocks.
 DOUBTFUL_OFFSET, REFUSED_OFFSET = 0.05, 0.25
 DOUBTFUL_TURN_DEG, REFUSED_TURN_DEG = 0.5, 3.0
-_DOUBTFUL_CAMERA = 0.5  # of the distance between neighbouring cameras
 
 
 def require_connected(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
@@ -330,7 +329,7 @@ def camera_doubts(blocks: Sequence[Block], alignment: BlockAlignment) -> dict[st
     doubts: dict[str, str] = {}
     for link in alignment.links:
         for name, offset in zip(link.names, link.offsets.tolist(), strict=True):
-            if offset > _DOUBTFUL_CAMERA * link.spacing:
+            if offset > 0.5 * link.spacing:  # the distance between neighbouring cameras
                 doubts[name] = (
                     f"{blocks[link.first].name} and {blocks[link.second].name} place it "
                     f"{offset / link.spacing:.2g} times the distance between neighbouring cameras apart"

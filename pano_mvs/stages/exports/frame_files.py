@@ -46,7 +46,6 @@ from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
 
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_MUCH = 0.01
 
 
 @params_from(panorama_faces)
@@ -119,7 +118,7 @@ class FrameFiles:
                 self._add_face(face, picture, layers)
         share = self.beyond / self.depths if self.depths else 0.0
         self.ctx.metric("beyond_depth", share)
-        if share > _MUCH:
+        if share > 0.01:
             unit = self.params.depth_unit
             self.ctx.note(
                 f"some depths exceed the {65535 * unit:g} scene units that 16 bits hold in steps of {unit:g}, and are "
