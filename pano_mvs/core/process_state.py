@@ -57,15 +57,10 @@ _FENV_BYTES = 512  # more than any system's fenv_t
 
 @dataclass(frozen=True)
 class ProcessState:
-    """The state of this process at one moment.
+    """The state of this process at one moment."""
 
-    Attributes:
-        settings: the value of each setting, by its name in words.
-        libraries: what the loaded library modules hold.
-    """
-
-    settings: Mapping[str, Any]
-    libraries: _Libraries
+    settings: Mapping[str, Any]  # the value of each setting, by its name in words
+    libraries: _Libraries  # what the loaded library modules hold
 
     @staticmethod
     def now(*, compared: bool = False) -> ProcessState:
@@ -89,15 +84,10 @@ class ProcessState:
 
 @dataclass(frozen=True)
 class Changes:
-    """What was different from an earlier state.
+    """What was different from an earlier state."""
 
-    Attributes:
-        settings: names of settings, in words.
-        functions: functions, classes and methods that were replaced, such as `cv2.remap`.
-    """
-
-    settings: tuple[str, ...] = ()
-    functions: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()  # names of settings, in words
+    functions: tuple[str, ...] = ()  # functions, classes and methods that were replaced, such as `cv2.remap`
 
     def __bool__(self) -> bool:
         """Return whether anything was different."""
@@ -143,20 +133,13 @@ _PLUGINS = _Plugins()
 
 @dataclass(frozen=True)
 class _Holder:
-    """A module or a class of a library, and what it holds.
-
-    Attributes:
-        values: all its values, in their order.
-        guarded: those of its values by name that may not be replaced.
-        codes: its functions that are written in Python, with their code.
-        classes: the classes of libraries among the values of a module.
-    """
+    """A module or a class of a library, and what it holds."""
 
     owner: ModuleType | type
-    values: list[object]
-    guarded: Mapping[str, object]
-    codes: Mapping[FunctionType, CodeType]
-    classes: list[type]
+    values: list[object]  # all its values, in their order
+    guarded: Mapping[str, object]  # those of its values by name that may not be replaced
+    codes: Mapping[FunctionType, CodeType]  # its functions that are written in Python, with their code
+    classes: list[type]  # the classes of libraries among the values of a module
 
     @staticmethod
     def of(owner: ModuleType | type) -> _Holder:
@@ -212,22 +195,14 @@ def _is_of_library(kind: type) -> bool:
 
 @dataclass(frozen=True)
 class _Libraries:
-    """What the loaded library modules and their classes hold: some 60,000 objects, compared in a few passes.
+    """What the loaded library modules and their classes hold: some 60,000 objects, compared in a few passes."""
 
-    Attributes:
-        modules: the modules by name.
-        views: the values of each, as they are at any time.
-        values: the values of all, in this order, when this was recorded.
-        functions: the functions that are written in Python.
-        codes: the code of each of those.
-    """
-
-    modules: Mapping[str, ModuleType]
+    modules: Mapping[str, ModuleType]  # the modules by name
     holders: list[_Holder]
-    views: Sequence[ValuesView[object]]
-    values: list[object]
-    functions: list[FunctionType]
-    codes: list[CodeType]
+    views: Sequence[ValuesView[object]]  # the values of each, as they are at any time
+    values: list[object]  # the values of all, in this order, when this was recorded
+    functions: list[FunctionType]  # the functions that are written in Python
+    codes: list[CodeType]  # the code of each of those
 
     @staticmethod
     def now(*, compared: bool) -> _Libraries:

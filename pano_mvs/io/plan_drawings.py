@@ -16,24 +16,15 @@ DXF_REMEDY = "DXF files need the package ezdxf: pip install 'pano-mvs[dxf]'"
 
 @dataclass(frozen=True, eq=False)
 class PlanDrawing:
-    """A plan of one storey, in its own coordinates: x right, y up.
-
-    Attributes:
-        walls: (N, 2, 2) ends of the wall lines.
-        cameras: name to (x, y).
-        box: ((left, bottom), (right, top)).
-        bar: length of the scale bar.
-        unit: of lengths, for display.
-        is_metric: whether it is the metre.
-    """
+    """A plan of one storey, in its own coordinates: x right, y up."""
 
     title: str
-    walls: FloatArray
-    cameras: Mapping[str, tuple[float, float]]
-    box: tuple[tuple[float, float], tuple[float, float]]
-    bar: float
-    unit: str
-    is_metric: bool
+    walls: FloatArray  # (N, 2, 2) ends of the wall lines
+    cameras: Mapping[str, tuple[float, float]]  # name to (x, y)
+    box: tuple[tuple[float, float], tuple[float, float]]  # ((left, bottom), (right, top))
+    bar: float  # length of the scale bar
+    unit: str  # of lengths, for display
+    is_metric: bool  # whether it is the metre
 
 
 def world_file_text(pixel: float, left: float, top: float) -> str:

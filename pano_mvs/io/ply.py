@@ -207,17 +207,14 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlyPoints:
-    """The vertices of a PLY file, which need not fit in memory.
-
-    Attributes:
-        vertices: (N,) with a field for each property, memory-mapped if the file is binary; as in the file.
-        world_from_file: rotation (3, 3) into the world of the run that wrote the file; None if the header states none.
-    """
+    """The vertices of a PLY file, which need not fit in memory."""
 
     path: Path
     count: int
     has_normals: bool
+    # (N,) with a field for each property, memory-mapped if the file is binary; as in the file
     vertices: NDArray[np.void]
+    # rotation (3, 3) into the world of the run that wrote the file; None if the header states none
     world_from_file: FloatArray | None = None
 
     def in_world(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -21,31 +21,19 @@ Variant = Literal["equirectangular", "faces"]
 
 @dataclass(frozen=True, slots=True)
 class NerfstudioFrame:
-    """One frame without its pose.
+    """One frame without its pose."""
 
-    Attributes:
-        variant: the transforms.json to which it belongs.
-        image: path of the image relative to that file; `{name}` stands for the panorama's name.
-        mask: path of the mask; empty if nothing is masked.
-        depth: path of the depth; empty without one.
-        size_wh: (width, height) in pixels.
-        focal_xy: fl_x, fl_y in pixels; the principal point is the image centre.
-        frame_from_cam: rotation from the panorama's camera frame (y down, z forward), as three rows.
-        normal: path of the normals; empty without any.
-        confidence: path of the confidence; empty without one.
-        radial: coefficient k1 of the lens's distortion; only photographs have one.
-    """
-
-    variant: Variant
-    image: str
-    mask: str
-    depth: str
-    size_wh: tuple[int, int]
-    focal_xy: tuple[float, float]
+    variant: Variant  # the transforms.json to which it belongs
+    image: str  # path of the image relative to that file; `{name}` stands for the panorama's name
+    mask: str  # path of the mask; empty if nothing is masked
+    depth: str  # path of the depth; empty without one
+    size_wh: tuple[int, int]  # (width, height) in pixels
+    focal_xy: tuple[float, float]  # fl_x, fl_y in pixels; the principal point is the image centre
+    # rotation from the panorama's camera frame (y down, z forward), as three rows
     frame_from_cam: tuple[tuple[float, ...], ...]
-    normal: str = ""
-    confidence: str = ""
-    radial: float = 0.0
+    normal: str = ""  # path of the normals; empty without any
+    confidence: str = ""  # path of the confidence; empty without one
+    radial: float = 0.0  # coefficient k1 of the lens's distortion; only photographs have one
 
     def to_json(self) -> dict[str, Any]:
         """Return the frame as a JSON object, without the paths of layers that nerfstudio does not read if empty."""
@@ -66,19 +54,14 @@ class NerfstudioFrame:
 
 @dataclass(frozen=True, eq=False)
 class PanoramaFrames(Files):
-    """The frames of one panorama, with their files.
-
-    Attributes:
-        pictures: target to source file of images that are exported unchanged.
-        frames: the entries of transforms.json without poses.
-        depth_unit: scene units of one step of the depths.
-    """
+    """The frames of one panorama, with their files."""
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
+    # target to source file of images that are exported unchanged
     pictures: Mapping[str, FilePart] = field(default_factory=dict)
-    frames: tuple[NerfstudioFrame, ...] = ()
-    depth_unit: float = 0.001
+    frames: tuple[NerfstudioFrame, ...] = ()  # the entries of transforms.json without poses
+    depth_unit: float = 0.001  # scene units of one step of the depths
 
     def to_parts(self) -> Parts:
         """Return the files under numbers, their targets and the frames as JSON."""

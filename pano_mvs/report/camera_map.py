@@ -26,12 +26,9 @@ _MAX_PAIR_SHARE = 0.25
 
 @dataclass(frozen=True)
 class WalkPath:
-    """A walk.
+    """A walk."""
 
-    Attributes:
-        stretches: positions of the cameras in order; a new stretch begins where consecutive cameras are not matched.
-    """
-
+    # positions of the cameras in order; a new stretch begins where consecutive cameras are not matched
     stretches: tuple[tuple[int, ...], ...]
 
     @staticmethod
@@ -75,54 +72,37 @@ _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
 
 @dataclass(frozen=True)
 class Link:
-    """One matched pair, drawn.
+    """One matched pair, drawn."""
 
-    Attributes:
-        ends: x1, y1, x2, y2.
-        strength: from 0 to 1, by its inliers.
-        text: the tooltip.
-        rejected: whether no common geometry was found.
-        closure: whether it closes a loop of a walk.
-    """
-
-    ends: tuple[float, float, float, float]
-    strength: float
-    text: str
-    rejected: bool
-    closure: bool = False
+    ends: tuple[float, float, float, float]  # x1, y1, x2, y2
+    strength: float  # from 0 to 1, by its inliers
+    text: str  # the tooltip
+    rejected: bool  # whether no common geometry was found
+    closure: bool = False  # whether it closes a loop of a walk
 
 
 @dataclass(frozen=True)
 class CameraMap:
-    """One drawing, in the units of an SVG view box.
+    """One drawing, in the units of an SVG view box."""
 
-    Attributes:
-        title: the caption, which names the direction of view.
-        text: description for screen readers.
-        links: in drawing order: rejected links, then weak ones, then strong ones.
-        cameras: (x, y, name, position of the label or None).
-        doubtful: (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others.
-        dots: an SVG path of the cameras if there are too many to name.
-        bar: (x, y, length, text) of the scale bar.
-        north: whether north is upwards.
-        judged: the probability that the pose of each of `cameras` is right, None where unknown; empty if all are.
-        marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
-        path: an SVG path along the cameras of a walk in their order; empty if they were not taken along one.
-        ends: (x, y) of the first and the last camera of a walk whose cameras have no labels.
-    """
-
-    title: str
-    text: str
+    title: str  # the caption, which names the direction of view
+    text: str  # description for screen readers
     size_wh: tuple[int, int]
-    links: tuple[Link, ...]
+    links: tuple[Link, ...]  # in drawing order: rejected links, then weak ones, then strong ones
+    # (x, y, name, position of the label or None)
     cameras: tuple[tuple[float, float, str, tuple[float, float] | None], ...]
-    dots: str
-    bar: tuple[float, float, float, str]
-    north: bool = False
+    dots: str  # an SVG path of the cameras if there are too many to name
+    bar: tuple[float, float, float, str]  # (x, y, length, text) of the scale bar
+    north: bool = False  # whether north is upwards
+    # (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others
     doubtful: tuple[tuple[float, float, str, str], ...] = ()
+    # the probability that the pose of each of `cameras` is right, None where unknown; empty if all are
     judged: tuple[float | None, ...] = ()
+    # (x, y, number) of places to stand, numbered as in the list of suggestions; only from above
     marks: tuple[tuple[float, float, int], ...] = ()
+    # an SVG path along the cameras of a walk in their order; empty if they were not taken along one
     path: str = ""
+    # (x, y) of the first and the last camera of a walk whose cameras have no labels
     ends: tuple[tuple[float, float], ...] = ()
 
     @property

@@ -26,18 +26,13 @@ POINT_BYTES = 12
 
 @dataclass(frozen=True)
 class TurnableCloud:
-    """What the page's viewer draws.
+    """What the page's viewer draws."""
 
-    Attributes:
-        key: of the encoded points among the facts of the page; see `encoded`.
-        total: number of points of the cloud.
-        cameras: (x, y, z, doubtful, name) in the frame of the viewer; names of at most 200 evenly spaced cameras, the
-            others are "".
-    """
-
-    key: str
+    key: str  # of the encoded points among the facts of the page; see `encoded`
     points: int
-    total: int
+    total: int  # number of points of the cloud
+    # (x, y, z, doubtful, name) in the frame of the viewer; names of at most 200 evenly spaced cameras, the others are
+    # ""
     cameras: tuple[tuple[float, float, float, bool, str], ...]
 
 

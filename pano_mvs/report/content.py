@@ -83,21 +83,15 @@ _MONTHS = "Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", 
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """The capture of a run.
+    """The capture of a run."""
 
-    Attributes:
-        name: of the folder with the images, or else of the workflow.
-        date: when the run began, in words; "" if unknown.
-        sizes: ((height, width) of the full sphere in the file, number of images), the most frequent size first.
-        measured: number of images whose size was looked up: at most 100, evenly spaced.
-        working_hw: (height, width) at which most images are processed; None if that is the size of the files.
-    """
-
-    name: str
-    date: str
+    name: str  # of the folder with the images, or else of the workflow
+    date: str  # when the run began, in words; "" if unknown
     panoramas: int
+    # ((height, width) of the full sphere in the file, number of images), the most frequent size first
     sizes: tuple[tuple[tuple[int, int], int], ...] = ()
-    measured: int = 0
+    measured: int = 0  # number of images whose size was looked up: at most 100, evenly spaced
+    # (height, width) at which most images are processed; None if that is the size of the files
     working_hw: tuple[int, int] | None = None
 
 
@@ -193,36 +187,21 @@ def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept:
 
 @dataclass(frozen=True)
 class Row:
-    """One panorama.
-
-    Attributes:
-        registered: whether it has a pose; None if no stage computed poses.
-        reason: why it was left out, or "".
-        doubtful: why its pose is doubtful, or "".
-        p_right: the probability that its pose is right, or None.
-        shares: of the sphere around it, if measured.
-        completeness: share of pixels with a range, as its stage reported it, or None.
-        consistent: share of pixels on which other views agree, likewise.
-        links: number of images with which it has a common geometry.
-        residual_deg: median reprojection residual, or None.
-        p95_deg: 95 % of its residuals are smaller, or None.
-        thumbnail: its preview, or None.
-        group: number of its group; None if there is only one group.
-    """
+    """One panorama."""
 
     name: str
-    registered: bool | None
-    reason: str
-    doubtful: str
-    p_right: float | None
-    shares: Shares | None
-    completeness: float | None
-    consistent: float | None
-    links: int
-    residual_deg: float | None
-    p95_deg: float | None
-    thumbnail: Picture | None
-    group: int | None = None
+    registered: bool | None  # whether it has a pose; None if no stage computed poses
+    reason: str  # why it was left out, or ""
+    doubtful: str  # why its pose is doubtful, or ""
+    p_right: float | None  # the probability that its pose is right, or None
+    shares: Shares | None  # of the sphere around it, if measured
+    completeness: float | None  # share of pixels with a range, as its stage reported it, or None
+    consistent: float | None  # share of pixels on which other views agree, likewise
+    links: int  # number of images with which it has a common geometry
+    residual_deg: float | None  # median reprojection residual, or None
+    p95_deg: float | None  # 95 % of its residuals are smaller, or None
+    thumbnail: Picture | None  # its preview, or None
+    group: int | None = None  # number of its group; None if there is only one group
 
     @property
     def doubt(self) -> float:
@@ -278,55 +257,32 @@ def panorama_rows(
 
 @dataclass(frozen=True)
 class Content:
-    """The content of the page.
+    """The content of the page."""
 
-    Attributes:
-        capture: what the report is about.
-        verdict: the head of the page.
-        advice: what to do next time, the most urgent first.
-        groups: the poses of each group of cameras, the largest first.
-        maps: the cameras of each group, from above and from the side.
-        metric: images whose ranges are in metres.
-        rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
-        pairs: number of compared pairs.
-        cloud: pictures of the cloud.
-        turnable: the cloud for the viewer in the page; None if there is none.
-        cards: views shown in full.
-        masked: what is masked in the panoramas.
-        rows: one for each panorama.
-        mean_shares: of the sphere, over all measured views.
-        measured_views: number of these.
-        residuals: of the points.
-        pair_residuals: medians of the pairs' residuals.
-        scores: (stage, tables) of each branch with scores.
-        comparison: the medians of several branches side by side.
-        notes: what could not be shown.
-        facts: figures that the next page may reuse.
-    """
-
-    capture: CaptureFacts
-    verdict: Verdict
-    advice: tuple[Suggestion, ...]
-    groups: tuple[PosesSummary, ...]
-    maps: tuple[tuple[CameraMap, ...], ...]
-    metric: frozenset[str]
+    capture: CaptureFacts  # what the report is about
+    verdict: Verdict  # the head of the page
+    advice: tuple[Suggestion, ...]  # what to do next time, the most urgent first
+    groups: tuple[PosesSummary, ...]  # the poses of each group of cameras, the largest first
+    maps: tuple[tuple[CameraMap, ...], ...]  # the cameras of each group, from above and from the side
+    metric: frozenset[str]  # images whose ranges are in metres
+    # (first, second, candidates or None, reason) of pairs without a common geometry
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
-    pairs: int
-    cloud: CloudPictures
-    turnable: TurnableCloud | None
-    cards: tuple[ViewCard, ...]
+    pairs: int  # number of compared pairs
+    cloud: CloudPictures  # pictures of the cloud
+    turnable: TurnableCloud | None  # the cloud for the viewer in the page; None if there is none
+    cards: tuple[ViewCard, ...]  # views shown in full
     total_views: int
-    masked: MaskedAreas
-    rows: tuple[Row, ...]
+    masked: MaskedAreas  # what is masked in the panoramas
+    rows: tuple[Row, ...]  # one for each panorama
     total_rows: int
-    mean_shares: Shares | None
-    measured_views: int
-    residuals: Residuals | None
-    pair_residuals: Histogram | None
-    scores: tuple[tuple[str, Mapping[str, Any]], ...]
-    comparison: Mapping[str, Any]
-    notes: tuple[str, ...]
-    facts: Mapping[str, Any]
+    mean_shares: Shares | None  # of the sphere, over all measured views
+    measured_views: int  # number of these
+    residuals: Residuals | None  # of the points
+    pair_residuals: Histogram | None  # medians of the pairs' residuals
+    scores: tuple[tuple[str, Mapping[str, Any]], ...]  # (stage, tables) of each branch with scores
+    comparison: Mapping[str, Any]  # the medians of several branches side by side
+    notes: tuple[str, ...]  # what could not be shown
+    facts: Mapping[str, Any]  # figures that the next page may reuse
 
 
 def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:

@@ -59,17 +59,12 @@ class MaskedCount:
 
 @dataclass(frozen=True)
 class MaskedAreas:
-    """What is masked in a capture.
+    """What is masked in a capture."""
 
-    Attributes:
-        counts: one for each reason that occurs.
-        examined: number of panoramas that were examined, at most 100, evenly spaced.
-        pictures: (image, reason to share of the sphere, picture), at most twelve, with at least one for each reason.
-    """
-
-    counts: tuple[MaskedCount, ...] = ()
-    examined: int = 0
+    counts: tuple[MaskedCount, ...] = ()  # one for each reason that occurs
+    examined: int = 0  # number of panoramas that were examined, at most 100, evenly spaced
     total: int = 0
+    # (image, reason to share of the sphere, picture), at most twelve, with at least one for each reason
     pictures: tuple[tuple[str, Mapping[str, float], Picture], ...] = ()
 
 

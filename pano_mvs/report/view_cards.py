@@ -25,21 +25,13 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, W
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of the sphere, which sum to 1.
+    """Shares of the sphere, which sum to 1."""
 
-    Attributes:
-        consistent: other views agree (confidence 128–255).
-        weak: seen, but not confirmed (64–127).
-        filled: interpolated, not seen (1–63).
-        invalid: no range.
-        masked: excluded by a mask, or sky.
-    """
-
-    consistent: float
-    weak: float
-    filled: float
-    invalid: float
-    masked: float
+    consistent: float  # other views agree (confidence 128–255)
+    weak: float  # seen, but not confirmed (64–127)
+    filled: float  # interpolated, not seen (1–63)
+    invalid: float  # no range
+    masked: float  # excluded by a mask, or sky
 
     @property
     def complete(self) -> float:
@@ -97,15 +89,10 @@ Limits = tuple[float, float]
 
 @dataclass(frozen=True)
 class RangeScales:
-    """The nearest and the farthest range of the colour scales of a view.
+    """The nearest and the farthest range of the colour scales of a view."""
 
-    Attributes:
-        common: of all views of its group.
-        own: of this view; None if it has no ranges.
-    """
-
-    common: Limits
-    own: Limits | None
+    common: Limits  # of all views of its group
+    own: Limits | None  # of this view; None if it has no ranges
 
     @property
     def differ(self) -> bool:
@@ -172,22 +159,17 @@ _PARTS = ("panorama", "range", "confidence")
 
 @dataclass(frozen=True)
 class ViewCard:
-    """One view as the page shows it in full.
-
-    Attributes:
-        pictures: the available images among `panorama`, `range`, `confidence` and `uncertainty`.
-        shares: of the sphere, or None.
-        ticks: (position on the colour scale from 0 to 1, range); the scale is common to all views of a group.
-        own_range: the range on a scale of this view alone; None if that would look the same.
-        own_ticks: of that scale.
-    """
+    """One view as the page shows it in full."""
 
     name: str
+    # the available images among `panorama`, `range`, `confidence` and `uncertainty`
     pictures: Mapping[str, Picture]
-    shares: Shares | None
+    shares: Shares | None  # of the sphere, or None
+    # (position on the colour scale from 0 to 1, range); the scale is common to all views of a group
     ticks: Ticks
+    # the range on a scale of this view alone; None if that would look the same
     own_range: Picture | None = None
-    own_ticks: Ticks = ()
+    own_ticks: Ticks = ()  # of that scale
 
     @property
     def has_uncertainty(self) -> bool:

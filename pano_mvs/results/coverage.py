@@ -29,35 +29,22 @@ _TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class LonelyArea:
-    """An area that only one camera sees.
+    """An area that only one camera sees."""
 
-    Attributes:
-        azimuth_deg: of its middle, in the image: 0 is the centre, positive to the right.
-        elevation_deg: of its middle, positive above the horizon.
-        share: of the sphere around the camera.
-        distance: median range, in the unit of the camera's world.
-        at: its middle in the world.
-    """
-
-    azimuth_deg: float
-    elevation_deg: float
-    share: float
-    distance: float
-    at: Direction
+    azimuth_deg: float  # of its middle, in the image: 0 is the centre, positive to the right
+    elevation_deg: float  # of its middle, positive above the horizon
+    share: float  # of the sphere around the camera
+    distance: float  # median range, in the unit of the camera's world
+    at: Direction  # its middle in the world
 
 
 @dataclass(frozen=True)
 class ViewCoverage:
-    """What one camera sees.
+    """What one camera sees."""
 
-    Attributes:
-        typical_range: median range by solid angle, in the unit of the camera's world.
-        alone: share of the sphere that no other camera sees.
-        areas: the largest connected parts of that, at most two, each at least 2 % of the sphere.
-    """
-
-    typical_range: float
-    alone: float
+    typical_range: float  # median range by solid angle, in the unit of the camera's world
+    alone: float  # share of the sphere that no other camera sees
+    # the largest connected parts of that, at most two, each at least 2 % of the sphere
     areas: tuple[LonelyArea, ...] = ()
 
 

@@ -23,20 +23,13 @@ from pano_mvs.results.verdict import FAIR_CONSISTENT, compares_views
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
-    """The cameras of a group, with what is known of their surroundings.
-
-    Attributes:
-        poses: of the group; the centres of all cameras are known.
-        centers: (N, 3), N > 1.
-        neighbours: (N, K) up to six nearest other cameras, nearest first.
-        coverage: what the views see, as far as known.
-    """
+    """The cameras of a group, with what is known of their surroundings."""
 
     number: int
-    poses: PosesSummary
-    centers: FloatArray
-    neighbours: NDArray[np.intp]
-    coverage: Mapping[str, ViewCoverage]
+    poses: PosesSummary  # of the group; the centres of all cameras are known
+    centers: FloatArray  # (N, 3), N > 1
+    neighbours: NDArray[np.intp]  # (N, K) up to six nearest other cameras, nearest first
+    coverage: Mapping[str, ViewCoverage]  # what the views see, as far as known
 
     @staticmethod
     def of(number: int, poses: PosesSummary, coverage: Mapping[str, ViewCoverage]) -> CameraGroup | None:
@@ -125,19 +118,12 @@ class _Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Something to do when the place is captured again.
+    """Something to do when the place is captured again."""
 
-    Attributes:
-        action: what to do, in a sentence that names images.
-        reasons: why, with figures.
-        group: number of the group in whose world `at` is.
-        at: where to stand; None if no place is known.
-    """
-
-    action: str
-    reasons: tuple[str, ...]
-    group: int = 0
-    at: Direction | None = None
+    action: str  # what to do, in a sentence that names images
+    reasons: tuple[str, ...]  # why, with figures
+    group: int = 0  # number of the group in whose world `at` is
+    at: Direction | None = None  # where to stand; None if no place is known
 
 
 @dataclass

@@ -21,16 +21,11 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of the page.
+    """One picture of the page."""
 
-    Attributes:
-        uri: `data:image/jpeg;base64,…`.
-        key: by which a later page can reuse it; "" if it cannot.
-    """
-
-    uri: str
+    uri: str  # `data:image/jpeg;base64,…`
     size_hw: tuple[int, int]
-    key: str = ""
+    key: str = ""  # by which a later page can reuse it; "" if it cannot
 
 
 def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str = "") -> Picture:

@@ -17,17 +17,12 @@ _BINS = 30
 
 @dataclass(frozen=True)
 class Histogram:
-    """Counts over bins of equal width, the last of which includes all larger values.
-
-    Attributes:
-        upper_deg: nominal end of the last bin.
-        p95_deg: 95 % are smaller.
-    """
+    """Counts over bins of equal width, the last of which includes all larger values."""
 
     counts: tuple[int, ...]
-    upper_deg: float
+    upper_deg: float  # nominal end of the last bin
     median_deg: float
-    p95_deg: float
+    p95_deg: float  # 95 % are smaller
     total: int
 
     @property
@@ -47,17 +42,12 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Reprojection residuals of the points.
+    """Reprojection residuals of the points."""
 
-    Attributes:
-        overall: of all observations.
-        views: image name to (median, 95 % quantile) in degrees and the number of observations.
-        sampled: whether only evenly spaced observations were used.
-    """
-
-    overall: Histogram
+    overall: Histogram  # of all observations
+    # image name to (median, 95 % quantile) in degrees and the number of observations
     views: Mapping[str, tuple[float, float, int]]
-    sampled: bool
+    sampled: bool  # whether only evenly spaced observations were used
 
 
 def histogram(values_deg: Sequence[float] | FloatArray) -> Histogram | None:

@@ -33,16 +33,12 @@ _Kind = TypeVar("_Kind", bound=Record)
 
 @dataclass(frozen=True)
 class StoredValues:
-    """The values of one run.
+    """The values of one run."""
 
-    Attributes:
-        store: the cache; None if it is unknown or was deleted.
-        refs: role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
-        notes: values that could not be read, with the reason; grows as values are loaded.
-    """
-
-    store: Store | None = None
+    store: Store | None = None  # the cache; None if it is unknown or was deleted
+    # role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
     refs: Mapping[str, Mapping[str, ItemRef]] = field(default_factory=dict)
+    # values that could not be read, with the reason; grows as values are loaded
     notes: list[str] = field(default_factory=list)
 
     @staticmethod

@@ -48,19 +48,12 @@ _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.304
 
 @dataclass(frozen=True)
 class Measurement:
-    """A known length.
+    """A known length."""
 
-    Attributes:
-        length: in the units of the run.
-        metres: the same in metres.
-        group: number of the group of poses in which it was measured.
-        origin: what was measured.
-    """
-
-    length: float
-    metres: float
-    group: int
-    origin: str
+    length: float  # in the units of the run
+    metres: float  # the same in metres
+    group: int  # number of the group of poses in which it was measured
+    origin: str  # what was measured
 
     @property
     def factor(self) -> float:

@@ -49,26 +49,17 @@ _COMPUTED = ("run", "failed")
 
 @dataclass(slots=True)
 class StageProgress:
-    """What is known of one stage.
-
-    Attributes:
-        units: number of its units; None until the stage has started.
-        done: number of settled units.
-        computed: number of these that were computed.
-        seconds: computing time of these.
-        running: unit to the time at which it began.
-        most_at_once: the largest number of units of all stages that ran at a time while one of this stage did.
-        finished: whether all units are settled.
-    """
+    """What is known of one stage."""
 
     forecast: StageForecast
-    units: int | None = None
-    done: int = 0
-    computed: int = 0
-    seconds: float = 0.0
-    running: dict[str, float] = field(default_factory=dict)
+    units: int | None = None  # number of its units; None until the stage has started
+    done: int = 0  # number of settled units
+    computed: int = 0  # number of these that were computed
+    seconds: float = 0.0  # computing time of these
+    running: dict[str, float] = field(default_factory=dict)  # unit to the time at which it began
+    # the largest number of units of all stages that ran at a time while one of this stage did
     most_at_once: int = 0
-    finished: bool = False
+    finished: bool = False  # whether all units are settled
     _own_s: float = 0.0
     _began: float = 0.0
 

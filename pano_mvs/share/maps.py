@@ -25,17 +25,11 @@ MAP_PIXELS = 512
 
 @dataclass(frozen=True, eq=False)
 class MapPlace:
-    """Where a map lies, in x and z of the page.
+    """Where a map lies, in x and z of the page."""
 
-    Attributes:
-        corner: (2,) its upper-left corner.
-        right: (2,) its upper side, from left to right.
-        down: (2,) its left side, from top to bottom.
-    """
-
-    corner: FloatArray
-    right: FloatArray
-    down: FloatArray
+    corner: FloatArray  # (2,) its upper-left corner
+    right: FloatArray  # (2,) its upper side, from left to right
+    down: FloatArray  # (2,) its left side, from top to bottom
 
     @property
     def size_hw(self) -> tuple[int, int]:
@@ -120,17 +114,11 @@ PLAN = "floor_plan/floor_plan.json"
 
 @dataclass(frozen=True, eq=False)
 class StoreyMap:
-    """The plan of one storey.
+    """The plan of one storey."""
 
-    Attributes:
-        picture: (H, W, 3) uint8 RGB.
-        place: where it lies in the page.
-        heights: the y of the page between which it lies.
-    """
-
-    picture: NDArray[np.uint8]
-    place: MapPlace
-    heights: tuple[float, float]
+    picture: NDArray[np.uint8]  # (H, W, 3) uint8 RGB
+    place: MapPlace  # where it lies in the page
+    heights: tuple[float, float]  # the y of the page between which it lies
 
 
 def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap], str]:

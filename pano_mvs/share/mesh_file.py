@@ -22,21 +22,14 @@ COLORED = "mesh.ply"
 
 @dataclass(frozen=True, eq=False)
 class SharedMesh:
-    """Triangles with a texture, or else with coloured vertices.
+    """Triangles with a texture, or else with coloured vertices."""
 
-    Attributes:
-        vertices: (V, 3) float32.
-        faces: (F, 3) int32, anticlockwise as seen from the side that was seen.
-        colors_rgb: (V, 3) uint8; None with a texture.
-        uv: (V, 2) float32 places in the texture, from its lower-left corner; None without a texture.
-        texture: (H, W, 3) uint8 RGB; None without a texture.
-    """
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    colors_rgb: NDArray[np.uint8] | None = None
+    vertices: NDArray[np.float32]  # (V, 3) float32
+    faces: NDArray[np.int32]  # (F, 3) int32, anticlockwise as seen from the side that was seen
+    colors_rgb: NDArray[np.uint8] | None = None  # (V, 3) uint8; None with a texture
+    # (V, 2) float32 places in the texture, from its lower-left corner; None without a texture
     uv: NDArray[np.float32] | None = None
-    texture: NDArray[np.uint8] | None = None
+    texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8 RGB; None without a texture
 
     def moved(self, target_from_source: Rigid3) -> SharedMesh:
         """Return the mesh in another frame."""

@@ -25,15 +25,10 @@ _MIN_SHARED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a panorama saw.
+    """What a panorama saw."""
 
-    Attributes:
-        cam_from_page: its pose.
-        ranges: (H, W) float32; NaN where there is none.
-    """
-
-    cam_from_page: Rigid3
-    ranges: NDArray[np.float32]
+    cam_from_page: Rigid3  # its pose
+    ranges: NDArray[np.float32]  # (H, W) float32; NaN where there is none
 
 
 def given_rooms(given: Mapping[str, Sequence[str]] | str | Path) -> dict[str, tuple[str, ...]]:

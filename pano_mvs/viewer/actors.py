@@ -79,16 +79,11 @@ class CloudActor:
 
 @dataclass(frozen=True, eq=False)
 class SphereMesh:
-    """Triangles of a sphere with texture coordinates.
+    """Triangles of a sphere with texture coordinates."""
 
-    Attributes:
-        vertices: (V, 3) float64 in the world.
-        triangles: (T, 3) int64; clockwise as seen from inside.
-        texture_uv: (V, 2) float32, u to the right, v upwards from the lower edge of the image.
-    """
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    vertices: NDArray[np.float64]  # (V, 3) float64 in the world
+    triangles: NDArray[np.int64]  # (T, 3) int64; clockwise as seen from inside
+    # (V, 2) float32, u to the right, v upwards from the lower edge of the image
     texture_uv: NDArray[np.float32]
 
 

@@ -47,57 +47,36 @@ def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], 
 
 @dataclass(frozen=True, eq=False)
 class TourState:
-    """State of the viewer.
-
-    Attributes:
-        surface: "cloud", "mesh" or "both".
-        coloring: name of the cloud's colouring.
-        inside: index of the camera whose panorama surrounds the viewer, or None.
-        outside: viewpoint to return to from inside.
-        measuring: whether clicks pick points.
-        picked: none, one or two points (3,) in the world.
-        hovered: index of the camera under the pointer, or None.
-        blended: whether the cloud is shown inside a panorama.
-        ranges: whether a camera's ranges are shown inside it instead of its panorama.
-        backs: whether points and triangles that face away from the viewer are shown; hiding them opens rooms
-            to view.
-        all_points: whether all points of the file are drawn.
-    """
+    """State of the viewer."""
 
     viewpoint: Viewpoint
-    surface: str = "cloud"
-    coloring: str = "rgb"
-    inside: int | None = None
-    outside: Viewpoint | None = None
-    measuring: bool = False
-    picked: tuple[FloatArray, ...] = ()
-    hovered: int | None = None
+    surface: str = "cloud"  # "cloud", "mesh" or "both"
+    coloring: str = "rgb"  # name of the cloud's colouring
+    inside: int | None = None  # index of the camera whose panorama surrounds the viewer, or None
+    outside: Viewpoint | None = None  # viewpoint to return to from inside
+    measuring: bool = False  # whether clicks pick points
+    picked: tuple[FloatArray, ...] = ()  # none, one or two points (3,) in the world
+    hovered: int | None = None  # index of the camera under the pointer, or None
     labels: bool = False
     cameras: bool = True
-    blended: bool = False
-    ranges: bool = False
+    blended: bool = False  # whether the cloud is shown inside a panorama
+    ranges: bool = False  # whether a camera's ranges are shown inside it instead of its panorama
+    # whether points and triangles that face away from the viewer are shown; hiding them opens rooms to view
     backs: bool = False
-    all_points: bool = False
+    all_points: bool = False  # whether all points of the file are drawn
     help: bool = False
     message: str = ""
 
 
 @dataclass(eq=False)
 class Tour:
-    """A scene and the state of its viewer.
+    """A scene and the state of its viewer."""
 
-    Attributes:
-        scene: cloud, mesh and cameras.
-        cloud: the points that are drawn, or None.
-        box: (2, 3) that contains nearly everything.
-        aspect: width of the window as a multiple of its height.
-        corners: (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh.
-    """
-
-    scene: ShownScene
-    cloud: DrawnCloud | None
-    box: FloatArray
-    aspect: float = 1.5
+    scene: ShownScene  # cloud, mesh and cameras
+    cloud: DrawnCloud | None  # the points that are drawn, or None
+    box: FloatArray  # (2, 3) that contains nearly everything
+    aspect: float = 1.5  # width of the window as a multiple of its height
+    # (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh
     corners: NDArray[np.float32] | None = None
     state: TourState = field(init=False)
 

@@ -28,23 +28,15 @@ _NAMED_DOUBTS = 5
 
 @dataclass(frozen=True, eq=False)
 class ShownCamera:
-    """A camera to step into.
-
-    Attributes:
-        picture: its panorama, or None if the file is missing.
-        preview: a small image whose upper half is the panorama, or None.
-        range_file: its ranges as float32 TIFF, or None.
-        confidence_file: its confidences as PNG, or None.
-        doubtful: whether the run found its pose doubtful.
-    """
+    """A camera to step into."""
 
     name: str
     cam_from_world: Rigid3
-    picture: Path | None
-    preview: Path | None
-    range_file: Path | None = None
-    confidence_file: Path | None = None
-    doubtful: bool = False
+    picture: Path | None  # its panorama, or None if the file is missing
+    preview: Path | None  # a small image whose upper half is the panorama, or None
+    range_file: Path | None = None  # its ranges as float32 TIFF, or None
+    confidence_file: Path | None = None  # its confidences as PNG, or None
+    doubtful: bool = False  # whether the run found its pose doubtful
 
     @property
     def label(self) -> str:
@@ -54,27 +46,16 @@ class ShownCamera:
 
 @dataclass(frozen=True, eq=False)
 class ShownScene:
-    """The scene to show.
+    """The scene to show."""
 
-    Attributes:
-        name: of the folder or file.
-        cloud: the vertices of the cloud, or None.
-        mesh: a PLY file with faces, or None.
-        cameras: in the order of the capture.
-        unit: of lengths: "m" or "scene units".
-        up: (3,) unit vector, up in the world.
-        ahead: (3,) unit vector orthogonal to `up`: the viewing direction of the first camera.
-        notes: what is missing, and why.
-    """
-
-    name: str
-    cloud: PlyPoints | None
-    mesh: Path | None
-    cameras: tuple[ShownCamera, ...]
-    unit: str
-    up: FloatArray
-    ahead: FloatArray
-    notes: tuple[str, ...] = ()
+    name: str  # of the folder or file
+    cloud: PlyPoints | None  # the vertices of the cloud, or None
+    mesh: Path | None  # a PLY file with faces, or None
+    cameras: tuple[ShownCamera, ...]  # in the order of the capture
+    unit: str  # of lengths: "m" or "scene units"
+    up: FloatArray  # (3,) unit vector, up in the world
+    ahead: FloatArray  # (3,) unit vector orthogonal to `up`: the viewing direction of the first camera
+    notes: tuple[str, ...] = ()  # what is missing, and why
 
     @property
     def centers(self) -> FloatArray:

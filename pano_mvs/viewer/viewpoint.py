@@ -16,21 +16,13 @@ _FILLED = 0.94
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Position and direction of view.
+    """Position and direction of view."""
 
-    Attributes:
-        eye: (3,) in the world.
-        target: (3,) point in the centre of the window.
-        up: (3,) unit vector, up in the window.
-        angle_deg: vertical field of view.
-        height: visible height in parallel projection, scene units; 0 for perspective.
-    """
-
-    eye: FloatArray
-    target: FloatArray
-    up: FloatArray
-    angle_deg: float = OUTSIDE_ANGLE_DEG
-    height: float = 0.0
+    eye: FloatArray  # (3,) in the world
+    target: FloatArray  # (3,) point in the centre of the window
+    up: FloatArray  # (3,) unit vector, up in the window
+    angle_deg: float = OUTSIDE_ANGLE_DEG  # vertical field of view
+    height: float = 0.0  # visible height in parallel projection, scene units; 0 for perspective
 
     @property
     def axes(self) -> FloatArray:

@@ -30,18 +30,13 @@ State: TypeAlias = Literal["ok", "note", "warning", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of one check.
+    """The result of one check."""
 
-    Attributes:
-        group: packages, libraries, machine, disk or plugins.
-        remedy: what to do; given with every warning and failure.
-    """
-
-    group: str
+    group: str  # packages, libraries, machine, disk or plugins
     what: str
     state: State
     detail: str
-    remedy: str = ""
+    remedy: str = ""  # what to do; given with every warning and failure
 
 
 KNOWN_VARIABLES = (

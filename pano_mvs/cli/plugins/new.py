@@ -23,17 +23,12 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 @dataclass(frozen=True, slots=True)
 class PluginKind:
-    """A kind of plugin.
+    """A kind of plugin."""
 
-    Attributes:
-        prefix: of the stage's name; empty for a part of the sweep.
-        use: how a workflow uses it, with `{name}` for its name.
-        contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
-    """
-
-    prefix: str
+    prefix: str  # of the stage's name; empty for a part of the sweep
     what: str
-    use: str
+    use: str  # how a workflow uses it, with `{name}` for its name
+    # the function of `pano_mvs.testing.conformance` that returns its contract tests
     contract_tests: str = "stage_contract_tests"
 
 

@@ -42,18 +42,12 @@ class DamagedBlobError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class BlobRef:
-    """One stored part of a record.
+    """One stored part of a record."""
 
-    Attributes:
-        digest: of the bytes.
-        suffix: `.npy`, `.json`, or that of the stored file.
-        external: whether the bytes are in a file of the user rather than in the cache.
-    """
-
-    digest: str
+    digest: str  # of the bytes
     size_bytes: int
-    suffix: str
-    external: bool = False
+    suffix: str  # `.npy`, `.json`, or that of the stored file
+    external: bool = False  # whether the bytes are in a file of the user rather than in the cache
 
     def to_json(self) -> list[Any]:
         """Return the reference as a JSON value."""

@@ -26,17 +26,12 @@ _PIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run or a pin.
+    """A run or a pin."""
 
-    Attributes:
-        name: the id of the run, or the name of the pin.
-        when: end of the run, ISO 8601, UTC.
-    """
-
-    name: str
+    name: str  # the id of the run, or the name of the pin
     workflow: str
     out: str
-    when: str
+    when: str  # end of the run, ISO 8601, UTC
     keys: Keys
     pinned: bool = False
 

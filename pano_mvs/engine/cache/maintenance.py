@@ -35,49 +35,35 @@ _MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can r
 
 @dataclass(frozen=True, slots=True)
 class StageUsage:
-    """The results of one stage in a cache.
+    """The results of one stage in a cache."""
 
-    Attributes:
-        stage: name of the stage in the registry.
-        size_bytes: size of their blobs; a blob that several units share counts once.
-    """
-
-    stage: str
+    stage: str  # name of the stage in the registry
     units: int
-    size_bytes: int
+    size_bytes: int  # size of their blobs; a blob that several units share counts once
     seconds: float
 
 
 @dataclass(slots=True)
 class Verification:
-    """What a verification found.
-
-    Attributes:
-        removed: damaged files, which were removed; the next run computes them again.
-        incomplete: records with missing blobs, which runs ignore.
-        temporary: temporary files, each with the process that it belongs to, and unfinished packs.
-    """
+    """What a verification found."""
 
     records: int = 0
     blobs: int = 0
+    # damaged files, which were removed; the next run computes them again
     removed: list[str] = field(default_factory=list)
-    incomplete: list[str] = field(default_factory=list)
+    incomplete: list[str] = field(default_factory=list)  # records with missing blobs, which runs ignore
     foreign: list[str] = field(default_factory=list)
+    # temporary files, each with the process that it belongs to, and unfinished packs
     temporary: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class GarbageCollection:
-    """What a garbage collection deletes, or would delete.
+    """What a garbage collection deletes, or would delete."""
 
-    Attributes:
-        runs: remembered runs that are too old.
-        blobs: blobs, and packs that were not finished.
-    """
-
-    runs: list[RunEntry] = field(default_factory=list)
+    runs: list[RunEntry] = field(default_factory=list)  # remembered runs that are too old
     records: list[Path | Packed] = field(default_factory=list)
-    blobs: list[Path | Packed] = field(default_factory=list)
+    blobs: list[Path | Packed] = field(default_factory=list)  # blobs, and packs that were not finished
     size_bytes: int = 0
     kept_bytes: int = 0
 

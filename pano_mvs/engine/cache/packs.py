@@ -37,20 +37,14 @@ _TABLE = np.dtype([("high", "u8"), ("low", "u8"), ("offset", "u8"), ("size", "u8
 
 
 class Packed(NamedTuple):  # created for each value that is looked up, four times as fast as a frozen dataclass
-    """One value in a pack.
-
-    Attributes:
-        digest: of a blob, or the key of a record.
-        kind: `RECORD`, `ARRAY` or `JSON`.
-        time_s: when it was stored, in seconds since the epoch; 0 where this was not asked for.
-    """
+    """One value in a pack."""
 
     pack: Path
     offset: int
     size_bytes: int
-    digest: str
-    kind: str
-    time_s: float = 0.0
+    digest: str  # of a blob, or the key of a record
+    kind: str  # `RECORD`, `ARRAY` or `JSON`
+    time_s: float = 0.0  # when it was stored, in seconds since the epoch; 0 where this was not asked for
 
     @property
     def name(self) -> str:

@@ -46,15 +46,11 @@ _MUTABLE = ("packs/*.index", "runs/*.json", "pins/*.json")
 
 @dataclass(frozen=True, slots=True)
 class Copied:
-    """What was copied.
-
-    Attributes:
-        present: number of files that were there already.
-    """
+    """What was copied."""
 
     files: int
     size_bytes: int
-    present: int
+    present: int  # number of files that were there already
 
 
 class RemoteCache:

@@ -192,22 +192,17 @@ class ItemRef:
 
 @dataclass(frozen=True, slots=True)
 class UnitRecord:
-    """The result of one finished unit of work.
-
-    Attributes:
-        identity: what the key was made of, for the reasons in plans.
-        items: the items of a collection, by image.
-        rejected: image name to the reason why the result leaves it out.
-        doubts: image name to the reason why the result is doubtful there.
-    """
+    """The result of one finished unit of work."""
 
     key: str
-    identity: Mapping[str, Any]
+    identity: Mapping[str, Any]  # what the key was made of, for the reasons in plans
     output: ItemRef
-    items: Mapping[str, ItemRef] = field(default_factory=dict)
+    items: Mapping[str, ItemRef] = field(default_factory=dict)  # the items of a collection, by image
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    # image name to the reason why the result leaves it out
     rejected: Mapping[str, str] = field(default_factory=dict)
+    # image name to the reason why the result is doubtful there
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 

@@ -24,14 +24,10 @@ _MAX_SAMPLES = 8
 
 @dataclass(frozen=True, slots=True)
 class CaptureSize:
-    """The size of a capture, by which times are scaled.
-
-    Attributes:
-        pixels: of one image in the median; the bytes of its file if it is not an image file.
-    """
+    """The size of a capture, by which times are scaled."""
 
     images: int
-    pixels: float
+    pixels: float  # of one image in the median; the bytes of its file if it is not an image file
 
     @staticmethod
     def of_files(images: Sequence[Collection[Path]]) -> CaptureSize:
@@ -43,22 +39,15 @@ class CaptureSize:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The units of one stage that one run computed.
+    """The units of one stage that one run computed."""
 
-    Attributes:
-        settings: digest of the settings of the stage.
-        threads: that each unit could use.
-        seconds: that a unit took in the mean.
-        stored_bytes: that a unit stored in the mean.
-    """
-
-    settings: str
-    threads: int
+    settings: str  # digest of the settings of the stage
+    threads: int  # that each unit could use
     images: int
     pixels: float
     units: int
-    seconds: float
-    stored_bytes: float
+    seconds: float  # that a unit took in the mean
+    stored_bytes: float  # that a unit stored in the mean
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,21 +17,14 @@ from pano_mvs.scene import Axis
 
 @dataclass(frozen=True, slots=True)
 class StageForecast:
-    """What a stage is expected to take.
-
-    Attributes:
-        after: the stages that feed it.
-        units: expected number of units to compute; None if unknown.
-        unit_s: expected seconds of one unit; None if no earlier run computed the stage.
-        unit_bytes: expected bytes that a unit adds to the cache; None likewise.
-    """
+    """What a stage is expected to take."""
 
     stage: str
-    after: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()  # the stages that feed it
     cached: int = 0
-    units: int | None = None
-    unit_s: float | None = None
-    unit_bytes: float | None = None
+    units: int | None = None  # expected number of units to compute; None if unknown
+    unit_s: float | None = None  # expected seconds of one unit; None if no earlier run computed the stage
+    unit_bytes: float | None = None  # expected bytes that a unit adds to the cache; None likewise
 
     @property
     def seconds(self) -> float | None:

@@ -177,22 +177,16 @@ def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
 
 @dataclass(slots=True)
 class StagePlan:
-    """What a run would do in one stage.
-
-    Attributes:
-        run: unit that would be computed, to the reason.
-        may_run: units that depend on units that would be computed; they run if these give other results.
-        blocked: unit to the reason why it cannot run.
-        open: whether the number of units is not known yet.
-    """
+    """What a run would do in one stage."""
 
     name: str
     use: str
     cached: list[str] = field(default_factory=list)
-    run: dict[str, str] = field(default_factory=dict)
+    run: dict[str, str] = field(default_factory=dict)  # unit that would be computed, to the reason
+    # units that depend on units that would be computed; they run if these give other results
     may_run: list[str] = field(default_factory=list)
-    blocked: dict[str, str] = field(default_factory=dict)
-    open: bool = False
+    blocked: dict[str, str] = field(default_factory=dict)  # unit to the reason why it cannot run
+    open: bool = False  # whether the number of units is not known yet
 
 
 def make_plan(

@@ -33,15 +33,12 @@ class _ListedFile:
 
 @dataclass(slots=True)
 class SourceListing:
-    """The items of the sources of a run, and the digests of their files.
+    """The items of the sources of a run, and the digests of their files."""
 
-    Attributes:
-        lost: file to the reason why this run cannot use it any more.
-        with_digests: False to read no file as a whole: for a plan with an empty cache, where all units are computed,
-            whatever their keys.
-    """
-
+    # False to read no file as a whole: for a plan with an empty cache, where all units are computed, whatever their
+    # keys
     with_digests: bool = True
+    # file to the reason why this run cannot use it any more
     lost: dict[Path, str] = field(default_factory=dict)
     _items: dict[str, tuple[SourceItem, ...]] = field(default_factory=dict)
     _files: dict[Path, _ListedFile] = field(default_factory=dict)

@@ -28,18 +28,12 @@ _INVALID_CHARACTERS = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 @dataclass(frozen=True, slots=True)
 class FinishedJob:
-    """A job that has ended, after all its retries.
-
-    Attributes:
-        outcome: what became of the last attempt.
-        log: file with what the unit printed; None if it printed nothing.
-        said: the last lines of the log.
-    """
+    """A job that has ended, after all its retries."""
 
     unit: Unit
-    outcome: JobOutcome
-    log: Path | None = None
-    said: tuple[str, ...] = ()
+    outcome: JobOutcome  # what became of the last attempt
+    log: Path | None = None  # file with what the unit printed; None if it printed nothing
+    said: tuple[str, ...] = ()  # the last lines of the log
 
 
 @dataclass(slots=True)

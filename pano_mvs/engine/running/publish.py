@@ -41,15 +41,10 @@ class Owner(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """The result of a claim.
+    """The result of a claim."""
 
-    Attributes:
-        refusal: why the unit cannot deliver its files; empty if it can.
-        losers: units of the same stage that have to withdraw their files: item to the reason.
-    """
-
-    refusal: str
-    losers: dict[str, str]
+    refusal: str  # why the unit cannot deliver its files; empty if it can
+    losers: dict[str, str]  # units of the same stage that have to withdraw their files: item to the reason
 
 
 class FileClaims:

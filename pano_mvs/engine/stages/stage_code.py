@@ -47,15 +47,10 @@ _IGNORED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class StageCode:
-    """What the results of a stage depend on beside its settings and inputs.
+    """What the results of a stage depend on beside its settings and inputs."""
 
-    Attributes:
-        digest: of the code that the stage reaches.
-        libraries: name to version of the libraries that this code uses.
-    """
-
-    digest: str
-    libraries: Mapping[str, str]
+    digest: str  # of the code that the stage reaches
+    libraries: Mapping[str, str]  # name to version of the libraries that this code uses
 
 
 def stage_code(spec: StageSpec, params: Params) -> StageCode:

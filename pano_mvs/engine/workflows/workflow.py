@@ -26,38 +26,26 @@ from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class StageEntry:
-    """One stage of a workflow, validated.
-
-    Attributes:
-        place: `file:line:column` of its name.
-        places: port or setting to `file:line:column`.
-    """
+    """One stage of a workflow, validated."""
 
     name: str
     spec: StageSpec
     params: Params
     policy: Policy
-    place: str
-    places: dict[str, str] = field(default_factory=dict)
+    place: str  # `file:line:column` of its name
+    places: dict[str, str] = field(default_factory=dict)  # port or setting to `file:line:column`
 
 
 @dataclass(frozen=True, slots=True)
 class Workflow:
-    """A validated workflow.
+    """A validated workflow."""
 
-    Attributes:
-        name: for the output folder and the report.
-        text: the YAML, followed by that of the files that it extends.
-        stages: in the order of the file.
-        overrides: the `--set` and `--images` options that were applied.
-        plugins: its plugin files, with the digests of their code.
-    """
-
-    name: str
+    name: str  # for the output folder and the report
     path: Path | None
-    text: str
-    stages: dict[str, StageEntry]
-    overrides: tuple[str, ...] = ()
+    text: str  # the YAML, followed by that of the files that it extends
+    stages: dict[str, StageEntry]  # in the order of the file
+    overrides: tuple[str, ...] = ()  # the `--set` and `--images` options that were applied
+    # its plugin files, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
 
     @property

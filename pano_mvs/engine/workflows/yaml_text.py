@@ -24,25 +24,15 @@ _KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float"
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A YAML value and its location.
+    """A YAML value and its location."""
 
-    Attributes:
-        value: a scalar, a dict of str to Located, or a list of Located.
-        line: 1-based line of the value.
-        column: 1-based column of the value.
-        key_line: 1-based line of its key, if it is an entry of a mapping.
-        key_column: likewise.
-        origin: shown instead of the location, for values from the command line.
-        file: name of the text in messages.
-    """
-
-    value: Any
-    line: int
-    column: int
-    key_line: int = 0
-    key_column: int = 0
-    origin: str = ""
-    file: str = ""
+    value: Any  # a scalar, a dict of str to Located, or a list of Located
+    line: int  # 1-based line of the value
+    column: int  # 1-based column of the value
+    key_line: int = 0  # 1-based line of its key, if it is an entry of a mapping
+    key_column: int = 0  # likewise
+    origin: str = ""  # shown instead of the location, for values from the command line
+    file: str = ""  # name of the text in messages
 
     @property
     def place(self) -> str:

@@ -55,25 +55,16 @@ CloudInput = Path | PointCloud | NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class CloudTruth:
-    """What a cloud is compared with.
+    """What a cloud is compared with."""
 
-    Attributes:
-        pieces: returns the whole true surface at each call, in pieces (K, 3) of which one is in memory at a time.
-        surface: the part that should be covered.
-        used: the views that show it, by name; none of a reference cloud.
-        views: number of views with truth.
-        unit: unit of lengths, for display.
-        cameras: (M, 3) centres of the cameras that were used, in the truth's world.
-        up: (3,) unit vector away from the ground, as far as the cameras agree.
-    """
-
+    # returns the whole true surface at each call, in pieces (K, 3) of which one is in memory at a time
     pieces: Callable[[], Iterable[Points]]
-    surface: TrueSurface
-    used: dict[str, TrueView]
-    views: int
-    unit: str
-    cameras: NDArray[np.float64]
-    up: NDArray[np.float64]
+    surface: TrueSurface  # the part that should be covered
+    used: dict[str, TrueView]  # the views that show it, by name; none of a reference cloud
+    views: int  # number of views with truth
+    unit: str  # unit of lengths, for display
+    cameras: NDArray[np.float64]  # (M, 3) centres of the cameras that were used, in the truth's world
+    up: NDArray[np.float64]  # (3,) unit vector away from the ground, as far as the cameras agree
 
 
 @dataclass(frozen=True, eq=False)

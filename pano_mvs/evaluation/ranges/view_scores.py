@@ -91,19 +91,12 @@ Align = Literal["none", "median", "lsq"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredPixels:
-    """The pixels of one view with ground truth, in any order.
+    """The pixels of one view with ground truth, in any order."""
 
-    Attributes:
-        found: (N,) estimated ranges in the truth's unit, NaN where there is no estimate.
-        true: (N,) true ranges, positive and finite.
-        weight: (N,) solid angles in steradians.
-        confidence: (N,) the larger the more confident, or None.
-    """
-
-    found: FloatArray
-    true: FloatArray
-    weight: FloatArray
-    confidence: NDArray[np.integer] | None = None
+    found: FloatArray  # (N,) estimated ranges in the truth's unit, NaN where there is no estimate
+    true: FloatArray  # (N,) true ranges, positive and finite
+    weight: FloatArray  # (N,) solid angles in steradians
+    confidence: NDArray[np.integer] | None = None  # (N,) the larger the more confident, or None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -213,20 +206,14 @@ class Sparsification:
 
     Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
     order. Errors are |error| / truth, at most 1.
-
-    Attributes:
-        kept: (N,) share of the pixels with truth and estimate that is kept, growing to 1.
-        error: (N,) mean relative error of those.
-        oracle_error: (N,) mean relative error if the pixels were ordered by their true errors.
-        area: under the curve, the mean over all shares.
-        oracle_area: under the oracle's.
     """
 
-    kept: NDArray[np.float64]
-    error: NDArray[np.float64]
+    kept: NDArray[np.float64]  # (N,) share of the pixels with truth and estimate that is kept, growing to 1
+    error: NDArray[np.float64]  # (N,) mean relative error of those
+    # (N,) mean relative error if the pixels were ordered by their true errors
     oracle_error: NDArray[np.float64]
-    area: float
-    oracle_area: float
+    area: float  # under the curve, the mean over all shares
+    oracle_area: float  # under the oracle's
 
     @property
     def ause(self) -> float:

@@ -57,24 +57,15 @@ class ModelCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelImage:
-    """One registered image.
+    """One registered image."""
 
-    Attributes:
-        name: of the file, relative to the folder of the images.
-        quat_wxyz: rotation of cam_from_world as stored, (4,).
-        translation: of cam_from_world, (3,).
-        pixels: (n, 2), its key points.
-        point_ids: (n,), the point that each key point observes; negative without one.
-        where: the file and the image, for error messages.
-    """
-
-    name: str
-    quat_wxyz: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    name: str  # of the file, relative to the folder of the images
+    quat_wxyz: NDArray[np.float64]  # rotation of cam_from_world as stored, (4,)
+    translation: NDArray[np.float64]  # of cam_from_world, (3,)
     camera_id: int
-    pixels: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-    where: str
+    pixels: NDArray[np.float64]  # (n, 2), its key points
+    point_ids: NDArray[np.int64]  # (n,), the point that each key point observes; negative without one
+    where: str  # the file and the image, for error messages
 
     def cam_from_world(self) -> Rigid3:
         """Return the pose.
@@ -91,23 +82,14 @@ class ModelImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelPoints3D:
-    """All points.
+    """All points."""
 
-    Attributes:
-        ids: (N,), increasing.
-        xyz: (N, 3).
-        rgb: (N, 3) uint8.
-        errors_px: (N,), mean reprojection errors; −1 if unknown.
-        track_lengths: (N,), number of observations.
-        track_image_ids: the images of all observations, ordered by point.
-    """
-
-    ids: NDArray[np.int64]
-    xyz: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    errors_px: NDArray[np.float64]
-    track_lengths: NDArray[np.int64]
-    track_image_ids: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (N,), increasing
+    xyz: NDArray[np.float64]  # (N, 3)
+    rgb: NDArray[np.uint8]  # (N, 3) uint8
+    errors_px: NDArray[np.float64]  # (N,), mean reprojection errors; −1 if unknown
+    track_lengths: NDArray[np.int64]  # (N,), number of observations
+    track_image_ids: NDArray[np.int64]  # the images of all observations, ordered by point
 
 
 def read_colmap_model(folder: Path) -> Poses:

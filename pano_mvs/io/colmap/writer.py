@@ -67,15 +67,10 @@ def write_colmap_model(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutPanorama:
-    """The faces of one panorama.
+    """The faces of one panorama."""
 
-    Attributes:
-        views: the faces. Panoramas that share the same sequence object share a rig.
-        image_names: names of the faces' images in the same order, relative to the image folder.
-    """
-
-    views: Sequence[PinholeView]
-    image_names: Sequence[str]
+    views: Sequence[PinholeView]  # the faces. Panoramas that share the same sequence object share a rig
+    image_names: Sequence[str]  # names of the faces' images in the same order, relative to the image folder
 
 
 @dataclass(frozen=True, slots=True, eq=False)

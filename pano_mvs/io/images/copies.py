@@ -35,15 +35,10 @@ _REDUCED = {8: cv2.IMREAD_REDUCED_GRAYSCALE_8, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4
 
 @dataclass(frozen=True)
 class Copy:
-    """What a picture is a copy of.
+    """What a picture is a copy of."""
 
-    Attributes:
-        original: name of the earlier picture.
-        turn_deg: how far the copy is turned to the left about the vertical, from 0 to 360.
-    """
-
-    original: str
-    turn_deg: float
+    original: str  # name of the earlier picture
+    turn_deg: float  # how far the copy is turned to the left about the vertical, from 0 to 360
 
 
 def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read: bool = True) -> dict[str, Copy]:

@@ -42,19 +42,12 @@ _EXIF_IN_HEIF = re.compile(rb"Exif\0\0(?=II\*\0|MM\0\*)")
 
 @dataclass(frozen=True)
 class Container:
-    """The size and the metadata of an image file.
+    """The size and the metadata of an image file."""
 
-    Attributes:
-        size_hw: (height, width) as stored, or None if only decoding gives it.
-        exif: EXIF metadata, which begins with the byte order; empty if there is none.
-        xmp: XMP packets, possibly with bytes around them.
-        warning: which metadata was not read, and why; empty if all was read.
-    """
-
-    size_hw: tuple[int, int] | None = None
-    exif: bytes = b""
-    xmp: tuple[bytes, ...] = ()
-    warning: str = ""
+    size_hw: tuple[int, int] | None = None  # (height, width) as stored, or None if only decoding gives it
+    exif: bytes = b""  # EXIF metadata, which begins with the byte order; empty if there is none
+    xmp: tuple[bytes, ...] = ()  # XMP packets, possibly with bytes around them
+    warning: str = ""  # which metadata was not read, and why; empty if all was read
 
 
 def read_container(data: bytes) -> Container:
@@ -245,19 +238,13 @@ _MAX_SHOWN = 80  # characters of a field in a message
 
 @dataclass(frozen=True)
 class GPano:
-    """The GPano metadata of an image.
+    """The GPano metadata of an image."""
 
-    Attributes:
-        projection_type: "equirectangular" or, rarely, another, in lower case.
-        full_size_hw: (height, width) of the whole sphere in pixels, or None.
-        crop_ltwh: (left, top, width, height) of the part in the image, in the same pixels, or None.
-        heading_deg: compass heading of the image centre, or None.
-    """
-
-    projection_type: str = "equirectangular"
-    full_size_hw: tuple[int, int] | None = None
+    projection_type: str = "equirectangular"  # "equirectangular" or, rarely, another, in lower case
+    full_size_hw: tuple[int, int] | None = None  # (height, width) of the whole sphere in pixels, or None
+    # (left, top, width, height) of the part in the image, in the same pixels, or None
     crop_ltwh: tuple[int, int, int, int] | None = None
-    heading_deg: float | None = None
+    heading_deg: float | None = None  # compass heading of the image centre, or None
     pitch_deg: float | None = None
     roll_deg: float | None = None
 

@@ -39,21 +39,16 @@ _SIX_FILES = (
 
 @dataclass(frozen=True)
 class TourScene:
-    """One scene.
+    """One scene."""
 
-    Attributes:
-        name: its title in the tour's configuration; without one, the name of its folder or the common part of its
-            files, below the folder that all scenes share.
-        tiles: file of each tile of the finest complete resolution, by face, row and column, which count from 0; empty
-            for an equirectangular image.
-        links: names of the scenes to which it leads.
-        panorama: its equirectangular image, or None for a cube.
-    """
-
+    # its title in the tour's configuration; without one, the name of its folder or the common part of its files, below
+    # the folder that all scenes share
     name: str
+    # file of each tile of the finest complete resolution, by face, row and column, which count from 0; empty for an
+    # equirectangular image
     tiles: Mapping[tuple[str, int, int], Path]
-    links: tuple[str, ...] = ()
-    panorama: Path | None = None
+    links: tuple[str, ...] = ()  # names of the scenes to which it leads
+    panorama: Path | None = None  # its equirectangular image, or None for a cube
 
 
 def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:

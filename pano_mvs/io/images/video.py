@@ -29,19 +29,13 @@ _SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """The header of a video.
+    """The header of a video."""
 
-    Attributes:
-        size_hw: (height, width) of a frame as stored.
-        frames_per_s: average frame rate.
-        is_turned: whether the header asks players to rotate the frames.
-        stereo: how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
-    """
-
-    size_hw: tuple[int, int]
+    size_hw: tuple[int, int]  # (height, width) of a frame as stored
     frames: int
-    frames_per_s: float
-    is_turned: bool
+    frames_per_s: float  # average frame rate
+    is_turned: bool  # whether the header asks players to rotate the frames
+    # how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
     stereo: StereoLayout = "none"
 
 

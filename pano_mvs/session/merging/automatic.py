@@ -30,15 +30,11 @@ def default_overlap(size: int) -> int:
 
 @dataclass(frozen=True)
 class BlockDecision:
-    """Whether a run is divided into blocks.
+    """Whether a run is divided into blocks."""
 
-    Attributes:
-        division: how; None to run all images at once.
-        reason: how and why in one line, also if the capture should be divided and cannot be; "" if all images at once
-            need no explanation.
-    """
-
-    division: Division | None = None
+    division: Division | None = None  # how; None to run all images at once
+    # how and why in one line, also if the capture should be divided and cannot be; "" if all images at once need no
+    # explanation
     reason: str = ""
 
 

@@ -55,18 +55,12 @@ _MERGED_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """What a merge found and wrote.
-
-    Attributes:
-        blocks: the blocks, as given.
-        alignment: their similarities and their agreement.
-        merged: the cameras, and to which block each belongs.
-    """
+    """What a merge found and wrote."""
 
     summary: RunSummary
-    blocks: tuple[Block, ...]
-    alignment: BlockAlignment
-    merged: MergedBlocks
+    blocks: tuple[Block, ...]  # the blocks, as given
+    alignment: BlockAlignment  # their similarities and their agreement
+    merged: MergedBlocks  # the cameras, and to which block each belongs
 
 
 def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) -> MergeResult:

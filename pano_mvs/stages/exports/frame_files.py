@@ -80,19 +80,12 @@ class SeedParams(Params):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """What is known about a panorama besides its colours; only `valid` is always known.
+    """What is known about a panorama besides its colours; only `valid` is always known."""
 
-    Attributes:
-        valid: (H, W) bool, False is masked.
-        ranges: (H, W) float32, NaN unknown.
-        normals_in_cam: (H, W, 3) float32, NaN unknown.
-        confidence: (H, W) uint8, 0 unknown.
-    """
-
-    valid: NDArray[np.bool_]
-    ranges: NDArray[np.float32] | None = None
-    normals_in_cam: NDArray[np.float32] | None = None
-    confidence: NDArray[np.uint8] | None = None
+    valid: NDArray[np.bool_]  # (H, W) bool, False is masked
+    ranges: NDArray[np.float32] | None = None  # (H, W) float32, NaN unknown
+    normals_in_cam: NDArray[np.float32] | None = None  # (H, W, 3) float32, NaN unknown
+    confidence: NDArray[np.uint8] | None = None  # (H, W) uint8, 0 unknown
 
 
 class FrameFiles:
