@@ -40,7 +40,6 @@ class Selection:
     max_points: int = setting(0, ge=0, doc="thin evenly to at most this number of points; 0: no limit")
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_settings(self)
 
 

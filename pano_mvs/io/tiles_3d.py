@@ -78,7 +78,10 @@ class TilesetWriter:
                 tiles[above].setdefault("children", []).append(tile)
         root = tiles["r"] | {"refine": "ADD"}
         if origin_lla is not None:
-            root["transform"] = self._earth_from_file(origin_lla).T.ravel().tolist()
+            transform = np.eye(4)
+            transform[:3, :3] = earth_from_local(origin_lla) @ self._file_from_world.T
+            transform[:3, 3] = earth_from_lla(origin_lla)
+            root["transform"] = transform.T.ravel().tolist()
         document = {
             "asset": {"version": "1.1", "extras": {"generator": "pano_mvs"}},
             "geometricError": float(np.linalg.norm(np.diff(self._bounds["r"], axis=0))),
@@ -87,13 +90,6 @@ class TilesetWriter:
         }
         self.files["tileset.json"] = self._folder / "tileset.json"
         self.files["tileset.json"].write_text(json.dumps(document, indent=1), encoding="utf-8")
-
-    def _earth_from_file(self, origin_lla: Sequence[float]) -> FloatArray:
-        """Return the transform (4, 4) from the axes of the files to Earth-centred, Earth-fixed coordinates."""
-        transform = np.eye(4)
-        transform[:3, :3] = earth_from_local(origin_lla) @ self._file_from_world.T
-        transform[:3, 3] = earth_from_lla(origin_lla)
-        return transform
 
 
 def _box(bounds: FloatArray) -> list[float]:

@@ -135,11 +135,9 @@ class Views(Mapping[str, "RunView"]):
         return RunView(self._run, self._summaries[name])
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the images."""
         return iter(self._summaries)
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self._summaries)
 
     def __repr__(self) -> str:
@@ -209,7 +207,6 @@ class RunView:
         return file_inside(self._run.out, self.summary.preview)
 
     def __repr__(self) -> str:
-        """Return the name."""
         return f"RunView({self.name!r})"
 
     def _exported(self, folder: str, suffix: str) -> Path | None:

@@ -129,7 +129,6 @@ class TimeEstimator:
     """Keeps track of a run by its events; several threads may use it at a time."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin to estimate."""
         self.stages: dict[str, StageProgress] = {}
         self._clock = clock
         self._lock = threading.Lock()
@@ -201,14 +200,10 @@ class TimeEstimator:
             {name: stage.forecast.after for name, stage in self.stages.items()},
             workers=self._workers,
         )
-        report = self._report_work_s(now)
+        so_far_s = now - self._latest_end if self.is_reporting else 0.0
+        report = max(self._report_s - so_far_s, (_OVERDUE - 1) * so_far_s), so_far_s
         self._most_done = max(self._most_done, _share([*known.values(), report], len(unknown)))
         return TimeLeft(left_s + report[0], at_least=bool(unknown), done=self._most_done, unknown=unknown)
-
-    def _report_work_s(self, now: float) -> tuple[float, float]:
-        """Return the time left for the report, and that which it has taken."""
-        so_far_s = now - self._latest_end if self.is_reporting else 0.0
-        return max(self._report_s - so_far_s, (_OVERDUE - 1) * so_far_s), so_far_s
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))
@@ -303,14 +298,11 @@ class EventObserver:
             self._estimator(compiled)
             self._progress(compiled)
         if self._executor is not None:
-            self._report_workers(self._executor)
+            if (workers := self._executor.places()) != self._workers:
+                self._workers = workers
+                changed = WorkersChanged(workers)
+                self._estimator(changed)
+                self._progress(changed)
+            if notice := self._executor.notice():
+                self._progress(Warned(notice))
         self._progress(self._estimator.estimate())
-
-    def _report_workers(self, executor: Executor) -> None:
-        if (workers := executor.places()) != self._workers:
-            self._workers = workers
-            changed = WorkersChanged(workers)
-            self._estimator(changed)
-            self._progress(changed)
-        if notice := executor.notice():
-            self._progress(Warned(notice))

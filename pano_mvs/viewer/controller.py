@@ -102,7 +102,12 @@ class Tour:
         """
         kind, _, name = view.partition(":")
         if kind == "inside":
-            found = self._camera_called(name)
+            names = [camera.name for camera in self.scene.cameras]
+            matched = match_image_names([name], names)
+            if name not in matched:
+                shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+                raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
+            found = names.index(matched[name])
             self.step_into(found)
             pose = self.scene.cameras[found].cam_from_world
             self.moved_to(looking_along(pose.center, pose.rotation[2], self.scene.up))
@@ -256,14 +261,6 @@ class Tour:
         if distance is not None and self.scene.unit != "m":
             said += f" from {_place_text(picked[0])} to {_place_text(picked[1])}"
         self.state = replace(self.state, message=said)
-
-    def _camera_called(self, name: str) -> int:
-        names = [camera.name for camera in self.scene.cameras]
-        matched = match_image_names([name], names)
-        if name not in matched:
-            shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
-            raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
-        return names.index(matched[name])
 
 
 def _place_text(point: FloatArray) -> str:

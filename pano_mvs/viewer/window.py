@@ -97,7 +97,12 @@ class SceneWindow:
         state, before = self.tour.state, self._shown
         self._shown = state
         self.plotter.suppress_rendering = True  # once, at the end
-        self._place_camera(state.viewpoint)
+        camera = self.plotter.camera
+        camera.position, camera.focal_point = tuple(state.viewpoint.eye), tuple(state.viewpoint.target)
+        camera.up, camera.view_angle = tuple(state.viewpoint.up), state.viewpoint.angle_deg
+        camera.parallel_projection = bool(state.viewpoint.height)
+        if state.viewpoint.height:
+            camera.parallel_scale = state.viewpoint.height / 2
         if before is None or before.all_points != state.all_points:
             self._reload_points(state)
         if before is None or (before.inside, before.ranges) != (state.inside, state.ranges):
@@ -110,14 +115,6 @@ class SceneWindow:
         self.plotter.suppress_rendering = False
         self.plotter.renderer.ResetCameraClippingRange()
         self.plotter.render()
-
-    def _place_camera(self, viewpoint: Viewpoint) -> None:
-        camera = self.plotter.camera
-        camera.position, camera.focal_point = tuple(viewpoint.eye), tuple(viewpoint.target)
-        camera.up, camera.view_angle = tuple(viewpoint.up), viewpoint.angle_deg
-        camera.parallel_projection = bool(viewpoint.height)
-        if viewpoint.height:
-            camera.parallel_scale = viewpoint.height / 2
 
     def _add_cloud(self) -> None:
         if self.tour.cloud is not None:
@@ -328,7 +325,6 @@ class Hands:
     """
 
     def __init__(self, tour: Tour, *, seen_from: Callable[[], Viewpoint], update: Callable[[], None]) -> None:
-        """Make a handler."""
         self._tour, self._seen_from, self._update = tour, seen_from, update
         self._pressed: dict[str, tuple[int, int]] = {}
         self._last = (0, 0)

@@ -83,7 +83,10 @@ class ProgressDisplay:
             case KernelsCompiled(kernels=kernels):
                 self._kernels, self._kernels_at = kernels, self._clock()
             case UnitFailed():
-                self._print_failure(event)
+                label = f"{event.stage}:{event.item}" if event.item else event.stage
+                self.console.say(f"[red]failed[/] {escape(label)}")
+                for line in event.said[-5:]:
+                    self.console.say(f"  | {escape(line)}")
             case StageFinished():
                 self._print_stage(event)
             case Warned(text=text):
@@ -150,12 +153,6 @@ class ProgressDisplay:
         if left.at_least and seconds < 1:
             return f"time left not known yet: no earlier run has computed {unknown}"
         return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
-
-    def _print_failure(self, failure: UnitFailed) -> None:
-        label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
-        self.console.say(f"[red]failed[/] {escape(label)}")
-        for line in failure.said[-5:]:
-            self.console.say(f"  | {escape(line)}")
 
     def _print_stage(self, summary: StageFinished) -> None:
         parts = [f"{summary.run} run", f"{summary.cached} cached"]

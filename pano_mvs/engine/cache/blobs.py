@@ -413,7 +413,6 @@ class PackedRefs(Mapping[str, BlobRef]):
         return self._packed
 
     def __getitem__(self, name: str) -> BlobRef:
-        """Return one reference."""
         idx, suffix, external = self._form[name]
         start = idx * _PART_BYTES
         middle, end = start + DIGEST_BYTES, start + _PART_BYTES
@@ -421,13 +420,10 @@ class PackedRefs(Mapping[str, BlobRef]):
         return BlobRef(self._packed[start:middle].hex(), size_bytes, suffix, external)
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._form)
 
     def __len__(self) -> int:
-        """Return the number of parts."""
         return len(self._form)
 
     def __repr__(self) -> str:
-        """Return the references as a dict prints them."""
         return repr(dict(self))

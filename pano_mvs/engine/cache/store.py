@@ -165,7 +165,6 @@ class ItemRef:
         return PackedRefs.from_packed(self._form, self._packed[DIGEST_BYTES:])
 
     def __eq__(self, other: object) -> bool:
-        """Return whether two references are the same in every part."""
         if not isinstance(other, ItemRef):
             return NotImplemented
         if (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form):
@@ -176,7 +175,6 @@ class ItemRef:
     __hash__ = None  # type: ignore[assignment]  # as that of the mapping of its parts
 
     def __repr__(self) -> str:
-        """Return the reference as a dataclass prints it."""
         return f"ItemRef(kind={self.kind!r}, digest={self.digest!r}, parts={self.parts!r})"
 
     def to_json(self) -> dict[str, Any]:
@@ -283,7 +281,7 @@ class Store:
         self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
         self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
-        self._clear_abandoned()
+        clear_abandoned(self.root / "tmp", "*")
         self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.unit_times = UnitTimes(root / FILE_NAME)
@@ -453,10 +451,6 @@ class Store:
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
-
-    def _clear_abandoned(self) -> None:
-        """Remove temporary files of runs that were killed."""
-        clear_abandoned(self.root / "tmp", "*")
 
     def _create(self, path: Path) -> None:
         try:

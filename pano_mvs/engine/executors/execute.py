@@ -175,7 +175,6 @@ class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
     """
 
     def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value], *, max_kept: int = 64) -> None:
-        """Create the mapping; nothing is loaded yet."""
         self._max_kept = max_kept
         self._refs = refs
         self._load = load
@@ -196,11 +195,9 @@ class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
         return key in self._refs
 
     def __iter__(self) -> Iterator[Key]:
-        """Iterate over the keys."""
         return iter(self._refs)
 
     def __len__(self) -> int:
-        """Return the number of items."""
         return len(self._refs)
 
 

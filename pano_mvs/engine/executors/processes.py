@@ -56,7 +56,15 @@ class ProcessExecutor:
         """Submit a job; another worker is started if all are busy."""
         request = request_to_json(job, self._store)
         if len(self._out) == len(self._workers):
-            self._add_worker()
+            errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
+            try:
+                make_folder(errors.parent)
+            except OSError as error:
+                raise self._store.cannot_write(error) from error
+            worker = WorkerProcess(self.cores, errors)
+            thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
+            self._workers.append((thread, worker))
+            thread.start()
         self._out.add(job.number)
         self._jobs.put((job, request))
 
@@ -108,17 +116,6 @@ class ProcessExecutor:
         for thread, _ in self._workers:
             thread.join()
         self._workers.clear()
-
-    def _add_worker(self) -> None:
-        errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
-        try:
-            make_folder(errors.parent)
-        except OSError as error:
-            raise self._store.cannot_write(error) from error
-        worker = WorkerProcess(self.cores, errors)
-        thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
-        self._workers.append((thread, worker))
-        thread.start()
 
     def _serve(self, worker: WorkerProcess) -> None:
         """Pass units to one worker until there are no more, and restart it after `units_per_process` units."""

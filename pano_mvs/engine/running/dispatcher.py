@@ -65,7 +65,6 @@ class Dispatcher:
         self._latest = ("", 0)  # key and memory of the unit that was asked for last
 
     def __len__(self) -> int:
-        """Return the number of running jobs."""
         return len(self._running)
 
     @property

@@ -206,14 +206,10 @@ class Run:
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
         if self._has_passed and self.computed:
-            self._pack()
-
-    def _pack(self) -> None:
-        """Move the results into few files; the run does not fail if that is impossible."""
-        try:
-            pack(self.store)
-        except StoreError as error:
-            self.warn(f"the results stay in many files, because they could not be packed: {error}")
+            try:
+                pack(self.store)
+            except StoreError as error:
+                self.warn(f"the results stay in many files, because they could not be packed: {error}")
 
     def _remember_times(self) -> None:
         """Store what the units of each stage took, for the estimates of later runs."""
@@ -378,7 +374,12 @@ class RunPass:
         outcome, unit = finished.outcome, finished.unit
         duplicates = self._duplicates.pop(unit.key)
         if outcome.status == "damaged":
-            self._drop_producers(unit)
+            # The incomplete records that led to a damaged file are dropped, so that they are computed again.
+            for producer in self.queue.producers(unit.entry.name):
+                for key in self._run.keys.get(producer, {}).values():
+                    record = self._store.read_record(key)
+                    if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
+                        self._store.drop(key)
             self.damaged.append(outcome.cause)
             return
         if outcome.status == "changed" and self._run.listing.report(outcome.changed):
@@ -448,14 +449,6 @@ class RunPass:
         if entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
         self.queue.fail(unit, outcome.cause)
-
-    def _drop_producers(self, unit: Unit) -> None:
-        """Drop the incomplete records that led a unit to a damaged file, so that they are computed again."""
-        for producer in self.queue.producers(unit.entry.name):
-            for key in self._run.keys.get(producer, {}).values():
-                record = self._store.read_record(key)
-                if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
-                    self._store.drop(key)
 
     def _replaced(self) -> set[str]:
         """Return the stages whose results a finished later stage reads and replaces by its own, of the same kind."""

@@ -251,19 +251,15 @@ class PackedFigures(Mapping[str, float]):
         self._packed = self._form[1].pack(*figures.values())
 
     def __getitem__(self, name: str) -> float:
-        """Return one figure."""
         positions, layout = self._form
         figures: tuple[float, ...] = layout.unpack(self._packed)
         return figures[positions[name]]
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._form[0])
 
     def __len__(self) -> int:
-        """Return the number of figures."""
         return len(self._form[0])
 
     def __repr__(self) -> str:
-        """Return the figures as a dict prints them."""
         return repr(dict(self))

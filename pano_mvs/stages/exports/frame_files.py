@@ -92,7 +92,6 @@ class FrameFiles:
     """The files of one panorama below a folder of the output."""
 
     def __init__(self, root: str, params: FramesParams, ctx: Context) -> None:
-        """Start without files."""
         self.root = root
         self.params = params
         self.ctx = ctx
