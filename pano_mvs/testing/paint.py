@@ -24,15 +24,6 @@ class Pattern(Protocol):
         """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), for pixels of width `footprint`."""
 
 
-WHITE: Colors = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
-OAK: Colors = ((0.62, 0.44, 0.27), (0.42, 0.28, 0.17))
-BRICK: Colors = ((0.62, 0.36, 0.27), (0.50, 0.40, 0.33))
-STONE: Colors = ((0.62, 0.60, 0.54), (0.47, 0.46, 0.44))
-LEAVES: Colors = ((0.22, 0.42, 0.16), (0.40, 0.50, 0.22))
-STEEL: Colors = ((0.36, 0.40, 0.46), (0.60, 0.60, 0.62))
-BLUE: Colors = ((0.25, 0.38, 0.62), (0.45, 0.60, 0.75))
-RED: Colors = ((0.70, 0.26, 0.22), (0.80, 0.52, 0.40))
-
 # Cell sizes in scene units, with the amplitude of the noise on each.
 _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
     "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),

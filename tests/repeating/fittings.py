@@ -8,12 +8,13 @@ from typing import TypeAlias
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Colors, Pattern, Texture
+from pano_mvs.testing.paint import Colors, Pattern, Texture
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 from tests.repeating.drawings import Drawing, Kind
 from tests.repeating.prints import Print
 from tests.repeating.walks import Rect
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.rod import Rod
 
 Painted: TypeAlias = tuple[Surface, Texture | Pattern]

@@ -6,7 +6,6 @@ from typing import Literal, Unpack
 
 import numpy as np
 
-from pano_mvs.testing.paint import OAK, WHITE
 from tests.repeating.drawings import Drawing
 from tests.repeating.fittings import Site, Wall
 from tests.repeating.prints import Print
@@ -23,6 +22,7 @@ from tests.repeating.visits import (
     wall_print,
 )
 from tests.repeating.walks import Ground, Rect
+from tests.synthetic.paints import OAK, WHITE
 from tests.synthetic.scenes import Scene
 
 

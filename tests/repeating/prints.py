@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import WHITE
 from pano_mvs.testing.surfaces import Vector
 from tests.repeating.drawings import Drawing, Image, pyramid
+from tests.synthetic.paints import WHITE
 
 _ROW = 1024
 # Side of a print of the wear, and scale of its second layer: together they do not repeat within a hall.

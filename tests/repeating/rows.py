@@ -8,7 +8,6 @@ from typing import Unpack
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
 from tests.repeating.fittings import Site, Wall
 from tests.repeating.visits import (
     PLASTER,
@@ -24,6 +23,7 @@ from tests.repeating.visits import (
     wall_print,
 )
 from tests.repeating.walks import Ground, Rect
+from tests.synthetic.paints import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.scenes import Scene
 
 

@@ -6,12 +6,12 @@ from typing import Literal, Unpack
 
 import numpy as np
 
-from pano_mvs.testing.paint import OAK, WHITE
 from tests.repeating.copies import Move
 from tests.repeating.fittings import Site, Wall
 from tests.repeating.prints import Print
 from tests.repeating.visits import STONES, TILES, Visit, captured, printed, unique_rng, wall_print
 from tests.repeating.walks import Ground, Rect
+from tests.synthetic.paints import OAK, WHITE
 from tests.synthetic.scenes import Scene
 
 _HALF = 0.1  # half of the partition's thickness

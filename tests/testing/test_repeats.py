@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, ray_grid, spiral_rays
-from pano_mvs.testing.paint import OAK
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.surfaces import Cuboid
 from tests.repeating.drawings import Drawing
@@ -19,6 +18,7 @@ from tests.repeating.places import REPEATS, doors, draw_capture, tiled_hall, twi
 from tests.repeating.prints import Print
 from tests.repeating.walks import LAYOUTS, Ground, stands
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import OAK
 from tests.synthetic.scenes import Scene
 
 SIZE = (32, 64)

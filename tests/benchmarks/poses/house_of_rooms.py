@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
 from tests.benchmarks.poses.painted import Paint, Painted, bounded, write_views
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.rod import Rod
 
 # Cells of the plan (column, row), in the order of a walk, and the pairs of rooms with a door between them.

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors
+from pano_mvs.testing.paint import Colors
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Surface, Vector
 from tests.benchmarks.poses.painted import Paint, bounded, write_views
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE
 
 STEP = 0.6
 _VIEWS = 300
