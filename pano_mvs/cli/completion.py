@@ -18,8 +18,7 @@ from pano_mvs.core.paths import children, is_folder
 if TYPE_CHECKING:
     from pano_mvs.engine.workflows.workflow import StageEntry
 
-Offer = tuple[str, str]
-"""What may be put there, and what it is."""
+Offer = tuple[str, str]  # what may be put there, and what it is
 
 
 def _silent(complete: Callable[..., Iterator[Offer]]) -> Callable[..., list[Offer]]:

@@ -21,9 +21,7 @@ from pano_mvs.core.processes import process_place, start_of
 OUTPUT_MARK = ".pano-mvs-output"
 """An empty file, written first into every output folder, so that sources do not read images from there."""
 
-CACHE_MARK = ".pano-mvs-cache"
-"""An empty file in every cache, so that sources do not read images from there."""
-
+CACHE_MARK = ".pano-mvs-cache"  # an empty file in every cache, so that sources do not read images from there
 _FOLDERS_OF_A_CACHE = ("blobs", "records")
 
 

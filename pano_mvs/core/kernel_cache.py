@@ -21,9 +21,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import below, exists, home_folder, is_folder
 
 VARIABLE = "NUMBA_CACHE_DIR"
-PACKAGE = Path(__file__).parent.parent
-"""The folder of `pano_mvs`, whose kernels are cached."""
-
+PACKAGE = Path(__file__).parent.parent  # the folder of `pano_mvs`, whose kernels are cached
 _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/Caches")}
 
 

@@ -6,9 +6,7 @@ import re
 from collections.abc import Iterable
 from xml.etree import ElementTree
 
-MAX_CHARACTERS = 2000
-"""Maximum length of a message."""
-
+MAX_CHARACTERS = 2000  # maximum length of a message
 # Control characters except tab and newline, marks of writing direction, line separators, surrogates.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 

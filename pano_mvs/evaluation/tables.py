@@ -24,8 +24,7 @@ class TextTable:
         return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
 
 
-Summary = tuple[str | TextTable, ...]
-"""Lines of text and tables, in the order in which they are displayed."""
+Summary = tuple[str | TextTable, ...]  # lines of text and tables, in the order in which they are displayed
 
 
 def finite_or_none(value: float) -> float | None:

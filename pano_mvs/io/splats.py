@@ -198,9 +198,7 @@ def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
     } | ({"k1": frame.radial} if frame.radial else {})
 
 
-ROOT = "splat_bundle"
-"""Folder of the bundle in the output folder."""
-
+ROOT = "splat_bundle"  # folder of the bundle in the output folder
 
 _MANIFEST_DEPTHS = {"equirectangular": "range along the ray", "faces": "z-depth"}
 _CONVENTIONS = {

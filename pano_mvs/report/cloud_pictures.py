@@ -24,9 +24,7 @@ from pano_mvs.scene.pose_groups import split_groups
 RENDERER_VARIABLE = "PANO_MVS_RENDERER"
 """`software` draws without PyVista; anything else, or nothing, tries PyVista first."""
 
-VERSION = 2
-"""Raise it when the pictures change: earlier pages' are then drawn again."""
-
+VERSION = 2  # raise it when the pictures change: earlier pages' are then drawn again
 _SIZE_HW = (600, 960)
 MAX_BYTES = 300_000
 _COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_pictures")

@@ -17,9 +17,7 @@ from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud
 
-VERSION = 1
-"""Raise it when the encoding changes: points of earlier pages are then encoded again."""
-
+VERSION = 1  # raise it when the encoding changes: points of earlier pages are then encoded again
 MAX_POINTS = 150_000
 POINT_BYTES = 12
 

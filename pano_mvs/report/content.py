@@ -40,8 +40,7 @@ from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.scores import NO_TRUTH
 from pano_mvs.scene.two_view import pair_name
 
-MAX_SUGGESTIONS = 12
-"""Suggestions that the page shows."""
+MAX_SUGGESTIONS = 12  # suggestions that the page shows
 
 
 def advice(

@@ -20,9 +20,7 @@ from pano_mvs.scene import Panorama
 from pano_mvs.scene.masking import inside_crop
 from pano_mvs.scene.panorama import StaticMasks, camera_of
 
-VERSION = 1
-"""Raise it when the pictures or the kinds change: earlier pages' are then drawn again."""
-
+VERSION = 1  # raise it when the pictures or the kinds change: earlier pages' are then drawn again
 MAX_PICTURES = 12
 MAX_BYTES = 50_000
 _WIDTH = 640

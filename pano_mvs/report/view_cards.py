@@ -146,9 +146,7 @@ def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
     return rgb
 
 
-VERSION = 4
-"""Raise it when the pictures change: earlier pages' are then drawn again."""
-
+VERSION = 4  # raise it when the pictures change: earlier pages' are then drawn again
 MAX_CARDS = 36
 WIDTH = 768
 MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}

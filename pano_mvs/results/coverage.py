@@ -19,9 +19,7 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
-VERSION = 1
-"""Raise it when the figures change: those of earlier pages are then computed again."""
-
+VERSION = 1  # raise it when the figures change: those of earlier pages are then computed again
 _POINTS_HW, _SURFACES_HW = (32, 64), (64, 128)
 # A point is hidden from a camera if a surface is nearer by more than this share of its distance.
 _TOLERANCE = 0.1

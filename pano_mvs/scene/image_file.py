@@ -28,9 +28,7 @@ from pano_mvs.scene.image_header import (
 )
 from pano_mvs.scene.record import FilePart
 
-MAX_PIXELS = 512_000_000
-"""Default limit of pixels of an image that is decoded."""
-
+MAX_PIXELS = 512_000_000  # default limit of pixels of an image that is decoded
 MASK_BYTES_PER_PIXEL = 8
 """Peak memory while a mask is read and resized: grey levels, flags, and counts of masked pixels."""
 

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 Size: TypeAlias = "tuple[int, int]"
-ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]
-"""`heif` includes AVIF."""
-
+ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]  # `heif` includes AVIF
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _WIDTH, _HEIGHT = 256, 257

@@ -32,9 +32,7 @@ from pano_mvs.scene.two_view import Pairs, Views
 from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import chain_of
 
-WORKFLOW_FILE = "metres.yaml"
-"""The workflow with the scale, in the output folder."""
-
+WORKFLOW_FILE = "metres.yaml"  # the workflow with the scale, in the output folder
 _PREFIX = "metres_"
 _SCALED: Mapping[type[Record], tuple[str, str]] = {
     Poses: ("poses.scale", "poses"),

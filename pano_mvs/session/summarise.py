@@ -354,9 +354,7 @@ def _versions() -> dict[str, str]:
     return found
 
 
-PLAUSIBLE_HEIGHT_M = 1.6
-"""A usual height of a camera on a tripod or a stick."""
-
+PLAUSIBLE_HEIGHT_M = 1.6  # a usual height of a camera on a tripod or a stick
 _BLOCKS, _BLOCK_POINTS = 300, 1000
 
 

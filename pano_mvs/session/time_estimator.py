@@ -32,12 +32,8 @@ from pano_mvs.session.progress import (
     WorkersChanged,
 )
 
-_OVERDUE = 1.2
-"""A unit that takes longer than expected is expected to take this multiple of its time so far …"""
-
-_UNKNOWN = 2.0
-"""… and this one if nothing is known of its stage."""
-
+_OVERDUE = 1.2  # a unit that takes longer than expected is expected to take this multiple of its time so far …
+_UNKNOWN = 2.0  # … and this one if nothing is known of its stage
 _START_S = 10.0
 """A worker process starts within this time, which is not evidence that the units of its stage are slow."""
 

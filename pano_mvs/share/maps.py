@@ -19,8 +19,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart, PointCloud
 from pano_mvs.scene.image_file import decode_image
 
-MAP_PIXELS = 512
-"""Length of the longer side of a map."""
+MAP_PIXELS = 512  # length of the longer side of a map
 
 
 @dataclass(frozen=True, eq=False)

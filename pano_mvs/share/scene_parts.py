@@ -34,8 +34,7 @@ from pano_mvs.share.maps import MapPlace, StoreyMap, cut_height, place_around, t
 from pano_mvs.share.mesh_file import SharedMesh, coarser
 from pano_mvs.share.page_folder import PageFolder
 
-RANGES_HW = (256, 512)
-"""Size of the range map that the page walks and measures on."""
+RANGES_HW = (256, 512)  # size of the range map that the page walks and measures on
 
 
 @dataclass(frozen=True)

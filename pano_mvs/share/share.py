@@ -60,8 +60,7 @@ def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rig
     return Rigid3(rotation, -rotation @ origin)
 
 
-Progress = Callable[[int, int], None]
-"""Receives the number of panoramas that are written, and of all."""
+Progress = Callable[[int, int], None]  # receives the number of panoramas that are written, and of all
 
 
 @dataclass(frozen=True)

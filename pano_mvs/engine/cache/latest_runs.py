@@ -18,9 +18,7 @@ from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import read_regular, replacing
 from pano_mvs.core.paths import children, is_file, resolved
 
-Keys: TypeAlias = "dict[str, dict[str, str]]"
-"""Stage to unit to cache key."""
-
+Keys: TypeAlias = "dict[str, dict[str, str]]"  # stage to unit to cache key
 _PIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 

@@ -30,9 +30,7 @@ _MAX_PACK_BYTES = 1 << 30  # collection rewrites a pack as a whole, and needs th
 _ENTRY = np.dtype(
     [("high", ">u8"), ("low", ">u8"), ("offset", "<u8"), ("size", "<u8"), ("time", "<f8"), ("kind", "u1")]
 )
-_NO_ENTRIES = np.zeros(0, _ENTRY)
-"""Of an index that cannot be read."""
-
+_NO_ENTRIES = np.zeros(0, _ENTRY)  # of an index that cannot be read
 _TABLE = np.dtype([("high", "u8"), ("low", "u8"), ("offset", "u8"), ("size", "u8"), ("pack", "u4"), ("kind", "u1")])
 
 

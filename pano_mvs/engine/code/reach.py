@@ -22,9 +22,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import is_file
 
 _IMPORT, _WHOLE = "<import>", "<all>"
-_AT_RUN_TIME = "/"
-"""Prefix of the paths that `import_module` and its like import."""
-
+_AT_RUN_TIME = "/"  # prefix of the paths that `import_module` and its like import
 _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _STAGE_DECORATORS = frozenset(
     f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")

@@ -12,12 +12,8 @@ from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis
 
-WHOLE = ""
-"""The name of the unit of a stage that has only one."""
-
-PENDING = ItemRef("", "0" * 32, {})
-"""Placeholder for an item of which only the name is known."""
-
+WHOLE = ""  # the name of the unit of a stage that has only one
+PENDING = ItemRef("", "0" * 32, {})  # placeholder for an item of which only the name is known
 OF_CODE = frozenset({"code", "libraries"})
 """The parts of a unit's identity that describe the code that computes it."""
 

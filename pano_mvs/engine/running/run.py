@@ -42,12 +42,8 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis, Files, Record
 
-GRACE_S = 10.0
-"""Time for which running units may go on after an interrupt, so that their results are not lost."""
-
-WAIT_S = 5.0
-"""Time without an event after which observers are notified that the run is waiting for units."""
-
+GRACE_S = 10.0  # time for which running units may go on after an interrupt, so that their results are not lost
+WAIT_S = 5.0  # time without an event after which observers are notified that the run is waiting for units
 _MAX_REPAIRS = 3
 _STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 

@@ -111,8 +111,7 @@ def _version(module: str) -> str:
     return "not installed"
 
 
-_Code = tuple[str, tuple[str, ...]]
-"""A digest, and the libraries that the code uses."""
+_Code = tuple[str, tuple[str, ...]]  # a digest, and the libraries that the code uses
 
 
 @cache

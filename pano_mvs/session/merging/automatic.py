@@ -19,8 +19,7 @@ from pano_mvs.session.planning import reference_times
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
-MIN_SIZE = 7
-"""Smallest number of images of a block."""
+MIN_SIZE = 7  # smallest number of images of a block
 
 
 def default_overlap(size: int) -> int:
