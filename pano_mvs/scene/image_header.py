@@ -197,18 +197,12 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Tiff:
-    """A TIFF in memory.
-
-    Attributes:
-        order: "<" or ">".
-        first: offset of its first directory.
-        is_big: whether it is a BigTIFF.
-    """
+    """A TIFF in memory."""
 
     data: bytes
-    order: str
-    first: int
-    is_big: bool
+    order: str  # "<" or ">"
+    first: int  # offset of its first directory
+    is_big: bool  # whether it is a BigTIFF
 
     def directory(self, offset: int) -> Mapping[int, Entry]:
         """Return the entries of the directory at an offset by tag, without those that point outside of the data."""

@@ -17,23 +17,17 @@ from pano_mvs.engine.workflows.workflow import Workflow
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """The options of one run.
+    """The options of one run."""
 
-    Attributes:
-        until: the run ends after these stages; empty to run all.
-        only: units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
-        refresh: stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached.
-        accept_code: reuse results that differ from what is needed only in the code or the libraries that computed them.
-        keep_going: go on after a failed unit even if its stage says `on_error: stop`.
-        isolate: compute each unit of a plugin's stage in a process of its own.
-    """
-
-    until: tuple[str, ...] = ()
+    until: tuple[str, ...] = ()  # the run ends after these stages; empty to run all
+    # units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
     only: tuple[str, ...] = ()
+    # stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached
     refresh: tuple[str, ...] = ()
+    # reuse results that differ from what is needed only in the code or the libraries that computed them
     accept_code: bool = False
-    keep_going: bool = False
-    isolate: bool = False
+    keep_going: bool = False  # go on after a failed unit even if its stage says `on_error: stop`
+    isolate: bool = False  # compute each unit of a plugin's stage in a process of its own
 
     @property
     def is_partial(self) -> bool:

@@ -344,20 +344,14 @@ BASELINES = "best", "median", "mean"
 
 @dataclass(frozen=True, slots=True)
 class ViewScores:
-    """The scores of one range map, and of constants.
+    """The scores of one range map, and of constants."""
 
-    Attributes:
-        pixels: number of pixels with truth.
-        scale: factor by which the estimates were multiplied.
-        scores: name to value (see `score_view`).
-        constants: name of a baseline to its scores by the same names. "best" is the best constant for each score (see
-            `best_constant_errors`), "median" and "mean" are those of the view's true ranges, unweighted. Each is scored
-            over the same pixels as the range map.
-    """
-
-    pixels: int
-    scale: float
-    scores: Mapping[str, float]
+    pixels: int  # number of pixels with truth
+    scale: float  # factor by which the estimates were multiplied
+    scores: Mapping[str, float]  # name to value (see `score_view`)
+    # name of a baseline to its scores by the same names. "best" is the best constant for each score (see
+    # `best_constant_errors`), "median" and "mean" are those of the view's true ranges, unweighted. Each is scored over
+    # the same pixels as the range map.
     constants: Mapping[str, Mapping[str, float]]
 
 
