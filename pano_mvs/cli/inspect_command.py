@@ -15,6 +15,7 @@ from rich.table import Table
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
@@ -28,8 +29,6 @@ from pano_mvs.session.session import Session
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.curves import curve_text
 from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
-
-_SHOWN = 6
 
 
 @dataclass(frozen=True)
@@ -111,8 +110,7 @@ def _image(wanted: str, names: Sequence[str]) -> str:
         return fitting[0]
     shown = fitting or list(names)
     raise UsageError(
-        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
-        f"{' …' if len(shown) > _SHOWN else ''}"
+        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {shortened_list(shown, 6, rest=' …')}"
     )
 
 

@@ -115,9 +115,6 @@ def _print_reasons(plan: StagePlan, console: Console) -> None:
         console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
 
 
-_SHOWN = 8
-
-
 def explain_unit(session: Session, label: str, console: Console) -> None:
     """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit."""
     stage, _, item = label.partition(":")
@@ -143,7 +140,7 @@ def _why_not(plan: StagePlan, item: str) -> str:
     if item in plan.may_run or plan.open:
         return "waits for outputs that are not computed yet; run what it needs first"
     known = [*plan.cached, *plan.run]
-    shown = ", ".join(known[:_SHOWN]) + (" …" if len(known) > _SHOWN else "")
+    shown = shortened_list(known, 8, rest=" …")
     raise UsageError(f"{plan.name} has no unit {item!r}; it has: {shown or 'none'}")
 
 
@@ -177,7 +174,7 @@ def _read(value: UnitInput) -> str:
     if isinstance(value, ItemRef):
         return f"{value.kind} {value.digest}"
     names = [f"{name} ({ref.digest[:8]})" if ref.digest else name for name, ref in value.items()]
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return shortened_list(names, 8, rest=" and {more} more")
 
 
 def show_status(

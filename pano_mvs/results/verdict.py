@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.results.figures import degrees, figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary, Tile, Verdict
 from pano_mvs.results.residuals import Residuals
@@ -269,7 +269,7 @@ def _groups(summary: RunSummary) -> Iterator[Finding]:
 
 def _named(group: PoseGroup) -> str:
     names = group.images
-    return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
+    return f"{len(names)} ({shortened_list(names, rest=' …')})"
 
 
 def pictures_between(groups: Sequence[PoseGroup]) -> str:
@@ -307,7 +307,7 @@ def _graph(summary: RunSummary) -> Iterator[Finding]:
     loose = [name for name in names if 0 < count[name] < 2]
     if not loose:
         return
-    shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
+    shown = shortened_list(loose, rest=" …")
     mood = "fair" if len(loose) > len(names) / 4 else ""
     sharing = plural(len(loose), "camera shares", "cameras share")
     yield Finding(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import replacing
 from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.engine.workflows.wiring import Edge, Graph, wire
@@ -305,8 +306,8 @@ def _camera(groups: list[Poses], text: str) -> tuple[int, str]:
     matched = match_image_names([text], names)
     if text not in matched:
         raise UsageError(
-            f"{text[:80]!r} is not one registered image, nor coordinates x,y,z. Images: {', '.join(names[:8])}"
-            f"{' …' if len(names) > 8 else ''}"
+            f"{text[:80]!r} is not one registered image, nor coordinates x,y,z. Images: "
+            f"{shortened_list(names, 8, rest=' …')}"
         )
     name = matched[text]
     return next(number for number, group in enumerate(groups) if name in group.names), name

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.text import shortened_list
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
@@ -105,7 +106,7 @@ class Tour:
             names = [camera.name for camera in self.scene.cameras]
             matched = match_image_names([name], names)
             if name not in matched:
-                shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+                shown = shortened_list(names, 6, rest=" …")
                 raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
             found = names.index(matched[name])
             self.step_into(found)

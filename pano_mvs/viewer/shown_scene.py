@@ -13,7 +13,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import file_inside
 from pano_mvs.core.paths import is_file, is_folder, resolved
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
@@ -23,7 +23,6 @@ from pano_mvs.scene.files import group_file
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
-_NAMED_DOUBTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     mesh_file = _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images=images, notes=notes)
     if doubtful := [camera.name for camera in cameras if camera.doubtful]:
-        shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
+        shown = shortened_list(doubtful, 5, rest=" …")
         notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
     cloud = _cloud(_written(path, run, cloud_name), cloud_name, notes)
     if cloud is None and mesh_file is None and not cameras:

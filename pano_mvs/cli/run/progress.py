@@ -25,7 +25,6 @@ from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStart
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
 _SHOWN_STAGES = 6
-_SHOWN_UNITS = 2
 _BAR_WIDTH = 20
 _NAME_WIDTH = 14
 
@@ -170,8 +169,7 @@ def _count(stage: StageProgress) -> str:
 def _units(stage: StageProgress) -> Text:
     """Return the units that are being computed; nothing for a stage with a single unit."""
     names = [one_line(item) for item in stage.running if item]
-    more = f" and {len(names) - _SHOWN_UNITS} more" if len(names) > _SHOWN_UNITS else ""
-    return Text(", ".join(names[:_SHOWN_UNITS]) + more, overflow="ellipsis", no_wrap=True)
+    return Text(shortened_list(names, 2, rest=" and {more} more"), overflow="ellipsis", no_wrap=True)
 
 
 class _Repeated:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.resolve import SourceListing, resolve
 from pano_mvs.engine.planning.units import OF_CODE, StageState, Unit
@@ -84,9 +85,6 @@ def _items_by_stage(units: Iterable[str]) -> Mapping[str, frozenset[str]]:
         stage, _, item = unit.partition(":")
         found.setdefault(stage, set()).add(item)
     return {stage: frozenset(items) for stage, items in found.items() if "" not in items}
-
-
-_SHOWN = 3
 
 
 def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
@@ -166,7 +164,7 @@ def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
     names = [name for name, entry in zip(value, new, strict=True) if str(entry) not in known]
     if not names:
         return "fewer items" if len(new) < len(old or []) else "another order"
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return shortened_list(names, rest=" and {more} more")
 
 
 @dataclass(slots=True)

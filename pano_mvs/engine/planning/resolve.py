@@ -12,6 +12,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, InputError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.core.paths import reason_of
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
@@ -133,8 +134,6 @@ def _path_digest(path: Path) -> str:
 KEY_SCHEMA = 3
 """Raise this if the engine passes other inputs, seeds or settings for the same key, or makes keys differently."""
 
-_MAX_SHOWN = 20
-
 
 def resolve_source(
     entry: StageEntry, store: Store, *, only: frozenset[str] | None = None, listing: SourceListing | None = None
@@ -249,8 +248,7 @@ class Resolver:
         missing = sorted(self.only - names.keys())
         if missing:
             raise UsageError(
-                f"{self.entry.name} has no unit {missing[0]!r}; it has: {', '.join(list(names)[:_MAX_SHOWN])}"
-                f"{' …' if len(names) > _MAX_SHOWN else ''}"
+                f"{self.entry.name} has no unit {missing[0]!r}; it has: {shortened_list(names, 20, rest=' …')}"
             )
         return {name: names[name] for name in names if name in self.only}
 
