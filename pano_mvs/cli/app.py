@@ -9,7 +9,8 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -70,6 +71,13 @@ def options(
     """Dense 3D from 360° photographs."""
 
 
+# Options by the panel of the help in which they are listed.
+_worker_option = partial(typer.Option, rich_help_panel="Workers")
+_disk_option = partial(typer.Option, rich_help_panel="Disk and messages")
+_block_option = partial(typer.Option, rich_help_panel="Blocks of a large capture")
+_shown_option = partial(typer.Option, rich_help_panel="What is shown")
+
+
 @dataclass(frozen=True)
 class RunArguments:
     """The arguments and options of `pano-mvs run`."""
@@ -81,12 +89,11 @@ class RunArguments:
     cache: CacheOption = None
     executor: Annotated[
         str,
-        typer.Option(
+        _worker_option(
             "--executor",
             help="How units are computed: processes, dask, jobs of a queueing system (slurm, pbs, lsf or sge), or "
             "serial (one unit at a time in this process, for debugging). Default: processes.",
             show_default=False,
-            rich_help_panel="Workers",
         ),
     ] = ""
     workers: Annotated[
@@ -94,50 +101,36 @@ class RunArguments:
         typer.Option("--workers", min=0, help="Number of worker processes; 0: one per core, if memory permits."),
     ] = 0
     threads: Annotated[
-        int,
-        typer.Option(
-            "--threads-per-worker",
-            min=0,
-            help="Threads per worker; 0: an equal share of the cores.",
-            rich_help_panel="Workers",
-        ),
+        int, _worker_option("--threads-per-worker", min=0, help="Threads per worker; 0: an equal share of the cores.")
     ] = 0
     scheduler: Annotated[
         str,
-        typer.Option(
+        _worker_option(
             "--scheduler",
             metavar="ADDRESS",
             help="Use this dask scheduler, such as tcp://host:8786; its workers must share the cache.",
             show_default=False,
-            rich_help_panel="Workers",
         ),
     ] = ""
     queue: Annotated[
         Path | None,
-        typer.Option(
+        _worker_option(
             "--queue",
             metavar="FILE.yaml",
             help="Settings of the jobs of slurm, pbs, lsf or sge: cores, memory, walltime, number of jobs, queue.",
             show_default=False,
-            rich_help_panel="Workers",
         ),
     ] = None
     notify: Annotated[
         list[str] | None,
-        typer.Option(
+        _disk_option(
             "--notify",
             metavar="URL",
             help="Send a message when the run has ended, to an address of apprise such as ntfy://topic; repeatable.",
-            rich_help_panel="Disk and messages",
         ),
     ] = None
     otel: Annotated[
-        bool,
-        typer.Option(
-            "--otel",
-            help="Send the run, its stages and units as spans to an OpenTelemetry collector.",
-            rich_help_panel="Disk and messages",
-        ),
+        bool, _disk_option("--otel", help="Send the run, its stages and units as spans to an OpenTelemetry collector.")
     ] = False
     as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False
     until: UntilOption = None
@@ -148,71 +141,51 @@ class RunArguments:
         bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
     ] = False
     isolate: Annotated[
-        bool,
-        typer.Option(
-            "--isolate",
-            help="Compute each unit of a plugin's stage in a process of its own.",
-            rich_help_panel="Workers",
-        ),
+        bool, _worker_option("--isolate", help="Compute each unit of a plugin's stage in a process of its own.")
     ] = False
     min_free: Annotated[
         str,
-        typer.Option(
+        _disk_option(
             "--min-free",
             metavar="SIZE",
             help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
             show_default=False,
-            rich_help_panel="Disk and messages",
         ),
     ] = ""
     durable: Annotated[
-        bool,
-        typer.Option(
-            "--durable",
-            help="Flush each result to disk, for machines that may lose power.",
-            rich_help_panel="Disk and messages",
-        ),
+        bool, _disk_option("--durable", help="Flush each result to disk, for machines that may lose power.")
     ] = False
     dry_run: Annotated[
         bool, typer.Option("-n", "--dry-run", help="Only show what would be computed, as `pano-mvs plan` does.")
     ] = False
     block_size: Annotated[
         int | None,
-        typer.Option(
+        _block_option(
             "--block-size",
             metavar="N",
             min=0,
             help="Run overlapping blocks of at most N images one after the other, and merge them; 0: all images at "
             "once. Default: blocks if pairs or poses would take more memory than there is.",
             show_default=False,
-            rich_help_panel="Blocks of a large capture",
         ),
     ] = None
     block_overlap: Annotated[
         int,
-        typer.Option(
+        _block_option(
             "--block-overlap",
             metavar="N",
             min=0,
             help="Images that consecutive blocks share; default: a quarter of the block size, 3 to 100.",
             show_default=False,
-            rich_help_panel="Blocks of a large capture",
         ),
     ] = 0
     block_loop: Annotated[
-        bool,
-        typer.Option(
-            "--block-loop",
-            help="The path ends where it began: the last block overlaps the first.",
-            rich_help_panel="Blocks of a large capture",
-        ),
+        bool, _block_option("--block-loop", help="The path ends where it began: the last block overlaps the first.")
     ] = False
     block_poses: Annotated[
         Path | None,
-        typer.Option(
-            "--block-poses",
-            help="Rough poses, such as an output folder: blocks also overlap where the path returns.",
-            rich_help_panel="Blocks of a large capture",
+        _block_option(
+            "--block-poses", help="Rough poses, such as an output folder: blocks also overlap where the path returns."
         ),
     ] = None
 
@@ -447,60 +420,32 @@ class ViewArguments:
     view: Annotated[str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")] = (
         "overview"
     )
-    color: Annotated[
-        str,
-        typer.Option(
-            "--color", help="Colours: rgb, confidence, views, normals or height.", rich_help_panel="What is shown"
-        ),
-    ] = "rgb"
+    color: Annotated[str, _shown_option("--color", help="Colours: rgb, confidence, views, normals or height.")] = "rgb"
     surface: Annotated[
         str,
-        typer.Option(
+        _shown_option(
             "--show",
             metavar="cloud|mesh|both",
             help="What to show; default: the cloud if it exists.",
             show_default=False,
-            rich_help_panel="What is shown",
         ),
     ] = ""
-    points: Annotated[
-        int,
-        typer.Option(
-            "--points", min=0, help="Maximum number of points to draw; 0: all.", rich_help_panel="What is shown"
-        ),
-    ] = 2_000_000
+    points: Annotated[int, _shown_option("--points", min=0, help="Maximum number of points to draw; 0: all.")] = (
+        2_000_000
+    )
     size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")] = (
         "1280x860"
     )
     images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")] = None
-    labels: Annotated[
-        bool, typer.Option("--labels", help="Show the names of the cameras.", rich_help_panel="What is shown")
-    ] = False
-    blended: Annotated[
-        bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.", rich_help_panel="What is shown")
-    ] = False
-    backs: Annotated[
-        bool,
-        typer.Option(
-            "--backs", help="Also show points that face away from the viewer.", rich_help_panel="What is shown"
-        ),
-    ] = False
+    labels: Annotated[bool, _shown_option("--labels", help="Show the names of the cameras.")] = False
+    blended: Annotated[bool, _shown_option("--blend", help="Overlay the cloud on the panoramas.")] = False
+    backs: Annotated[bool, _shown_option("--backs", help="Also show points that face away from the viewer.")] = False
     group: Annotated[
         int,
-        typer.Option(
-            "--group",
-            min=0,
-            help="Group to show if the panoramas form several groups; 0 is the largest.",
-            rich_help_panel="What is shown",
-        ),
+        _shown_option("--group", min=0, help="Group to show if the panoramas form several groups; 0 is the largest."),
     ] = 0
     ranges: Annotated[
-        bool,
-        typer.Option(
-            "--ranges",
-            help="Inside a camera, show its ranges; unconfirmed ones are marked.",
-            rich_help_panel="What is shown",
-        ),
+        bool, _shown_option("--ranges", help="Inside a camera, show its ranges; unconfirmed ones are marked.")
     ] = False
 
 
@@ -511,20 +456,7 @@ def view_results(given: ViewArguments) -> None:
     """View the cloud, the mesh and the cameras, and step inside the panoramas."""
     from pano_mvs.viewer.view import ViewOptions, view_run
 
-    options = ViewOptions(
-        given.images,
-        given.screenshot,
-        given.view,
-        given.color,
-        given.surface,
-        given.points,
-        given.size,
-        given.labels,
-        given.blended,
-        given.backs,
-        given.group,
-        given.ranges,
-    )
+    options = ViewOptions(**{field.name: getattr(given, field.name) for field in fields(ViewOptions)})
     console = Console()
     view_run(given.out, options, say=lambda note: console.say(f"note: {escape(note)}"))
     if given.screenshot is not None:

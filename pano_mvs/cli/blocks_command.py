@@ -42,16 +42,7 @@ def run_decided(
     """Run a workflow, in blocks if that was decided, print progress and a summary, and return the exit code.
 
     Args:
-        execution: how units are computed.
-        decision: whether the capture is divided.
-        as_json: print events instead.
-        dry_run: only print the plan.
         advise: whether to print the commands that can follow.
-
-    Raises:
-        UsageError: if the session cannot be run in blocks, or an option does not go with blocks.
-        InputError: if there are no images.
-        StoreError: if the output folder cannot be written.
     """
     if decision.division is not None:
         return _run_blocks_shown(session, execution, decision, as_json=as_json, dry_run=dry_run)
@@ -158,11 +149,6 @@ def show_blocks(
     Args:
         session: over the whole capture.
         decision: with a division.
-        console: where to print.
-
-    Raises:
-        UsageError: if the session cannot be run in blocks.
-        InputError: if there are no images.
     """
     assert decision.division is not None
     if decision.reason:
@@ -177,13 +163,7 @@ def show_blocks(
 
 
 def split_command(images: Path, to: Path, division: Division, *, console: Console) -> None:
-    """Write the blocks of a capture, and print them and the commands that follow.
-
-    Raises:
-        UsageError: if a setting or a folder cannot be used.
-        InputError: if there are no images, or the poses are of other images.
-        StoreError: if a link cannot be made.
-    """
+    """Write the blocks of a capture, and print them and the commands that follow."""
     blocks = split_images(images, to, division)
     outs = [f"out/{block.folder.name}" for block in blocks]
     for block, out in zip(blocks, outs, strict=True):
@@ -195,13 +175,7 @@ def split_command(images: Path, to: Path, division: Division, *, console: Consol
 
 
 def merge_blocks_command(outs: tuple[Path, ...], to: Path, *, cache: Path | None, console: Console) -> int:
-    """Merge output folders, print how well they agree and what was written, and return the exit code.
-
-    Raises:
-        UsageError: if the folders cannot be used.
-        InputError: if the blocks cannot be merged.
-        StoreError: if a file cannot be written.
-    """
+    """Merge output folders, print how well they agree and what was written, and return the exit code."""
     with console.status("merging"):
         summary = merge_outputs(outs, to, cache=cache).summary
     for text in summary.notes:

@@ -17,7 +17,6 @@ from pano_mvs.session.calibrating import QUARTER_TURNS, calibrate_camera
 from pano_mvs.session.scaling import metres_from_text
 
 _LAYOUTS = ("auto", "side_by_side", "folders", "suffixes")
-_MAX_DISTANCE_M = 1.0
 
 
 def calibrate(
@@ -32,24 +31,7 @@ def calibrate(
     captures: int,
     console: Console,
 ) -> None:
-    """Write the calibration of the camera that took some raw pictures.
-
-    Args:
-        photos: their folder.
-        out: the file to write.
-        names: names of the lenses, separated by a comma.
-        layout: how the pictures of both lenses are stored.
-        distance: distance between the lenses, with its unit; empty if unknown.
-        field_of_view_deg: start value; 0 for that of the camera.
-        up: side of the first lens's picture where the top of the scene is.
-        captures: maximum number of captures to use.
-        console: where to print.
-
-    Raises:
-        UsageError: if an option is wrong.
-        InputError: if the pictures do not determine the lenses.
-        StoreError: if the disk is full.
-    """
+    """Write the calibration of the camera that took some raw pictures."""
     lenses = tuple(part.strip() for part in names.split(","))
     if len(lenses) != 2 or not all(lenses) or lenses[0] == lenses[1]:
         raise UsageError(f"--lenses {names[:80]!r}: give two different names, separated by a comma: front,back")
@@ -58,7 +40,7 @@ def calibrate(
     if up not in QUARTER_TURNS:
         raise UsageError(f"--up {up[:80]!r}: choose one of {', '.join(QUARTER_TURNS)}")
     distance_m = metres_from_text(distance) if distance else None
-    if distance_m is not None and distance_m > _MAX_DISTANCE_M:
+    if distance_m is not None and distance_m > 1.0:
         raise UsageError(
             f"--distance {distance}: {distance_m:g} m is too far for the lenses of one camera. Add a unit: 28mm"
         )

@@ -18,8 +18,7 @@ from pano_mvs.core.paths import children, is_folder
 if TYPE_CHECKING:
     from pano_mvs.engine.workflows.workflow import StageEntry
 
-Offer = tuple[str, str]
-"""What may be put there, and what it is."""
+Offer = tuple[str, str]  # what may be put there, and what it is
 
 
 def _silent(complete: Callable[..., Iterator[Offer]]) -> Callable[..., list[Offer]]:
@@ -42,7 +41,9 @@ def complete_workflow(incomplete: str) -> Iterator[Offer]:
     from pano_mvs.session.session import presets_folder
 
     for preset in children(presets_folder(), "*.yaml"):
-        yield preset.stem, _first_comment(preset)
+        with preset.open(encoding="utf-8") as stream:
+            line = stream.readline().strip()
+        yield preset.stem, (line.removeprefix("#").strip() if line.startswith("#") else "preset")
     folder = incomplete.rpartition("/")[0]
     for path in children(Path(f"{folder}/" if folder or incomplete.startswith("/") else ".")):
         shown = f"{folder}/{path.name}" if "/" in incomplete else path.name
@@ -113,9 +114,3 @@ def _values(field: Mapping[str, Any]) -> Iterator[str]:
         yield from (str(value) for value in option.get("enum", ()))
         if option.get("type") == "null":
             yield "null"
-
-
-def _first_comment(path: Path) -> str:
-    with path.open(encoding="utf-8") as stream:
-        line = stream.readline().strip()
-    return line.removeprefix("#").strip() if line.startswith("#") else "preset"

@@ -11,8 +11,6 @@ from rich.segment import Segment
 
 from pano_mvs.core.text import shortened, without_controls
 
-_MAX_LINE = 10_000
-
 
 class Console(rich.console.Console):
     """A console that escapes control characters and cuts overlong lines."""
@@ -23,7 +21,7 @@ class Console(rich.console.Console):
             if segment.control:
                 yield segment
             else:
-                yield Segment(shortened(without_controls(segment.text), _MAX_LINE), segment.style)
+                yield Segment(shortened(without_controls(segment.text), 10_000), segment.style)
 
     def say(self, text: str) -> None:
         """Print text with markup, without wrapping it and without colours of numbers and paths."""

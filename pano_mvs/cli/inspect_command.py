@@ -15,6 +15,7 @@ from rich.table import Table
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
@@ -29,20 +30,10 @@ from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.curves import curve_text
 from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
 
-_SHOWN = 6
-
 
 @dataclass(frozen=True)
 class PixelWanted:
-    """The pixel to inspect.
-
-    Attributes:
-        image: name of the image, or a unique part of it.
-        x: column of the pixel from the left, at the resolution of the sweep; fractions are dropped.
-        y: row of the pixel from the top.
-        stage: name of the sweep in the workflow; empty for the first.
-        truth: folder with poses.json and depth.npz; None for the workflow's own.
-    """
+    """The pixel to inspect."""
 
     image: str
     x: float
@@ -52,16 +43,17 @@ class PixelWanted:
 
 
 def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Path | None, as_json: bool) -> None:
-    """Print the analysis of a pixel.
-
-    Raises:
-        UsageError: if there is no such sweep, image or pixel.
-        InputError: if an input of the sweep is not computed yet.
-        StoreError: if the plot cannot be written.
-    """
+    """Print the analysis of a pixel."""
     found = _inspection(session, wanted)
     if plot is not None:
-        _write_plot(plot, found)
+        from pano_mvs.viewer.curves import write_curve_picture
+
+        if plot.suffix.lower() != ".png":
+            raise UsageError(f"--plot {plot}: the plot is a PNG image, so the file name must end in .png")
+        try:
+            write_curve_picture(plot, found)
+        except OSError as error:
+            raise StoreError(f"--plot {plot}: cannot be written ({error.strerror}). Choose another place") from error
     if as_json:
         print_json(as_json_value(found))
         return
@@ -78,7 +70,6 @@ class _Found:
     units: dict[str, dict[str, UnitFound]] = field(default_factory=dict)
 
     def look(self, unit: Unit, record: UnitRecord | None, _reason: str) -> None:
-        """Add a unit."""
         if unit.source is not None:
             self.images.append(unit.item)
         if issubclass(unit.entry.spec.output, RangeMap):
@@ -119,8 +110,7 @@ def _image(wanted: str, names: Sequence[str]) -> str:
         return fitting[0]
     shown = fitting or list(names)
     raise UsageError(
-        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
-        f"{' …' if len(shown) > _SHOWN else ''}"
+        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {shortened_list(shown, 6, rest=' …')}"
     )
 
 
@@ -147,17 +137,6 @@ def _truth_of(session: Session, image: str) -> Path | None:
         if isinstance(folder, Path) and is_file(folder / "poses.json"):
             return folder if read_truth(folder).match([image]) else None
     return None
-
-
-def _write_plot(path: Path, found: Inspection) -> None:
-    from pano_mvs.viewer.curves import write_curve_picture
-
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")
-    try:
-        write_curve_picture(path, found)
-    except OSError as error:
-        raise StoreError(f"--plot {path}: cannot be written ({error.strerror}). Choose another place") from error
 
 
 _BLOCKS = "▁█△"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeVar, get_type_hints
 
@@ -71,30 +72,21 @@ UntilOption = Annotated[
         autocompletion=complete_stage,
     ),
 ]
+# Options by the panel of the help in which they are listed.
+_unit_option = partial(typer.Option, rich_help_panel="Selection of units")
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--only",
-        metavar="STAGE:ITEM",
-        help="Run only this unit and the units that it needs.",
-        rich_help_panel="Selection of units",
-    ),
+    _unit_option("--only", metavar="STAGE:ITEM", help="Run only this unit and the units that it needs."),
 ]
 RefreshOption = Annotated[
     list[str] | None,
-    typer.Option(
+    _unit_option(
         "--refresh",
         metavar="STAGE[:ITEM]",
         help="Recompute this stage or unit even if it is cached.",
         autocompletion=complete_stage,
-        rich_help_panel="Selection of units",
     ),
 ]
 AcceptOption = Annotated[
-    bool,
-    typer.Option(
-        "--accept-code",
-        help="Reuse results that were computed before code or libraries changed.",
-        rich_help_panel="Selection of units",
-    ),
+    bool, _unit_option("--accept-code", help="Reuse results that were computed before code or libraries changed.")
 ]

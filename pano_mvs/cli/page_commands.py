@@ -38,10 +38,6 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     """Write `report.html` of an output folder from its run.json and the cache that the run used.
 
     The cache is `cache`, else $PANO_MVS_CACHE, else the one that run.json names. Merged runs need none.
-
-    Raises:
-        InputError: if there is no run.json or no cache, since a page without images would replace one with images.
-        StoreError: if the cache's list of runs is damaged, or a run is writing into the folder.
     """
     summary = RunSummary.read(out)
     # Merged runs have no values in a cache: their pictures are files in the folder.
@@ -64,13 +60,7 @@ def _stored_values(out: Path, summary: RunSummary, cache: Path | None) -> Stored
 def share_output(
     out: Path, to: Path, options: ShareOptions, *, images: Path | None, cache: Path | None, console: Console
 ) -> None:
-    """Write the page of an output folder and print where it is.
-
-    Raises:
-        InputError: if the folder holds no run, or the run has nothing to show.
-        UsageError: if `to` holds something else, or cannot be written.
-        StoreError: if a file cannot be written.
-    """
+    """Write the page of an output folder and print where it is."""
     with console.status("panoramas") as status:
         shared = share_run(
             load(out, cache=cache),
@@ -93,15 +83,7 @@ def share_output(
 
 @dataclass(frozen=True)
 class TourWanted:
-    """What a tour is made of, and where.
-
-    Attributes:
-        images: folder of panoramas or of a virtual tour, or a video.
-        out: output folder; None for `out/` and the name of `images`. The page is beside it.
-        workflow: a preset or a workflow file; empty for `mesh`, or `walk` for a video.
-        overrides: settings, as `--set` takes them.
-        cache: folder of the cache; None for the default.
-    """
+    """What a tour is made of, and where."""
 
     images: Path
     out: Path | None = None
@@ -111,18 +93,7 @@ class TourWanted:
 
 
 def make_tour(wanted: TourWanted, console: Console, *, opens: bool) -> int:
-    """Run a workflow, write the page of its results unless it ended early, and return the exit code of the run.
-
-    Args:
-        wanted: what the tour is made of.
-        console: where to print.
-        opens: whether to open the page in a browser.
-
-    Raises:
-        UsageError: if the workflow, a setting or a folder cannot be used.
-        InputError: if the images cannot be read.
-        StoreError: if the cache, the output folder or the page cannot be written.
-    """
+    """Run a workflow, write the page of its results unless it ended early, and return the exit code of the run."""
     is_video = not is_folder(wanted.images) and wanted.images.suffix.lower() in VIDEO_SUFFIXES
     place = resolved(wanted.images)
     session = open_session(

@@ -31,11 +31,7 @@ _SHOWN_REASONS = 5
 
 
 def show_dry_run(session: Session, console: Console, *, execution: Execution, as_json: bool) -> None:
-    """Print the plan of a run, for its number of workers.
-
-    Raises:
-        UsageError: if the output folder cannot be used, or JSON is requested.
-    """
+    """Print the plan of a run, for its number of workers."""
     if as_json:
         raise UsageError("--dry-run prints a table, not events: leave out --json")
     check_output(session)
@@ -51,7 +47,6 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
     """Print for each stage the units that are cached and that would or may run, with reasons, times and sizes.
 
     Args:
-        console: where to print.
         workers: number of units at a time, for the times; 0 for the default.
         threads: of each worker; 0 for the default.
     """
@@ -120,15 +115,8 @@ def _print_reasons(plan: StagePlan, console: Console) -> None:
         console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
 
 
-_SHOWN = 8
-
-
 def explain_unit(session: Session, label: str, console: Console) -> None:
-    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit.
-
-    Raises:
-        UsageError: if there is no such stage or unit.
-    """
+    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit."""
     stage, _, item = label.partition(":")
     workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
     store = Store(session.store_root, for_reading=True)
@@ -152,7 +140,7 @@ def _why_not(plan: StagePlan, item: str) -> str:
     if item in plan.may_run or plan.open:
         return "waits for outputs that are not computed yet; run what it needs first"
     known = [*plan.cached, *plan.run]
-    shown = ", ".join(known[:_SHOWN]) + (" …" if len(known) > _SHOWN else "")
+    shown = shortened_list(known, 8, rest=" …")
     raise UsageError(f"{plan.name} has no unit {item!r}; it has: {shown or 'none'}")
 
 
@@ -186,7 +174,7 @@ def _read(value: UnitInput) -> str:
     if isinstance(value, ItemRef):
         return f"{value.kind} {value.digest}"
     names = [f"{name} ({ref.digest[:8]})" if ref.digest else name for name, ref in value.items()]
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return shortened_list(names, 8, rest=" and {more} more")
 
 
 def show_status(
@@ -204,13 +192,6 @@ def show_status(
 
     Args:
         target: a workflow, or an output folder, whose run.json states workflow, settings, images and cache.
-        out: output folder of a workflow; None for the default.
-        overrides: settings.
-        images: folder of panoramas.
-        console: where to print.
-
-    Raises:
-        InputError: if an output folder has no run.json, or its workflow is missing.
     """
     if is_folder(Path(target)):
         latest = _print_latest(Path(target), console)

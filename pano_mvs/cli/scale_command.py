@@ -22,9 +22,6 @@ from pano_mvs.session.scaling import (
 )
 from pano_mvs.session.summarise import height_note
 
-_USUAL_HEIGHTS_M = (0.3, 4.0)
-"""Outside of these, the height of the cameras is called in question."""
-
 
 def scale_output(
     out: Path, known: tuple[str, ...], *, camera_height: str, group: int, cache: Path | None, console: Console
@@ -32,18 +29,6 @@ def scale_output(
     """Scale a run by a measurement, run its exports again, and return the exit code.
 
     Without a measurement, only the scale that a usual camera height would give is printed.
-
-    Args:
-        out: the output folder of a run.
-        known: two ends and the distance between them, or nothing.
-        camera_height: height of the cameras above the floor, with its unit; empty if unknown.
-        group: group of poses, if points or a height were measured.
-        cache: folder of the cache; None for that of the run.
-        console: where to print.
-
-    Raises:
-        UsageError: if the measurement cannot be used, or the results are merged from blocks.
-        InputError: if the folder holds no run.
     """
     run = load(out, cache=cache)
     if run.summary.merged is not None:
@@ -61,7 +46,7 @@ def scale_output(
     lines = [f"{measurement.origin}: {text}", f"workflow: {out / WORKFLOW_FILE}"]
     if chosen is not None and chosen.camera_height is not None:
         height_m = chosen.camera_height * measurement.factor
-        doubt = "" if _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1] else "; is the distance right?"
+        doubt = "" if 0.3 <= height_m <= 4.0 else "; is the distance right?"
         lines.insert(1, f"the cameras are then {height_m:.3g} m above the floor{doubt}")
     console.say("\n".join(map(escape, lines)))
     return run_workflow(session, Execution())

@@ -45,11 +45,7 @@ class StreamState:
 
 
 class LenientStream(io.TextIOWrapper):
-    """A text stream that drops all output after the first failed write.
-
-    Attributes:
-        state: whether it can still be written.
-    """
+    """A text stream that drops all output after the first failed write."""
 
     def __init__(
         self, raw: io.RawIOBase, encoding: str, state: StreamState, *, owned: bool = False, by_line: bool = True

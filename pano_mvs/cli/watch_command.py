@@ -39,22 +39,11 @@ from pano_mvs.session.progress import (
 )
 from pano_mvs.session.time_estimator import StageProgress, TimeEstimator
 
-_EVERY_S = 1.0
-_LINE_EVERY_S = 30.0
-_SILENT_S = 60.0
-_SHOWN_FAILURES = 5
-_SHOWN_WARNINGS = 3
-_KILLED = 1
-
 View = TypeVar("View", bound="RunView | BlocksView")
 
 
 def watch_run(out: Path, console: Console) -> int:
-    """Show a run, or a run in blocks, until it ends, and return its exit code; 1 if it was killed.
-
-    Raises:
-        InputError: if no run has begun in the folder.
-    """
+    """Show a run, or a run in blocks, until it ends, and return its exit code; 1 if it was killed."""
     blocks = out / BLOCKS
     in_blocks = is_file(blocks / EVENTS_FILE) and not is_file(out / EVENTS_FILE)
     folder = blocks if in_blocks else out
@@ -78,23 +67,18 @@ def watch_run(out: Path, console: Console) -> int:
                 live.update(view.shown(), refresh=True)
             elif time.monotonic() >= next_line_s:
                 console.say(escape(view.left_text()))
-                next_line_s += _LINE_EVERY_S
-            time.sleep(_EVERY_S)
+                next_line_s += 30.0
+            time.sleep(1.0)
     console.print(view.shown())
     console.say(escape(_ending(view.end)))
-    return _KILLED if view.end is None else view.end.exit_code
+    return 1 if view.end is None else view.end.exit_code
 
 
 def _updated(view: View, reader: EventReader, since_s: float = 0.0) -> View:
     """Return the view after the new events; another one if another run has begun.
 
     Args:
-        view: of the run so far.
-        reader: reads its events.
         since_s: in seconds since 1970; earlier events are of an earlier run, which this one has not replaced yet.
-
-    Raises:
-        OSError: if there are no events.
     """
     is_new, events = reader.read()
     view = type(view)(view.folder) if is_new else view
@@ -181,7 +165,6 @@ class RunView:
     """What the events of a run say about it.
 
     Attributes:
-        folder: its output folder.
         end: its last event; None while it runs.
     """
 
@@ -195,9 +178,9 @@ class RunView:
         self._estimator = TimeEstimator(lambda: self._now)
         self._now = 0.0
         self._unsuccessful: Counter[str] = Counter()  # stage to its failed and blocked units
-        self._failures: deque[UnitFailed] = deque(maxlen=_SHOWN_FAILURES)
+        self._failures: deque[UnitFailed] = deque(maxlen=5)
         self._failed = 0
-        self._warnings: deque[str] = deque(maxlen=_SHOWN_WARNINGS)
+        self._warnings: deque[str] = deque(maxlen=3)
         self._ends: deque[tuple[float, float]] = deque()  # time of an estimate, and when the run would end by it
 
     def take(self, at: float, event: Event) -> None:
@@ -304,7 +287,7 @@ class RunView:
 
     def _silence(self) -> list[str]:
         silent_s = self._now - self._latest
-        if silent_s < _SILENT_S:
+        if silent_s < 60.0:
             return []
         return [f"no event for {duration_text(silent_s)}: the run is computing a long unit, or its host has failed"]
 

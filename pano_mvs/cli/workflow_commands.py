@@ -22,16 +22,7 @@ from pano_mvs.session.session import Session, presets_folder
 
 
 def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None:
-    """Write the text of a workflow and of the files that it extends, or one file with all settings.
-
-    Args:
-        out: the file; None for the standard output.
-        resolved: whether to write one file with all settings.
-
-    Raises:
-        UsageError: if the file exists, or cannot be written.
-        StoreError: if the disk is full.
-    """
+    """Write the text of a workflow and of the files that it extends, or one file with all settings."""
     text = resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text
     text = without_controls(text).rstrip("\n")
     if out is None:
@@ -44,16 +35,7 @@ def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None
 
 
 def show_schema(workflow: str | None, out: Path | None) -> None:
-    """Write the schema of workflows to a file or to the standard output.
-
-    Args:
-        workflow: a workflow whose plugins and inherited stages are included.
-        out: the file; None for the standard output.
-
-    Raises:
-        UsageError: if there is no such workflow, or the file cannot be written.
-        StoreError: if the disk is full.
-    """
+    """Write the schema of workflows to a file or to the standard output."""
     registry = Registry.installed()
     inherited = {} if workflow is None else _inherited(workflow, registry)
     text = json.dumps(workflow_schema(registry, inherited), indent=1, ensure_ascii=False) + "\n"

@@ -16,7 +16,6 @@ def for_bands(work: Callable[[int, int], object], height: int, *, threads: int, 
 
     Args:
         work: called once for each band, in any order.
-        height: number of rows.
         threads: number of bands to process at a time.
         band_rows: number of rows of a band; a call costs about 0.1 ms, which matters if rows are short.
     """

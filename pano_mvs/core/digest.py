@@ -19,8 +19,6 @@ DIGEST_BYTES = 16
 IS_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
 """Matches the digests that the functions below return."""
 
-_MAX_CHUNKS = 10_000
-
 
 def digest_from_value(value: object) -> str:
     """Return the hex digest of a tree of None, bool, int, float, str, bytes, list, tuple and dict.
@@ -60,7 +58,6 @@ class _Encoder:
         self._chunks: list[bytes] = []
 
     def digest(self) -> str:
-        """Return the hex digest of what was added."""
         self._flush()
         return self._hasher.hexdigest()
 
@@ -95,7 +92,7 @@ class _Encoder:
                 chunks.append(b"y%d:" % len(value) + value)
             case _:
                 raise UsageError(f"a {type(value).__name__} has no canonical form and cannot be part of a cache key")
-        if len(chunks) > _MAX_CHUNKS:
+        if len(chunks) > 10_000:
             self._flush()
 
     def _flush(self) -> None:

@@ -21,9 +21,7 @@ from pano_mvs.core.processes import process_place, start_of
 OUTPUT_MARK = ".pano-mvs-output"
 """An empty file, written first into every output folder, so that sources do not read images from there."""
 
-CACHE_MARK = ".pano-mvs-cache"
-"""An empty file in every cache, so that sources do not read images from there."""
-
+CACHE_MARK = ".pano-mvs-cache"  # an empty file in every cache, so that sources do not read images from there
 _FOLDERS_OF_A_CACHE = ("blobs", "records")
 
 
@@ -43,7 +41,6 @@ def _umask() -> int:
 _UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
-_ABANDONED_AFTER_S = 7 * 24 * 3600.0
 
 
 def set_aside(path: Path) -> Path:
@@ -115,7 +112,7 @@ def _is_abandoned(path: Path) -> bool:
     match = _TEMPORARY.fullmatch(path.name)
     if match and match[1] == process_place() and os.name == "posix":
         return start_of(int(match[2])) is None  # also for a process that has ended but is not reaped yet
-    return is_older(path, _ABANDONED_AFTER_S)
+    return is_older(path, 7 * 24 * 3600.0)
 
 
 def is_older(path: Path, seconds: float) -> bool:
@@ -212,7 +209,6 @@ def write_given(path: Path, text: str, what: str) -> None:
     """Write the first file of a place that the user names, as `write_text` does.
 
     Args:
-        text: what to write.
         what: the option and the place that it names, for messages.
 
     Raises:

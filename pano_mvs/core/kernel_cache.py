@@ -21,19 +21,13 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import below, exists, home_folder, is_folder
 
 VARIABLE = "NUMBA_CACHE_DIR"
-PACKAGE = Path(__file__).parent.parent
-"""The folder of `pano_mvs`, whose kernels are cached."""
-
+PACKAGE = Path(__file__).parent.parent  # the folder of `pano_mvs`, whose kernels are cached
 _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/Caches")}
 
 
 @dataclass(slots=True)
 class CompilationTime:
-    """Time that this process has spent on compiling kernels, waiting for another process that does, and loading them.
-
-    Attributes:
-        seconds: in total.
-    """
+    """Time that this process has spent on compiling kernels, waiting for another that does, and loading them."""
 
     seconds: float = 0.0
 

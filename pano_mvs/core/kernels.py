@@ -32,7 +32,6 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     compiles it, and the others wait and load the result.
 
     Args:
-        function: a function with a body that numba supports.
         options: further options of `numba.njit`, such as `parallel`.
     """
     if function is None:

@@ -23,9 +23,7 @@ _UNITS = {
     "GIB": 2**30,
     "TIB": 2**40,
 }
-_LIBRARIES_BYTES = 10**9
-"""Address space that a process takes which has loaded the libraries: 0.8 GB on Linux."""
-
+_LIBRARIES_BYTES = 10**9  # address space that a process takes which has loaded the libraries: 0.8 GB on Linux
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]*)\s*")
 
 

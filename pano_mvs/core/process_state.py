@@ -57,15 +57,10 @@ _FENV_BYTES = 512  # more than any system's fenv_t
 
 @dataclass(frozen=True)
 class ProcessState:
-    """The state of this process at one moment.
+    """The state of this process at one moment."""
 
-    Attributes:
-        settings: the value of each setting, by its name in words.
-        libraries: what the loaded library modules hold.
-    """
-
-    settings: Mapping[str, Any]
-    libraries: _Libraries
+    settings: Mapping[str, Any]  # the value of each setting, by its name in words
+    libraries: _Libraries  # what the loaded library modules hold
 
     @staticmethod
     def now(*, compared: bool = False) -> ProcessState:
@@ -89,15 +84,10 @@ class ProcessState:
 
 @dataclass(frozen=True)
 class Changes:
-    """What was different from an earlier state.
+    """What was different from an earlier state."""
 
-    Attributes:
-        settings: names of settings, in words.
-        functions: functions, classes and methods that were replaced, such as `cv2.remap`.
-    """
-
-    settings: tuple[str, ...] = ()
-    functions: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()  # names of settings, in words
+    functions: tuple[str, ...] = ()  # functions, classes and methods that were replaced, such as `cv2.remap`
 
     def __bool__(self) -> bool:
         """Return whether anything was different."""
@@ -143,20 +133,13 @@ _PLUGINS = _Plugins()
 
 @dataclass(frozen=True)
 class _Holder:
-    """A module or a class of a library, and what it holds.
-
-    Attributes:
-        values: all its values, in their order.
-        guarded: those of its values by name that may not be replaced.
-        codes: its functions that are written in Python, with their code.
-        classes: the classes of libraries among the values of a module.
-    """
+    """A module or a class of a library, and what it holds."""
 
     owner: ModuleType | type
-    values: list[object]
-    guarded: Mapping[str, object]
-    codes: Mapping[FunctionType, CodeType]
-    classes: list[type]
+    values: list[object]  # all its values, in their order
+    guarded: Mapping[str, object]  # those of its values by name that may not be replaced
+    codes: Mapping[FunctionType, CodeType]  # its functions that are written in Python, with their code
+    classes: list[type]  # the classes of libraries among the values of a module
 
     @staticmethod
     def of(owner: ModuleType | type) -> _Holder:
@@ -206,30 +189,20 @@ def _is_guarded(owner: ModuleType | type, name: str, value: object) -> bool:
 def _is_of_library(kind: type) -> bool:
     """Return whether a class belongs to a library whose classes stages use, and can be changed."""
     library = str(kind.__module__).partition(".")[0]
-    return library in _LIBRARIES and library != "numba" and not kind.__flags__ & _IMMUTABLE
-
-
-_IMMUTABLE = 1 << 8  # Py_TPFLAGS_IMMUTABLETYPE
+    immutable = 1 << 8  # Py_TPFLAGS_IMMUTABLETYPE
+    return library in _LIBRARIES and library != "numba" and not kind.__flags__ & immutable
 
 
 @dataclass(frozen=True)
 class _Libraries:
-    """What the loaded library modules and their classes hold: some 60,000 objects, compared in a few passes.
+    """What the loaded library modules and their classes hold: some 60,000 objects, compared in a few passes."""
 
-    Attributes:
-        modules: the modules by name.
-        views: the values of each, as they are at any time.
-        values: the values of all, in this order, when this was recorded.
-        functions: the functions that are written in Python.
-        codes: the code of each of those.
-    """
-
-    modules: Mapping[str, ModuleType]
+    modules: Mapping[str, ModuleType]  # the modules by name
     holders: list[_Holder]
-    views: Sequence[ValuesView[object]]
-    values: list[object]
-    functions: list[FunctionType]
-    codes: list[CodeType]
+    views: Sequence[ValuesView[object]]  # the values of each, as they are at any time
+    values: list[object]  # the values of all, in this order, when this was recorded
+    functions: list[FunctionType]  # the functions that are written in Python
+    codes: list[CodeType]  # the code of each of those
 
     @staticmethod
     def now(*, compared: bool) -> _Libraries:
@@ -261,7 +234,6 @@ class _Libraries:
             return False
 
     def put_back(self) -> Iterator[str]:
-        """Put back what was replaced, and yield the names."""
         for name, module in self.modules.items():
             if sys.modules.get(name) is not module:
                 sys.modules[name] = module
@@ -298,7 +270,6 @@ _CHOSEN: list[dict[str, ModuleType]] = []
 
 
 def _library(name: str) -> Any:
-    """Return a library if it is loaded."""
     return sys.modules.get(name)
 
 
@@ -333,7 +304,6 @@ def _blocked_signals() -> set[int] | None:
 
 
 def _timers() -> tuple[bool, ...] | None:
-    """Return which interval timers run."""
     return tuple(signal.getitimer(timer)[0] > 0 for timer in _TIMERS) if _TIMERS else None
 
 
@@ -347,7 +317,6 @@ _TIMERS = [getattr(signal, name) for name in ("ITIMER_REAL", "ITIMER_VIRTUAL", "
 
 
 def _limits() -> dict[int, tuple[int, int]] | None:
-    """Return the limits of the system for this process."""
     resource = _resource()
     if resource is None:
         return None
@@ -405,7 +374,6 @@ def _numba_options() -> dict[str, Any] | None:
 
 
 def _decimals() -> tuple[Any, ...] | None:
-    """Return precision, rounding and limits of decimal numbers."""
     context = _library("decimal") and _library("decimal").getcontext()
     return context and tuple(getattr(context, name) for name in _DECIMAL)
 

@@ -6,9 +6,7 @@ import re
 from collections.abc import Iterable
 from xml.etree import ElementTree
 
-MAX_CHARACTERS = 2000
-"""Maximum length of a message."""
-
+MAX_CHARACTERS = 2000  # maximum length of a message
 # Control characters except tab and newline, marks of writing direction, line separators, surrogates.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -34,14 +32,17 @@ def plural(count: int, one: str, many: str = "") -> str:
     return one if count == 1 else many or f"{one}s"
 
 
-def shortened_list(names: Iterable[str], count: int = 3) -> str:
-    """Return the first names as text, with the total if there are more.
+def shortened_list(names: Iterable[str], count: int = 3, *, rest: str = " … ({total} in all)") -> str:
+    """Return the first names as text, followed by `rest` if there are more.
 
     >>> shortened_list("abcde")
     'a, b, c … (5 in all)'
+    >>> shortened_list("abcde", rest=" and {more} more")
+    'a, b, c and 2 more'
     """
     listed = list(names)
-    return ", ".join(listed[:count]) + (f" … ({len(listed)} in all)" if len(listed) > count else "")
+    left = len(listed) - count
+    return ", ".join(listed[:count]) + (rest.format(total=len(listed), more=left) if left > 0 else "")
 
 
 def duration_text(seconds: float) -> str:

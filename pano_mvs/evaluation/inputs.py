@@ -25,19 +25,12 @@ from pano_mvs.scene.pose_groups import split_groups
 
 @dataclass(frozen=True)
 class TruthView:
-    """Ground truth of one image.
+    """Ground truth of one image."""
 
-    Attributes:
-        name: the image's name in the truth.
-        cam_from_world: its true pose.
-        range_file: its true range map, or None.
-        sha256: hex digest of the image file, or None; distinguishes different images of the same name.
-    """
-
-    name: str
-    cam_from_world: Rigid3
-    range_file: RangeFile | None
-    sha256: str | None
+    name: str  # the image's name in the truth
+    cam_from_world: Rigid3  # its true pose
+    range_file: RangeFile | None  # its true range map, or None
+    sha256: str | None  # hex digest of the image file, or None; distinguishes different images of the same name
 
     def belongs_to(self, image: FilePart) -> bool:
         """Return whether an image file has the bytes that the truth states, if it states any."""
@@ -140,20 +133,13 @@ _EXR_CHANNELS = ("range", "depth", "distance", "Z", "Depth.Z", "V", "Y", "R")
 
 @dataclass(frozen=True)
 class RangeFile:
-    """The range map of one image in a file.
-
-    Attributes:
-        key: name of the array in an NPZ file; "" for the only array, or the one named range or depth.
-        unit: factor from the file's numbers to the unit that `read` returns.
-        confidence_path: an 8-bit PNG with the confidence, or None.
-        what: the map's name in error messages; by default the key.
-    """
+    """The range map of one image in a file."""
 
     path: Path
-    key: str = ""
-    unit: float = 1.0
-    confidence_path: Path | None = None
-    what: str = ""
+    key: str = ""  # name of the array in an NPZ file; "" for the only array, or the one named range or depth
+    unit: float = 1.0  # factor from the file's numbers to the unit that `read` returns
+    confidence_path: Path | None = None  # an 8-bit PNG with the confidence, or None
+    what: str = ""  # the map's name in error messages; by default the key
 
     def __str__(self) -> str:
         return str(self.path)

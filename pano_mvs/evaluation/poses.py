@@ -192,52 +192,33 @@ _ROUNDING = 1e-12  # of a centre's coordinates
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of relative poses, over all pairs of images with ground truth.
+    """Errors of relative poses, over all pairs of images with ground truth."""
 
-    Attributes:
-        pairs: (P) the pairs of image names.
-        rotation_deg: (P,) error of second_from_first's rotation; 180 if an image is not registered.
-        direction_deg: (P,) error of the direction of its translation; 180 if an image is not registered.
-        pair_deg: (P,) the larger of the two.
-        measured: (P,) False if an image is not registered, or the two are in different groups.
-        median_pair_deg: median of `pair_deg`.
-        auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
-        registered: number of images with an estimate.
-        in_one_frame: number of those in the largest group, which shares one world frame.
-        expected: number of images with ground truth.
-        scale_ratio_median: median of |baseline ratio − 1| after division by the median ratio; NaN below 3 images.
-        scale_ratio_max: largest of them.
-    """
-
-    pairs: tuple[tuple[str, str], ...]
-    rotation_deg: FloatArray
+    pairs: tuple[tuple[str, str], ...]  # (P) the pairs of image names
+    rotation_deg: FloatArray  # (P,) error of second_from_first's rotation; 180 if an image is not registered
+    # (P,) error of the direction of its translation; 180 if an image is not registered
     direction_deg: FloatArray
-    pair_deg: FloatArray
-    measured: NDArray[np.bool_]
-    median_pair_deg: float
+    pair_deg: FloatArray  # (P,) the larger of the two
+    measured: NDArray[np.bool_]  # (P,) False if an image is not registered, or the two are in different groups
+    median_pair_deg: float  # median of `pair_deg`
+    # limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1]
     auc: dict[float, float]
-    registered: int
-    in_one_frame: int
-    expected: int
+    registered: int  # number of images with an estimate
+    in_one_frame: int  # number of those in the largest group, which shares one world frame
+    expected: int  # number of images with ground truth
+    # median of |baseline ratio − 1| after division by the median ratio; NaN below 3 images
     scale_ratio_median: float
-    scale_ratio_max: float
+    scale_ratio_max: float  # largest of them
 
 
 @dataclass(frozen=True, eq=False)
 class CenterErrors:
-    """Distances of camera centres from the true ones after similarity alignment.
+    """Distances of camera centres from the true ones after similarity alignment."""
 
-    Attributes:
-        names: (N) images with both poses.
-        distances: (N,) in the truth's unit.
-        extent: largest distance between two true centres, in the truth's unit.
-        scale: truth's units per unit of the estimate.
-    """
-
-    names: tuple[str, ...]
-    distances: FloatArray
-    extent: float
-    scale: float
+    names: tuple[str, ...]  # (N) images with both poses
+    distances: FloatArray  # (N,) in the truth's unit
+    extent: float  # largest distance between two true centres, in the truth's unit
+    scale: float  # truth's units per unit of the estimate
 
 
 class _RelativePoses(NamedTuple):

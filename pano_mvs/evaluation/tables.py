@@ -9,15 +9,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of text cells.
+    """A table of text cells."""
 
-    Attributes:
-        headings: one per column.
-        baselines: a second line of each row, such as the scores of a constant; empty without.
-    """
-
-    headings: tuple[str, ...]
+    headings: tuple[str, ...]  # one per column
     rows: tuple[tuple[str, ...], ...]
+    # a second line of each row, such as the scores of a constant; empty without
     baselines: tuple[tuple[str, ...], ...] = ()
 
     def __str__(self) -> str:
@@ -28,8 +24,7 @@ class TextTable:
         return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
 
 
-Summary = tuple[str | TextTable, ...]
-"""Lines of text and tables, in the order in which they are displayed."""
+Summary = tuple[str | TextTable, ...]  # lines of text and tables, in the order in which they are displayed
 
 
 def finite_or_none(value: float) -> float | None:

@@ -51,11 +51,9 @@ class GrowingArrays:
             stream.close()
 
     def __enter__(self) -> Self:
-        """Return the arrays."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close all files."""
         self._close()

@@ -18,17 +18,11 @@ from pano_mvs.scene import FilePart
 
 
 class TexturedArrays(NamedTuple):
-    """A mesh with positions in a texture.
+    """A mesh with positions in a texture."""
 
-    Attributes:
-        positions: (N, 3) float32 in the axes of the file.
-        uv: (N, 2) float32, (0, 0) the upper-left corner of the texture.
-        faces: (F, 3) int32, counter-clockwise as seen from outside.
-    """
-
-    positions: NDArray[np.float32]
-    uv: NDArray[np.float32]
-    faces: NDArray[np.int32]
+    positions: NDArray[np.float32]  # (N, 3) float32 in the axes of the file
+    uv: NDArray[np.float32]  # (N, 2) float32, (0, 0) the upper-left corner of the texture
+    faces: NDArray[np.int32]  # (F, 3) int32, counter-clockwise as seen from outside
 
 
 TextureFormat = Literal["jpeg", "png"]

@@ -12,29 +12,19 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 
 DXF_REMEDY = "DXF files need the package ezdxf: pip install 'pano-mvs[dxf]'"
-_METRES, _UNITLESS = 6, 0
 
 
 @dataclass(frozen=True, eq=False)
 class PlanDrawing:
-    """A plan of one storey, in its own coordinates: x right, y up.
-
-    Attributes:
-        walls: (N, 2, 2) ends of the wall lines.
-        cameras: name to (x, y).
-        box: ((left, bottom), (right, top)).
-        bar: length of the scale bar.
-        unit: of lengths, for display.
-        is_metric: whether it is the metre.
-    """
+    """A plan of one storey, in its own coordinates: x right, y up."""
 
     title: str
-    walls: FloatArray
-    cameras: Mapping[str, tuple[float, float]]
-    box: tuple[tuple[float, float], tuple[float, float]]
-    bar: float
-    unit: str
-    is_metric: bool
+    walls: FloatArray  # (N, 2, 2) ends of the wall lines
+    cameras: Mapping[str, tuple[float, float]]  # name to (x, y)
+    box: tuple[tuple[float, float], tuple[float, float]]  # ((left, bottom), (right, top))
+    bar: float  # length of the scale bar
+    unit: str  # of lengths, for display
+    is_metric: bool  # whether it is the metre
 
 
 def world_file_text(pixel: float, left: float, top: float) -> str:
@@ -103,7 +93,7 @@ def write_dxf(path: Path, plan: PlanDrawing) -> None:
     before = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True  # no dates and no random identifiers
     try:
-        document = new("R2010", units=_METRES if plan.is_metric else _UNITLESS)
+        document = new("R2010", units=6 if plan.is_metric else 0)  # metres, or none
         document.layers.add("WALLS", color=7)
         document.layers.add("CAMERAS", color=1)
         space = document.modelspace()

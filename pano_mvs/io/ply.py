@@ -39,9 +39,7 @@ MeshArrays = tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]
 
 _FRAME_KEY = b"comment file_from_world "
 _FRAME_MEANING = "comment x_in_file = file_from_world x_in_world; poses and COLMAP models are in the world\n"
-_ROTATION_TOLERANCE = 1e-6
 _MARK = b"end_header"
-_MAX_HEADER_BYTES = 1 << 20
 # PLY's names of number types, old and new.
 _NUMBERS = {
     "char": "i1",
@@ -86,8 +84,6 @@ def write_ply(
     The cloud is written in chunks, so that memory-mapped arrays need not fit in memory.
 
     Args:
-        path: the file to write.
-        cloud: the points.
         quality: also write `views`, the number of views that agree on the point, and `confidence` (uchar).
         uncertainty: also write `uncertainty`, the standard deviation of the position in scene units (float); NaN if
             unknown.
@@ -155,7 +151,6 @@ def write_ply_mesh(path: Path, mesh: MeshArrays, *, file_from_world: FloatArray 
     """Write a mesh as binary little-endian PLY: x y z red green blue, and triangles as lists of three corners.
 
     Args:
-        path: the file to write.
         mesh: vertices (V, 3) float32, colours (V, 3) uint8, triangles (F, 3) int32.
         file_from_world: as in `write_ply`.
     """
@@ -212,19 +207,14 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlyPoints:
-    """The vertices of a PLY file, which need not fit in memory.
-
-    Attributes:
-        count: number of vertices.
-        has_normals: whether they have nx, ny, nz.
-        vertices: (N,) with a field for each property, memory-mapped if the file is binary; as in the file.
-        world_from_file: rotation (3, 3) into the world of the run that wrote the file; None if the header states none.
-    """
+    """The vertices of a PLY file, which need not fit in memory."""
 
     path: Path
     count: int
     has_normals: bool
+    # (N,) with a field for each property, memory-mapped if the file is binary; as in the file
     vertices: NDArray[np.void]
+    # rotation (3, 3) into the world of the run that wrote the file; None if the header states none
     world_from_file: FloatArray | None = None
 
     def in_world(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -298,7 +288,7 @@ def open_ply_points(path: Path) -> PlyPoints:
     """
     try:
         with path.open("rb") as stream:
-            head, mark, rest = stream.read(_MAX_HEADER_BYTES).partition(_MARK)
+            head, mark, rest = stream.read(1 << 20).partition(_MARK)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     if not mark:
@@ -355,7 +345,7 @@ def _world_from_file(head: bytes, path: Path) -> FloatArray | None:
         rotation = np.array([float(word) for word in line[len(_FRAME_KEY) :].split()]).reshape(3, 3)
     except ValueError:
         rotation = np.zeros((3, 3))
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_ROTATION_TOLERANCE)
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6)
     if not (orthonormal and np.linalg.det(rotation) > 0):
         raise InputError(f"{path}: file_from_world in its header is not a rotation. Write the file again")
     return rotation.T

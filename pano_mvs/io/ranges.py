@@ -136,8 +136,6 @@ DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, SyntaxError, OverflowError),
     *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
 )
-_MAX_DIMENSIONS = 4
-_MAX_REASON = 300  # characters; numpy repeats whole headers
 _RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}  # largest ratio of decompression
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -194,7 +192,7 @@ def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
     shape, is_fortran, dtype = _HEADERS[version](stream)
     if dtype.hasobject:
         raise ValueError("it contains Python objects, which are not allowed")
-    if len(shape) > _MAX_DIMENSIONS or min(shape, default=0) < 0:
+    if len(shape) > 4 or min(shape, default=0) < 0:
         raise ValueError(f"its header states the shape {shape}")
     count = math.prod(shape)
     if count * dtype.itemsize > size_bytes:
@@ -214,7 +212,7 @@ def _read_exactly(stream: IO[bytes], size_bytes: int) -> bytes:
 
 def _reason(error: BaseException) -> str:
     """Return an exception's shortened text, or its type without one."""
-    return shortened(str(error), _MAX_REASON) or type(error).__name__
+    return shortened(str(error), 300) or type(error).__name__  # numpy repeats whole headers
 
 
 # The exceptions that OpenEXR raises for damaged files.

@@ -35,7 +35,6 @@ from pano_mvs.scene import FilePart
 MODELS = ("kannala_brandt", "opencv_fisheye")
 GUIDE = "docs/rigs.md shows a complete file and where the numbers come from"
 
-_MAX_BYTES = 1 << 20
 _MAX_TURN_ERROR = 1e-3
 _LENS_KEYS = (
     "image_size_px",
@@ -52,7 +51,6 @@ def read_rig(file: FilePart, *, stitch_distance_m: float = float("inf"), blend_d
     """Return the rig that a calibration file describes.
 
     Args:
-        file: the YAML file.
         stitch_distance_m: the distance at which the pictures are stitched.
         blend_deg: width of the strip around the seam in which both pictures are mixed.
 
@@ -152,7 +150,7 @@ class _Place:
 
 def _parsed(file: FilePart, place: _Place) -> CommentedMap:
     data = file.read_bytes()
-    if len(data) > _MAX_BYTES:
+    if len(data) > 1 << 20:
         raise InputError(f"{file.path}: too large for a calibration file ({len(data)} bytes). {GUIDE}")
     try:
         root = YAML(typ="rt", pure=True).load(data.decode("utf-8-sig"))

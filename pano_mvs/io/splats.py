@@ -21,31 +21,19 @@ Variant = Literal["equirectangular", "faces"]
 
 @dataclass(frozen=True, slots=True)
 class NerfstudioFrame:
-    """One frame without its pose.
+    """One frame without its pose."""
 
-    Attributes:
-        variant: the transforms.json to which it belongs.
-        image: path of the image relative to that file; `{name}` stands for the panorama's name.
-        mask: path of the mask; empty if nothing is masked.
-        depth: path of the depth; empty without one.
-        size_wh: (width, height) in pixels.
-        focal_xy: fl_x, fl_y in pixels; the principal point is the image centre.
-        frame_from_cam: rotation from the panorama's camera frame (y down, z forward), as three rows.
-        normal: path of the normals; empty without any.
-        confidence: path of the confidence; empty without one.
-        radial: coefficient k1 of the lens's distortion; only photographs have one.
-    """
-
-    variant: Variant
-    image: str
-    mask: str
-    depth: str
-    size_wh: tuple[int, int]
-    focal_xy: tuple[float, float]
+    variant: Variant  # the transforms.json to which it belongs
+    image: str  # path of the image relative to that file; `{name}` stands for the panorama's name
+    mask: str  # path of the mask; empty if nothing is masked
+    depth: str  # path of the depth; empty without one
+    size_wh: tuple[int, int]  # (width, height) in pixels
+    focal_xy: tuple[float, float]  # fl_x, fl_y in pixels; the principal point is the image centre
+    # rotation from the panorama's camera frame (y down, z forward), as three rows
     frame_from_cam: tuple[tuple[float, ...], ...]
-    normal: str = ""
-    confidence: str = ""
-    radial: float = 0.0
+    normal: str = ""  # path of the normals; empty without any
+    confidence: str = ""  # path of the confidence; empty without one
+    radial: float = 0.0  # coefficient k1 of the lens's distortion; only photographs have one
 
     def to_json(self) -> dict[str, Any]:
         """Return the frame as a JSON object, without the paths of layers that nerfstudio does not read if empty."""
@@ -66,19 +54,14 @@ class NerfstudioFrame:
 
 @dataclass(frozen=True, eq=False)
 class PanoramaFrames(Files):
-    """The frames of one panorama, with their files.
-
-    Attributes:
-        pictures: target to source file of images that are exported unchanged.
-        frames: the entries of transforms.json without poses.
-        depth_unit: scene units of one step of the depths.
-    """
+    """The frames of one panorama, with their files."""
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
+    # target to source file of images that are exported unchanged
     pictures: Mapping[str, FilePart] = field(default_factory=dict)
-    frames: tuple[NerfstudioFrame, ...] = ()
-    depth_unit: float = 0.001
+    frames: tuple[NerfstudioFrame, ...] = ()  # the entries of transforms.json without poses
+    depth_unit: float = 0.001  # scene units of one step of the depths
 
     def to_parts(self) -> Parts:
         """Return the files under numbers, their targets and the frames as JSON."""
@@ -120,8 +103,6 @@ class SplatFrames(PanoramaFrames):
 CAMERA_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DISTORTED = "OPENCV"
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
-_OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
-_PNG_RGB_8_BIT = bytes([8, 2])
 
 
 def transforms_document(
@@ -179,7 +160,7 @@ def is_common_picture(path: Path) -> bool:
         start = stream.read(26)
         if start[:2] == JPEG_START:
             return _jpeg_channels(start + stream.read()) == 3
-    return start[:8] == PNG_START and start[24:26] == _PNG_RGB_8_BIT
+    return start[:8] == PNG_START and start[24:26] == bytes([8, 2])  # 8 bits, RGB
 
 
 def _jpeg_channels(data: bytes) -> int:
@@ -195,7 +176,7 @@ def _listed(
 ) -> dict[str, Any]:
     world_from_frame = frame.cam_from_world(cam_from_world).inverse()
     matrix = np.eye(4)
-    matrix[:3, :3] = world_from_frame.rotation @ _OPENGL_FROM_CAM
+    matrix[:3, :3] = world_from_frame.rotation @ np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera frame
     matrix[:3, 3] = world_from_frame.translation
     entry: dict[str, Any] = {"file_path": frame.image.replace("{name}", name)}
     if masked:
@@ -217,10 +198,7 @@ def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
     } | ({"k1": frame.radial} if frame.radial else {})
 
 
-ROOT = "splat_bundle"
-"""Folder of the bundle in the output folder."""
-
-MANIFEST_VERSION = 1
+ROOT = "splat_bundle"  # folder of the bundle in the output folder
 
 _MANIFEST_DEPTHS = {"equirectangular": "range along the ray", "faces": "z-depth"}
 _CONVENTIONS = {
@@ -259,14 +237,13 @@ def manifest_document(
     """Return the contents of manifest.json.
 
     Args:
-        views: all images.
         groups: by number: frame and unit of the world, and the files of each variant.
         depth_unit: scene units per step of the depths.
         photographs: photographs without distortion beside the faces, in the world of group 0.
     """
     masked = {view.frame.variant for view in views if view.frame.mask}
     document = {
-        "schema": MANIFEST_VERSION,
+        "schema": 1,
         "program": "pano_mvs",
         "conventions": _CONVENTIONS,
         "layers": _layers(depth_unit),

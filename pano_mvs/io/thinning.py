@@ -21,14 +21,10 @@ CHUNK_POINTS = 1 << 18
 """Number of points that are processed at a time."""
 
 _BUCKET_POINTS = 1 << 22
-_MAX_BUCKETS = 256
 # The three indices of a voxel are packed into 63 bits.
 _INDEX_BITS = 21
 _MAX_INDEX = 1 << _INDEX_BITS
 _CANDIDATE = np.dtype([("place", "<u8"), ("rank", "<u2"), ("off_center", "<f4"), ("idx", "<i8")])
-_COUNTED_VOXELS = 1 << 14
-_CUBE_SURFACE = 24.0  # of a cube from −1 to 1, a rough model of rooms
-_MIN_ROUNDS = 8
 _FULL_ENOUGH = 0.93
 
 
@@ -44,7 +40,6 @@ class Selection:
     max_points: int = setting(0, ge=0, doc="thin evenly to at most this number of points; 0: no limit")
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_settings(self)
 
 
@@ -109,15 +104,16 @@ def voxel_for_count(cloud: PointCloud, good: SelectedPoints, selection: Selectio
     wanted = 0.98 * selection.max_points
     if good.count <= selection.max_points and not selection.voxel:
         return 0.0
-    share = max(1, selection.max_points // _COUNTED_VOXELS)
+    share = max(1, selection.max_points // (1 << 14))
     if selection.voxel and _occupied(cloud, good, selection.voxel, share=share) <= selection.max_points:
         return selection.voxel
     reach = _reach(cloud, good)
     smallest = max(selection.voxel, 2 * reach / (_MAX_INDEX - 2))
-    edge, slope = max(smallest, reach * np.sqrt(_CUBE_SURFACE / wanted)), -2.0
+    # A rough model of rooms is a cube from −1 to 1, whose surface is 24.
+    edge, slope = max(smallest, reach * np.sqrt(24.0 / wanted)), -2.0
     tried: list[tuple[float, float]] = []
     fitting: list[float] = []
-    while len(tried) < _MIN_ROUNDS or (not fitting and edge < 4 * reach):
+    while len(tried) < 8 or (not fitting and edge < 4 * reach):
         count = max(1, _occupied(cloud, good, edge, share=share))
         if count <= wanted:
             fitting.append(edge)
@@ -184,7 +180,7 @@ def _hashed(place: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _thinned_bits(cloud: PointCloud, good: SelectedPoints, scratch: Path) -> NDArray[np.uint8]:
     """Return the bits of the best point of each voxel."""
-    number = min(_MAX_BUCKETS, -(-len(cloud) // _BUCKET_POINTS))
+    number = min(256, -(-len(cloud) // _BUCKET_POINTS))
     paths = [scratch / f"bucket_{idx}" for idx in range(number)]
     for chunk in chunks(len(cloud)):
         candidates = _best(_candidates(cloud, good, chunk))

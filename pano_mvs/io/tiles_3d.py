@@ -21,9 +21,6 @@ from pano_mvs.scene import PointCloud
 
 _FLOAT, _UINT16, _POINTS, _ARRAY_BUFFER = 5126, 5123, 0, 34962
 _UNLIT = "KHR_materials_unlit"
-# By default, viewers load the tiles below another one if its error covers more than 16 pixels
-# (`maximumScreenSpaceError`, `errorTarget`): its points are then two pixels apart.
-_ERROR_PER_SPACING = 8.0
 
 
 class TilesetWriter:
@@ -53,7 +50,9 @@ class TilesetWriter:
         """
         points = self._cloud.points_in_world[chosen] @ self._file_from_world.T.astype(np.float32)
         self._bounds[name] = np.array([points.min(axis=0), points.max(axis=0)], np.float64)
-        self._errors[name] = _ERROR_PER_SPACING * size / np.sqrt(self._tile_points)  # half of that above it
+        # By default, viewers load the tiles below another one if its error covers more than 16 pixels
+        # (`maximumScreenSpaceError`, `errorTarget`): its points are then two pixels apart.
+        self._errors[name] = 8.0 * size / np.sqrt(self._tile_points)  # half of that above it
         self.files[f"{name}.glb"] = self._folder / f"{name}.glb"
         write_points_glb(self.files[f"{name}.glb"], points, self._cloud.colors_rgb[chosen])
 
@@ -79,7 +78,10 @@ class TilesetWriter:
                 tiles[above].setdefault("children", []).append(tile)
         root = tiles["r"] | {"refine": "ADD"}
         if origin_lla is not None:
-            root["transform"] = self._earth_from_file(origin_lla).T.ravel().tolist()
+            transform = np.eye(4)
+            transform[:3, :3] = earth_from_local(origin_lla) @ self._file_from_world.T
+            transform[:3, 3] = earth_from_lla(origin_lla)
+            root["transform"] = transform.T.ravel().tolist()
         document = {
             "asset": {"version": "1.1", "extras": {"generator": "pano_mvs"}},
             "geometricError": float(np.linalg.norm(np.diff(self._bounds["r"], axis=0))),
@@ -88,13 +90,6 @@ class TilesetWriter:
         }
         self.files["tileset.json"] = self._folder / "tileset.json"
         self.files["tileset.json"].write_text(json.dumps(document, indent=1), encoding="utf-8")
-
-    def _earth_from_file(self, origin_lla: Sequence[float]) -> FloatArray:
-        """Return the transform (4, 4) from the axes of the files to Earth-centred, Earth-fixed coordinates."""
-        transform = np.eye(4)
-        transform[:3, :3] = earth_from_local(origin_lla) @ self._file_from_world.T
-        transform[:3, 3] = earth_from_lla(origin_lla)
-        return transform
 
 
 def _box(bounds: FloatArray) -> list[float]:

@@ -50,38 +50,23 @@ scenes.get(APP_DATA.scenes[0].id).scene.switchTo();
 
 @dataclass(frozen=True)
 class Link:
-    """A way from one scene to another.
+    """A way from one scene to another."""
 
-    Attributes:
-        target: position of the other scene in the list.
-        yaw_deg: its direction, to the right of the middle of the picture.
-        pitch_deg: its direction above the horizon.
-        target_yaw_deg: the same horizontal direction in the other scene, in which one arrives looking.
-    """
-
-    target: int
-    yaw_deg: float
-    pitch_deg: float
-    target_yaw_deg: float
+    target: int  # position of the other scene in the list
+    yaw_deg: float  # its direction, to the right of the middle of the picture
+    pitch_deg: float  # its direction above the horizon
+    target_yaw_deg: float  # the same horizontal direction in the other scene, in which one arrives looking
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A panorama of a tour.
+    """A panorama of a tour."""
 
-    Attributes:
-        title: shown to people.
-        picture: path of the picture relative to the configuration, with forward slashes.
-        width: of the picture in pixels.
-        heading_deg: compass heading of its middle, or None.
-        links: to other scenes.
-    """
-
-    title: str
-    picture: str
-    width: int
-    heading_deg: float | None
-    links: tuple[Link, ...]
+    title: str  # shown to people
+    picture: str  # path of the picture relative to the configuration, with forward slashes
+    width: int  # of the picture in pixels
+    heading_deg: float | None  # compass heading of its middle, or None
+    links: tuple[Link, ...]  # to other scenes
 
 
 def pannellum_tour(scenes: Sequence[Scene]) -> dict[str, object]:

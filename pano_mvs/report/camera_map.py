@@ -15,23 +15,14 @@ from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.scene.upright import states_y_down, states_z_north
 
-# A capture is a walk if it has at least this number of cameras, most consecutive ones are matched, and most pairs are
-# of cameras that follow each other closely, although many others would have been possible.
-_MIN_CAMERAS = 20
-_WINDOW = 10
-_CONSECUTIVE_SHARE = 0.8
-_NEAR_SHARE = 0.6
-_MAX_PAIR_SHARE = 0.25
+_WINDOW = 10  # cameras whose positions in the capture differ by at most this follow each other closely
 
 
 @dataclass(frozen=True)
 class WalkPath:
-    """A walk.
+    """A walk."""
 
-    Attributes:
-        stretches: positions of the cameras in order; a new stretch begins where consecutive cameras are not matched.
-    """
-
+    # positions of the cameras in order; a new stretch begins where consecutive cameras are not matched
     stretches: tuple[tuple[int, ...], ...]
 
     @staticmethod
@@ -41,16 +32,20 @@ class WalkPath:
 
 
 def find_walk(count: int, pairs: Sequence[tuple[int, int]]) -> WalkPath | None:
-    """Return the walk along which cameras were taken, or None if they were not taken along one."""
-    if count < _MIN_CAMERAS or not pairs:
+    """Return the walk along which cameras were taken, or None if they were not taken along one.
+
+    They were if they are many, most consecutive ones are matched, and most pairs are of cameras that follow each other
+    closely, although many others would have been possible.
+    """
+    if count < 20 or not pairs:
         return None
     distinct = {(min(pair), max(pair)) for pair in pairs}
     near = sum(b - a <= _WINDOW for a, b in distinct)
     consecutive = [(idx, idx + 1) in distinct for idx in range(count - 1)]
     is_walk = (
-        sum(consecutive) >= _CONSECUTIVE_SHARE * (count - 1)
-        and near >= _NEAR_SHARE * len(distinct)
-        and (len(distinct) <= _MAX_PAIR_SHARE * count * (count - 1) / 2 or near == len(distinct))
+        sum(consecutive) >= 0.8 * (count - 1)
+        and near >= 0.6 * len(distinct)
+        and (len(distinct) <= 0.25 * count * (count - 1) / 2 or near == len(distinct))
     )
     if not is_walk:
         return None
@@ -65,70 +60,49 @@ def find_walk(count: int, pairs: Sequence[tuple[int, int]]) -> WalkPath | None:
 
 # In units of the drawing, which is about 310 px wide on a phone and 510 px on a desk. Labels are placed for the phone,
 # where text is larger in these units.
-_WIDTH, _HEIGHT, _SIDE_HEIGHT = 360, 320, 180
-_BORDER = 40
-_LETTER, _LINE = 8.6, 16.0
-_NEAR, _TINY_MAP = 9, 140
-_MAX_LABELS, _MANY, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 150, 1500, 600, 600
-_ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
+_WIDTH, _HEIGHT, _BORDER = 360, 320, 40
+_MAX_LABELS = 40
 
 
 @dataclass(frozen=True)
 class Link:
-    """One matched pair, drawn.
+    """One matched pair, drawn."""
 
-    Attributes:
-        ends: x1, y1, x2, y2.
-        strength: from 0 to 1, by its inliers.
-        text: the tooltip.
-        rejected: whether no common geometry was found.
-        closure: whether it closes a loop of a walk.
-    """
-
-    ends: tuple[float, float, float, float]
-    strength: float
-    text: str
-    rejected: bool
-    closure: bool = False
+    ends: tuple[float, float, float, float]  # x1, y1, x2, y2
+    strength: float  # from 0 to 1, by its inliers
+    text: str  # the tooltip
+    rejected: bool  # whether no common geometry was found
+    closure: bool = False  # whether it closes a loop of a walk
 
 
 @dataclass(frozen=True)
 class CameraMap:
-    """One drawing, in the units of an SVG view box.
+    """One drawing, in the units of an SVG view box."""
 
-    Attributes:
-        title: the caption, which names the direction of view.
-        text: description for screen readers.
-        links: in drawing order: rejected links, then weak ones, then strong ones.
-        cameras: (x, y, name, position of the label or None).
-        doubtful: (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others.
-        dots: an SVG path of the cameras if there are too many to name.
-        bar: (x, y, length, text) of the scale bar.
-        north: whether north is upwards.
-        judged: the probability that the pose of each of `cameras` is right, None where unknown; empty if all are.
-        marks: (x, y, number) of places to stand, numbered as in the list of suggestions; only from above.
-        path: an SVG path along the cameras of a walk in their order; empty if they were not taken along one.
-        ends: (x, y) of the first and the last camera of a walk whose cameras have no labels.
-    """
-
-    title: str
-    text: str
+    title: str  # the caption, which names the direction of view
+    text: str  # description for screen readers
     size_wh: tuple[int, int]
-    links: tuple[Link, ...]
+    links: tuple[Link, ...]  # in drawing order: rejected links, then weak ones, then strong ones
+    # (x, y, name, position of the label or None)
     cameras: tuple[tuple[float, float, str, tuple[float, float] | None], ...]
-    dots: str
-    bar: tuple[float, float, float, str]
-    north: bool = False
+    dots: str  # an SVG path of the cameras if there are too many to name
+    bar: tuple[float, float, float, str]  # (x, y, length, text) of the scale bar
+    north: bool = False  # whether north is upwards
+    # (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others
     doubtful: tuple[tuple[float, float, str, str], ...] = ()
+    # the probability that the pose of each of `cameras` is right, None where unknown; empty if all are
     judged: tuple[float | None, ...] = ()
+    # (x, y, number) of places to stand, numbered as in the list of suggestions; only from above
     marks: tuple[tuple[float, float, int], ...] = ()
+    # an SVG path along the cameras of a walk in their order; empty if they were not taken along one
     path: str = ""
+    # (x, y) of the first and the last camera of a walk whose cameras have no labels
     ends: tuple[tuple[float, float], ...] = ()
 
     @property
     def radius(self) -> float:
         """The radius at which a camera is drawn."""
-        return 4.5 if len(self.cameras) <= _MAX_LABELS else 2.5 if len(self.cameras) <= _MANY else 1.6
+        return 4.5 if len(self.cameras) <= _MAX_LABELS else 2.5 if len(self.cameras) <= 150 else 1.6
 
     @property
     def closures(self) -> int:
@@ -184,7 +158,10 @@ def camera_maps(
             tallest=tallest,
             north=north and title == "From above",
         )
-        for title, axes, tallest in (("From above", _ABOVE, _HEIGHT), ("From the side", _SIDE, _SIDE_HEIGHT))
+        for title, axes, tallest in (
+            ("From above", ((0, 1.0), (2, -1.0)), _HEIGHT),
+            ("From the side", ((0, 1.0), (1, 1.0)), 180),
+        )
     )
 
 
@@ -254,7 +231,7 @@ def _chosen(
 
     found.sort(key=lambda link: (closes(link), link.inliers, -(link.candidates or 0)))
     split = sum(not link.inliers for link in found)
-    chosen = found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
+    chosen = found[:split][:600] + found[split:][-1500:]
     return [
         _Joined(
             first := position[link.first],
@@ -300,7 +277,7 @@ def _drawn(
     if not (high - low).any():
         extent = np.ones(2)
     scale = float(min((_WIDTH - 2 * _BORDER) / extent[0], (tallest - 2 * _BORDER) / extent[1]))
-    height = int(np.clip(extent[1] * scale + 2 * _BORDER, _TINY_MAP, tallest))
+    height = int(np.clip(extent[1] * scale + 2 * _BORDER, 140, tallest))
 
     def on_map(points: FloatArray) -> FloatArray:
         return np.asarray(np.round((points - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1), np.float64)
@@ -315,7 +292,7 @@ def _drawn(
         Link((*at[link.first], *at[link.second]), link.inliers / most, link.text, not link.inliers, link.closure)
         for link in links
     )
-    named = len(labels) <= _MAX_NAMED
+    named = len(labels) <= 600
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(100 / scale)
@@ -361,8 +338,8 @@ def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, flo
     found: list[tuple[float, float] | None] = []
     taken: list[tuple[float, float, float]] = []
     for (x, y), label in zip(placed, labels, strict=True):
-        wide = _LETTER * len(label)
-        spots = [(float(x) + across, float(y) + down) for across in (_NEAR, -_NEAR - wide) for down in (-7, 18, 34)]
+        wide = 8.6 * len(label)
+        spots = [(float(x) + across, float(y) + down) for across in (9, -9 - wide) for down in (-7, 18, 34)]
         free = (spot for spot in spots if _fits(spot, wide, taken))
         found.append(next(free, None))
         if found[-1] is not None:
@@ -375,7 +352,7 @@ def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float
     left, y = spot
     if left < 2 or left + wide > _WIDTH - 2:
         return False
-    return all(left + wide < other or other + width < left or abs(y - line) >= _LINE for other, line, width in taken)
+    return all(left + wide < other or other + width < left or abs(y - line) >= 16 for other, line, width in taken)
 
 
 def _round_length(longest: float) -> float:

@@ -19,17 +19,13 @@ from pano_mvs.algorithms.rendering import Viewpoint, draw_cloud, facing, inside_
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture
 from pano_mvs.results.stored_values import StoredValues
-from pano_mvs.scene import PointCloud
 from pano_mvs.scene.pose_groups import split_groups
 
 RENDERER_VARIABLE = "PANO_MVS_RENDERER"
 """`software` draws without PyVista; anything else, or nothing, tries PyVista first."""
 
-VERSION = 2
-"""Raise it when the pictures change: earlier pages' are then drawn again."""
-
+VERSION = 2  # raise it when the pictures change: earlier pages' are then drawn again
 _SIZE_HW = (600, 960)
-_MAX_POINTS = 800_000
 MAX_BYTES = 300_000
 _COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_pictures")
 
@@ -68,7 +64,12 @@ def cloud_pictures(
     cloud, poses = whole.groups()[0], None if all_poses is None else split_groups(all_poses)[0]
     centers = poses.centers if poses is not None else np.zeros((0, 3))
     place = poses.names[inside_camera(centers)] if poses is not None and len(centers) else ""
-    arrays = _thinned(cloud)
+    step = -(-len(cloud) // 800_000)
+    arrays = (
+        np.ascontiguousarray(cloud.points_in_world[::step]),
+        np.ascontiguousarray(cloud.normals_in_world[::step]),
+        np.ascontiguousarray(cloud.colors_rgb[::step]),
+    )
     seen_from = viewpoints(arrays[0], centers, up, aspect=_SIZE_HW[1] / _SIZE_HW[0], place=place)
     images, note = _drawn(arrays, seen_from, software=software, command=command)
     if whole.group_sizes:
@@ -87,16 +88,6 @@ def cloud_pictures(
             for number, (title, image) in enumerate(zip(titles, images, strict=True))
         ),
         note,
-    )
-
-
-def _thinned(cloud: PointCloud) -> Arrays:
-    """Return every n-th point of a cloud, to limit the number of drawn points."""
-    step = -(-len(cloud) // _MAX_POINTS)
-    return (
-        np.ascontiguousarray(cloud.points_in_world[::step]),
-        np.ascontiguousarray(cloud.normals_in_world[::step]),
-        np.ascontiguousarray(cloud.colors_rgb[::step]),
     )
 
 
@@ -125,7 +116,6 @@ def _drawn_apart(arrays: Arrays, seen_from: Sequence[Viewpoint], command: Sequen
         return read_pictures(folder, len(seen_from), size_hw=_SIZE_HW) if done.returncode == 0 else []
 
 
-_PAPER = (238, 241, 244)
 _ARRAYS = ("points", "normals", "colors")
 
 
@@ -178,7 +168,7 @@ def draw(folder: Path) -> None:
         seen_from = Viewpoint("", eye, target, up, view["fov_deg"], view["height"])
         shown = facing(points, normals, seen_from)
         plotter: Any = pyvista.Plotter(off_screen=True, window_size=[width, height], lighting="none")
-        plotter.set_background(_PAPER)
+        plotter.set_background((238, 241, 244))
         if shown.any():
             mesh = pyvista.PolyData(points[shown])
             mesh["rgb"] = colors[shown]

@@ -17,33 +17,20 @@ from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud
 
-VERSION = 1
-"""Raise it when the encoding changes: points of earlier pages are then encoded again."""
-
+VERSION = 1  # raise it when the encoding changes: points of earlier pages are then encoded again
 MAX_POINTS = 150_000
 POINT_BYTES = 12
-_MAX_SAMPLED = 600_000
-_MAX_NAMED = 200
-_STEPS = 14
-_LEVELS = 65535
-_MIN_POINTS = 3
 
 
 @dataclass(frozen=True)
 class TurnableCloud:
-    """What the page's viewer draws.
+    """What the page's viewer draws."""
 
-    Attributes:
-        key: of the encoded points among the facts of the page; see `encoded`.
-        points: number of points that are drawn.
-        total: number of points of the cloud.
-        cameras: (x, y, z, doubtful, name) in the frame of the viewer; names of at most 200 evenly spaced cameras, the
-            others are "".
-    """
-
-    key: str
+    key: str  # of the encoded points among the facts of the page; see `encoded`
     points: int
-    total: int
+    total: int  # number of points of the cloud
+    # (x, y, z, doubtful, name) in the frame of the viewer; names of at most 200 evenly spaced cameras, the others are
+    # ""
     cameras: tuple[tuple[float, float, float, bool, str], ...]
 
 
@@ -63,12 +50,12 @@ def turnable_cloud(
     if not _is_encoded(fact):
         whole = values.cloud
         cloud = whole.groups()[0] if whole is not None else None
-        if cloud is None or len(cloud) < _MIN_POINTS:
+        if cloud is None or len(cloud) < 3:
             return None
         fact = encoded(cloud, level_from_world)
         earlier.keep(key, fact)
     centers = np.array(poses.centers, np.float64).reshape(-1, 3) @ level_from_world.T
-    step = -(-len(centers) // _MAX_NAMED) or 1
+    step = -(-len(centers) // 200) or 1
     cameras = tuple(
         (round(x, 4), round(y, 4), round(z, 4), name in poses.doubts, name if idx % step == 0 else "")
         for idx, ((x, y, z), name) in enumerate(zip(centers.tolist(), poses.registered, strict=False))
@@ -90,7 +77,7 @@ def encoded(cloud: PointCloud, level_from_world: FloatArray) -> dict[str, Any]:
     three uint8. The cube has its smallest coordinates at `lower` and edges of `size`. `spacing` is a typical distance
     between neighbours; `middle` and `radius` describe a sphere around nearly all points.
     """
-    step = -(-len(cloud) // _MAX_SAMPLED)
+    step = -(-len(cloud) // 600_000)
     points = np.asarray(cloud.points_in_world[::step], np.float64) @ level_from_world.T
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     extent = np.maximum(high - low, 1e-6 * (1 + np.abs(points).max()))
@@ -99,7 +86,7 @@ def encoded(cloud: PointCloud, level_from_world: FloatArray) -> dict[str, Any]:
     kept = near[chosen]
     lower = points[kept].min(axis=0)
     size = float((points[kept].max(axis=0) - lower).max()) or 1.0
-    places = np.rint((points[kept] - lower) / size * _LEVELS).astype("<u2")
+    places = np.rint((points[kept] - lower) / size * 65535).astype("<u2")
     normals = np.asarray(cloud.normals_in_world[::step][kept], np.float64) @ level_from_world.T
     packed = np.empty((len(kept), POINT_BYTES), np.uint8)
     packed[:, :6] = np.ascontiguousarray(places).view(np.uint8)
@@ -133,7 +120,7 @@ def one_per_voxel(points: FloatArray, most: int) -> tuple[NDArray[np.intp], floa
         area = 2 * float(extent @ np.roll(extent, 1)) or size**2  # of the box, near to which surfaces usually are
         return chosen, np.sqrt(area / len(chosen))
     chosen = _first_of_voxels(shifted, high)
-    for _ in range(_STEPS):
+    for _ in range(14):
         middle = float(np.sqrt(low * high))
         found = _first_of_voxels(shifted, middle)
         if len(found) > most:

@@ -40,10 +40,7 @@ from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.scores import NO_TRUTH
 from pano_mvs.scene.two_view import pair_name
 
-MAX_SUGGESTIONS = 12
-"""Suggestions that the page shows."""
-
-_MAX_COMPARED = 60
+MAX_SUGGESTIONS = 12  # suggestions that the page shows
 
 
 def advice(
@@ -51,7 +48,7 @@ def advice(
 ) -> tuple[Suggestion, ...]:
     """Return what to do next time, the most urgent first."""
     names = [view.name for view in summary.views]
-    return suggestions(summary, _coverage(values, earlier, names if len(names) <= _MAX_COMPARED else chosen))
+    return suggestions(summary, _coverage(values, earlier, names if len(names) <= 60 else chosen))
 
 
 def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) -> dict[str, ViewCoverage]:
@@ -65,8 +62,6 @@ def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) 
     return known
 
 
-_MAX_MEASURED = 100
-_MAX_SIZES = 4
 # Names of folders that do not say which capture it is: the name of the folder above comes first.
 _GENERIC = {
     "images",
@@ -87,29 +82,22 @@ _MONTHS = "Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", 
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """The capture of a run.
+    """The capture of a run."""
 
-    Attributes:
-        name: of the folder with the images, or else of the workflow.
-        date: when the run began, in words; "" if unknown.
-        panoramas: number of images of the capture.
-        sizes: ((height, width) of the full sphere in the file, number of images), the most frequent size first.
-        measured: number of images whose size was looked up: at most 100, evenly spaced.
-        working_hw: (height, width) at which most images are processed; None if that is the size of the files.
-    """
-
-    name: str
-    date: str
+    name: str  # of the folder with the images, or else of the workflow
+    date: str  # when the run began, in words; "" if unknown
     panoramas: int
+    # ((height, width) of the full sphere in the file, number of images), the most frequent size first
     sizes: tuple[tuple[tuple[int, int], int], ...] = ()
-    measured: int = 0
+    measured: int = 0  # number of images whose size was looked up: at most 100, evenly spaced
+    # (height, width) at which most images are processed; None if that is the size of the files
     working_hw: tuple[int, int] | None = None
 
 
 def capture_facts(summary: RunSummary, values: StoredValues, *, panoramas: int) -> CaptureFacts:
     """Return what is known of the capture of a run; `panoramas` is its number of images."""
     names = list(values.refs.get("images", {}))
-    known = [values.panorama(name) for name in names[:: -(-len(names) // _MAX_MEASURED) or 1]]
+    known = [values.panorama(name) for name in names[:: -(-len(names) // 100) or 1]]
     found = [panorama for panorama in known if panorama is not None]
     sizes = Counter(panorama.source_size_hw for panorama in found)
     working = Counter(panorama.size_hw for panorama in found).most_common(1)
@@ -118,7 +106,7 @@ def capture_facts(summary: RunSummary, values: StoredValues, *, panoramas: int) 
         capture_name(summary),
         date_in_words(summary.started),
         panoramas,
-        tuple(sizes.most_common(_MAX_SIZES)),
+        tuple(sizes.most_common(4)),
         len(found),
         working[0][0] if working and not same else None,
     )
@@ -155,9 +143,7 @@ def date_in_words(started: str) -> str:
 
 
 MAX_THUMBNAILS = 1000
-MAX_MEASURED = 1000
 MAX_BYTES = 6_000
-_THREADS = 2
 _VERSION = 2
 
 
@@ -166,7 +152,7 @@ def thumbnails(
 ) -> dict[str, Picture]:
     """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = evenly_spaced(views, MAX_THUMBNAILS)
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(2) as pool:
         found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept=kept), chosen)
         return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
 
@@ -174,7 +160,7 @@ def thumbnails(
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
     """Return the shares of the sphere of at most 1,000 evenly spaced views, by name; the sky does not count."""
     found: dict[str, Shares] = {}
-    for view in evenly_spaced(views, MAX_MEASURED):
+    for view in evenly_spaced(views, 1000):
         name = view.name
         key = key_of(results, name, "s", version=_VERSION)
         shares = shares_from_fact(kept.fact(key)) if key else None
@@ -198,42 +184,23 @@ def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, *, kept:
     return picture(np.vstack(panels), width=160, most_bytes=MAX_BYTES, key=key) if panels else None
 
 
-MAX_ROWS = 5000
-
-
 @dataclass(frozen=True)
 class Row:
-    """One panorama.
-
-    Attributes:
-        name: of the image.
-        registered: whether it has a pose; None if no stage computed poses.
-        reason: why it was left out, or "".
-        doubtful: why its pose is doubtful, or "".
-        p_right: the probability that its pose is right, or None.
-        shares: of the sphere around it, if measured.
-        completeness: share of pixels with a range, as its stage reported it, or None.
-        consistent: share of pixels on which other views agree, likewise.
-        links: number of images with which it has a common geometry.
-        residual_deg: median reprojection residual, or None.
-        p95_deg: 95 % of its residuals are smaller, or None.
-        thumbnail: its preview, or None.
-        group: number of its group; None if there is only one group.
-    """
+    """One panorama."""
 
     name: str
-    registered: bool | None
-    reason: str
-    doubtful: str
-    p_right: float | None
-    shares: Shares | None
-    completeness: float | None
-    consistent: float | None
-    links: int
-    residual_deg: float | None
-    p95_deg: float | None
-    thumbnail: Picture | None
-    group: int | None = None
+    registered: bool | None  # whether it has a pose; None if no stage computed poses
+    reason: str  # why it was left out, or ""
+    doubtful: str  # why its pose is doubtful, or ""
+    p_right: float | None  # the probability that its pose is right, or None
+    shares: Shares | None  # of the sphere around it, if measured
+    completeness: float | None  # share of pixels with a range, as its stage reported it, or None
+    consistent: float | None  # share of pixels on which other views agree, likewise
+    links: int  # number of images with which it has a common geometry
+    residual_deg: float | None  # median reprojection residual, or None
+    p95_deg: float | None  # 95 % of its residuals are smaller, or None
+    thumbnail: Picture | None  # its preview, or None
+    group: int | None = None  # number of its group; None if there is only one group
 
     @property
     def doubt(self) -> float:
@@ -264,7 +231,7 @@ def panorama_rows(
     doubts = summary.doubtful_images
     order = [*poses.registered, *figures, *poses.rejected, *summary.rejected, *doubts]
     rows = []
-    for name in list(dict.fromkeys(order))[:MAX_ROWS]:
+    for name in list(dict.fromkeys(order))[:5000]:
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
         view = figures.get(name, ViewSummary())
         rows.append(
@@ -287,62 +254,34 @@ def panorama_rows(
     return tuple(rows)
 
 
-_MAX_REASONS = 300
-
-
 @dataclass(frozen=True)
 class Content:
-    """The content of the page.
+    """The content of the page."""
 
-    Attributes:
-        capture: what the report is about.
-        verdict: the head of the page.
-        advice: what to do next time, the most urgent first.
-        groups: the poses of each group of cameras, the largest first.
-        maps: the cameras of each group, from above and from the side.
-        metric: images whose ranges are in metres.
-        rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
-        pairs: number of compared pairs.
-        cloud: pictures of the cloud.
-        turnable: the cloud for the viewer in the page; None if there is none.
-        cards: views shown in full.
-        total_views: number of views.
-        masked: what is masked in the panoramas.
-        rows: one for each panorama.
-        total_rows: number of panoramas.
-        mean_shares: of the sphere, over all measured views.
-        measured_views: number of these.
-        residuals: of the points.
-        pair_residuals: medians of the pairs' residuals.
-        scores: (stage, tables) of each branch with scores.
-        comparison: the medians of several branches side by side.
-        notes: what could not be shown.
-        facts: figures that the next page may reuse.
-    """
-
-    capture: CaptureFacts
-    verdict: Verdict
-    advice: tuple[Suggestion, ...]
-    groups: tuple[PosesSummary, ...]
-    maps: tuple[tuple[CameraMap, ...], ...]
-    metric: frozenset[str]
+    capture: CaptureFacts  # what the report is about
+    verdict: Verdict  # the head of the page
+    advice: tuple[Suggestion, ...]  # what to do next time, the most urgent first
+    groups: tuple[PosesSummary, ...]  # the poses of each group of cameras, the largest first
+    maps: tuple[tuple[CameraMap, ...], ...]  # the cameras of each group, from above and from the side
+    metric: frozenset[str]  # images whose ranges are in metres
+    # (first, second, candidates or None, reason) of pairs without a common geometry
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
-    pairs: int
-    cloud: CloudPictures
-    turnable: TurnableCloud | None
-    cards: tuple[ViewCard, ...]
+    pairs: int  # number of compared pairs
+    cloud: CloudPictures  # pictures of the cloud
+    turnable: TurnableCloud | None  # the cloud for the viewer in the page; None if there is none
+    cards: tuple[ViewCard, ...]  # views shown in full
     total_views: int
-    masked: MaskedAreas
-    rows: tuple[Row, ...]
+    masked: MaskedAreas  # what is masked in the panoramas
+    rows: tuple[Row, ...]  # one for each panorama
     total_rows: int
-    mean_shares: Shares | None
-    measured_views: int
-    residuals: Residuals | None
-    pair_residuals: Histogram | None
-    scores: tuple[tuple[str, Mapping[str, Any]], ...]
-    comparison: Mapping[str, Any]
-    notes: tuple[str, ...]
-    facts: Mapping[str, Any]
+    mean_shares: Shares | None  # of the sphere, over all measured views
+    measured_views: int  # number of these
+    residuals: Residuals | None  # of the points
+    pair_residuals: Histogram | None  # medians of the pairs' residuals
+    scores: tuple[tuple[str, Mapping[str, Any]], ...]  # (stage, tables) of each branch with scores
+    comparison: Mapping[str, Any]  # the medians of several branches side by side
+    notes: tuple[str, ...]  # what could not be shown
+    facts: Mapping[str, Any]  # figures that the next page may reuse
 
 
 def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:
@@ -406,7 +345,7 @@ def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tu
             link.first,
             link.second,
             link.candidates,
-            values.pair_reason(pair_name(link.first, link.second)) if idx < _MAX_REASONS else "",
+            values.pair_reason(pair_name(link.first, link.second)) if idx < 300 else "",
         )
         for idx, link in enumerate(rejected)
     )

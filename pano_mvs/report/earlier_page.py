@@ -19,7 +19,6 @@ _PICTURE = re.compile(
     r'height="(\d{1,5})"'
 )
 _FACTS = re.compile(r'<script type="application/json" id="facts">([^<]*)</script>')
-_MAX_BYTES = 100_000_000
 
 
 class EarlierPage:
@@ -34,7 +33,7 @@ class EarlierPage:
     def of_file(path: Path) -> EarlierPage:
         """Return the images and figures of a page; nothing if there is no page, or another program wrote it."""
         try:
-            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _MAX_BYTES else ""
+            text = path.read_text(encoding="utf-8") if path.stat().st_size <= 100_000_000 else ""
         except (OSError, UnicodeDecodeError):
             return EarlierPage()
         pictures = {

@@ -20,14 +20,10 @@ from pano_mvs.scene import Panorama
 from pano_mvs.scene.masking import inside_crop
 from pano_mvs.scene.panorama import StaticMasks, camera_of
 
-VERSION = 1
-"""Raise it when the pictures or the kinds change: earlier pages' are then drawn again."""
-
-MAX_EXAMINED = 100
+VERSION = 1  # raise it when the pictures or the kinds change: earlier pages' are then drawn again
 MAX_PICTURES = 12
 MAX_BYTES = 50_000
 _WIDTH = 640
-_EXAMINED_HW = (256, 512)
 
 
 @dataclass(frozen=True)
@@ -61,18 +57,12 @@ class MaskedCount:
 
 @dataclass(frozen=True)
 class MaskedAreas:
-    """What is masked in a capture.
+    """What is masked in a capture."""
 
-    Attributes:
-        counts: one for each reason that occurs.
-        examined: number of panoramas that were examined, at most 100, evenly spaced.
-        total: number of panoramas.
-        pictures: (image, reason to share of the sphere, picture), at most twelve, with at least one for each reason.
-    """
-
-    counts: tuple[MaskedCount, ...] = ()
-    examined: int = 0
+    counts: tuple[MaskedCount, ...] = ()  # one for each reason that occurs
+    examined: int = 0  # number of panoramas that were examined, at most 100, evenly spaced
     total: int = 0
+    # (image, reason to share of the sphere, picture), at most twelve, with at least one for each reason
     pictures: tuple[tuple[str, Mapping[str, float], Picture], ...] = ()
 
 
@@ -81,7 +71,7 @@ def masked_areas(values: StoredValues, kept: EarlierPage) -> MaskedAreas:
     names = list(values.refs.get("images", {}))
     shares: dict[str, Mapping[str, float]] = {}
     masks = values.static_masks if names else None
-    for name in evenly_spaced(names, MAX_EXAMINED):
+    for name in evenly_spaced(names, 100):
         found = _shares(values, kept, name, masks=masks)
         if found is not None:
             shares[name] = found
@@ -120,7 +110,7 @@ def masked_kinds(panorama: Panorama, *, static: StaticMasks | None = None, sky: 
         static: what moves with the cameras.
         sky: (H, W) of the panorama's range map, of any size.
     """
-    size_hw = min(panorama.size_hw, _EXAMINED_HW)
+    size_hw = min(panorama.size_hw, (256, 512))
     height = size_hw[0]
     outside = np.ones(size_hw, np.bool_)
     outside[inside_crop(size_hw, panorama.covers_ltwh, panorama.source_size_hw)] = False

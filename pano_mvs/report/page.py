@@ -25,9 +25,6 @@ from pano_mvs.results.summary import RunSummary
 
 _SCRIPTS = ("report.js", "cloud_viewer.js")
 
-MAX_SHOWN = 200
-"""Failures, rejected pairs and the like that the page lists; run.json has all of them."""
-
 
 def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None = None) -> Verdict:
     """Write `report.html` and return the verdict that it shows; `gather_report` and `write_page` in one step.
@@ -35,7 +32,6 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
     Args:
         out_dir: the output folder; previews are read from it, and the images of an existing page are
             reused if they show the same values.
-        summary: of the run.
         values: the values of the run; None if only the summary is known.
     """
     report = gather_report(out_dir, summary, values)
@@ -53,6 +49,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
     """Write `report.html`: one file without references to others, at most 30 MB."""
     scripts = [_resource(name) for name in _SCRIPTS]
     notes = tuple(dict.fromkeys([*summary.warnings, *summary.notes]))
+    # Failures, rejected pairs and the like that the page lists; run.json has all of them.
     page = (
         _environment()
         .get_template("report.html.j2")
@@ -62,7 +59,7 @@ def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:
             folders=_folders(summary.files),
             longest=max((stage.seconds for stage in summary.stages), default=0) or 1,
             content=content,
-            most_shown=MAX_SHOWN,
+            most_shown=200,
             most_advice=MAX_SUGGESTIONS,
             facts=content.facts,
             scripts=[Markup(script) for script in scripts],  # noqa: S704  # ours

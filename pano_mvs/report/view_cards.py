@@ -22,26 +22,16 @@ from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-_ROWS = 256
-
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of the sphere, which sum to 1.
+    """Shares of the sphere, which sum to 1."""
 
-    Attributes:
-        consistent: other views agree (confidence 128–255).
-        weak: seen, but not confirmed (64–127).
-        filled: interpolated, not seen (1–63).
-        invalid: no range.
-        masked: excluded by a mask, or sky.
-    """
-
-    consistent: float
-    weak: float
-    filled: float
-    invalid: float
-    masked: float
+    consistent: float  # other views agree (confidence 128–255)
+    weak: float  # seen, but not confirmed (64–127)
+    filled: float  # interpolated, not seen (1–63)
+    invalid: float  # no range
+    masked: float  # excluded by a mask, or sky
 
     @property
     def complete(self) -> float:
@@ -56,7 +46,7 @@ class Shares:
 
 def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Shares:
     """Return the shares of a view by the solid angle of its pixels; large maps are sampled."""
-    step = max(1, confidence.shape[0] // _ROWS)
+    step = max(1, confidence.shape[0] // 256)
     sampled = np.asarray(confidence[step // 2 :: step, step // 2 :: step])
     height, width = sampled.shape
     elevation_rad = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
@@ -80,7 +70,6 @@ def fact_of(shares: Shares) -> list[float]:
     return list(astuple(shares))
 
 
-_TICKS_APART = 0.09
 # Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
 UNCERTAINTY_LIMITS = 0.001, 0.2
 # A view has a scale of its own only if an end of it differs from the common scale by more than this factor.
@@ -100,15 +89,10 @@ Limits = tuple[float, float]
 
 @dataclass(frozen=True)
 class RangeScales:
-    """The nearest and the farthest range of the colour scales of a view.
+    """The nearest and the farthest range of the colour scales of a view."""
 
-    Attributes:
-        common: of all views of its group.
-        own: of this view; None if it has no ranges.
-    """
-
-    common: Limits
-    own: Limits | None
+    common: Limits  # of all views of its group
+    own: Limits | None  # of this view; None if it has no ranges
 
     @property
     def differ(self) -> bool:
@@ -136,7 +120,7 @@ def range_ticks(near: float, far: float) -> Ticks:
     found: list[tuple[float, float]] = []
     for value in scale_ticks(near, far):
         at = round(float(np.log(value / near) / np.log(far / near)), 4)
-        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= _TICKS_APART):
+        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= 0.09):
             found.append((at, value))
     return tuple(found)
 
@@ -162,37 +146,28 @@ def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
     return rgb
 
 
-VERSION = 4
-"""Raise it when the pictures change: earlier pages' are then drawn again."""
-
+VERSION = 4  # raise it when the pictures change: earlier pages' are then drawn again
 MAX_CARDS = 36
 WIDTH = 768
 MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}
 """Largest size of each image, before base64 encoding."""
 
-_DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
 
 
 @dataclass(frozen=True)
 class ViewCard:
-    """One view as the page shows it in full.
-
-    Attributes:
-        name: of the image.
-        pictures: the available images among `panorama`, `range`, `confidence` and `uncertainty`.
-        shares: of the sphere, or None.
-        ticks: (position on the colour scale from 0 to 1, range); the scale is common to all views of a group.
-        own_range: the range on a scale of this view alone; None if that would look the same.
-        own_ticks: of that scale.
-    """
+    """One view as the page shows it in full."""
 
     name: str
+    # the available images among `panorama`, `range`, `confidence` and `uncertainty`
     pictures: Mapping[str, Picture]
-    shares: Shares | None
+    shares: Shares | None  # of the sphere, or None
+    # (position on the colour scale from 0 to 1, range); the scale is common to all views of a group
     ticks: Ticks
+    # the range on a scale of this view alone; None if that would look the same
     own_range: Picture | None = None
-    own_ticks: Ticks = ()
+    own_ticks: Ticks = ()  # of that scale
 
     @property
     def has_uncertainty(self) -> bool:
@@ -225,13 +200,11 @@ def view_cards(
 
     Args:
         out_dir: the output folder, whose previews replace values that are not in the cache.
-        views: of the run.
-        kept: the earlier page's.
         groups: number of the group of each image; the views of a group share a colour scale, those of different groups
             do not, because their units of length differ. None: one group.
     """
     group_of = groups or {}
-    with ThreadPoolExecutor(_DECODERS) as pool:
+    with ThreadPoolExecutor(2) as pool:  # a large panorama takes 100 MB while it is decoded
         own = dict(
             zip(
                 (view.name for view in views),

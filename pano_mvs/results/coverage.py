@@ -19,48 +19,30 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
-VERSION = 1
-"""Raise it when the figures change: those of earlier pages are then computed again."""
-
+VERSION = 1  # raise it when the figures change: those of earlier pages are then computed again
 _POINTS_HW, _SURFACES_HW = (32, 64), (64, 128)
-_MAX_OTHERS = 8
 # A point is hidden from a camera if a surface is nearer by more than this share of its distance.
 _TOLERANCE = 0.1
-_MIN_AREA = 0.02
-_MAX_AREAS = 2
 
 
 @dataclass(frozen=True)
 class LonelyArea:
-    """An area that only one camera sees.
+    """An area that only one camera sees."""
 
-    Attributes:
-        azimuth_deg: of its middle, in the image: 0 is the centre, positive to the right.
-        elevation_deg: of its middle, positive above the horizon.
-        share: of the sphere around the camera.
-        distance: median range, in the unit of the camera's world.
-        at: its middle in the world.
-    """
-
-    azimuth_deg: float
-    elevation_deg: float
-    share: float
-    distance: float
-    at: Direction
+    azimuth_deg: float  # of its middle, in the image: 0 is the centre, positive to the right
+    elevation_deg: float  # of its middle, positive above the horizon
+    share: float  # of the sphere around the camera
+    distance: float  # median range, in the unit of the camera's world
+    at: Direction  # its middle in the world
 
 
 @dataclass(frozen=True)
 class ViewCoverage:
-    """What one camera sees.
+    """What one camera sees."""
 
-    Attributes:
-        typical_range: median range by solid angle, in the unit of the camera's world.
-        alone: share of the sphere that no other camera sees.
-        areas: the largest connected parts of that, at most two, each at least 2 % of the sphere.
-    """
-
-    typical_range: float
-    alone: float
+    typical_range: float  # median range by solid angle, in the unit of the camera's world
+    alone: float  # share of the sphere that no other camera sees
+    # the largest connected parts of that, at most two, each at least 2 % of the sphere
     areas: tuple[LonelyArea, ...] = ()
 
 
@@ -174,8 +156,8 @@ def _areas(alone: Mask, ranges: FloatArray, pose: Rigid3, *, weights: NDArray[np
     shares = np.bincount(labels.ravel(), weights.ravel(), minlength=1)
     shares[0] = 0
     found = []
-    for label in np.argsort(-shares)[:_MAX_AREAS]:
-        if shares[label] < _MIN_AREA:
+    for label in np.argsort(-shares)[:2]:
+        if shares[label] < 0.02:
             break
         inside = labels == label
         rays = ray_grid((alone.shape[0], alone.shape[1]))[inside]
@@ -204,7 +186,7 @@ def _labels(pixels: Mask) -> NDArray[np.int64]:
 def _nearest(group: Poses, idx: int, with_ranges: Sequence[int]) -> list[int]:
     others = [at for at in with_ranges if at != idx]
     distances = np.linalg.norm(group.centers[others] - group.centers[idx], axis=1)
-    return [others[at] for at in np.argsort(distances, kind="stable")[:_MAX_OTHERS]]
+    return [others[at] for at in np.argsort(distances, kind="stable")[:8]]
 
 
 def _cached(small: dict[str, _Small | None], values: StoredValues, idx: int, *, group: Poses) -> _Small | None:

@@ -21,7 +21,6 @@ from pano_mvs.results.summary import RUN_JSON, RunSummary
 CRATE_FILE = "ro-crate-metadata.json"
 _PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
 _COMPLETED, _FAILED = "http://schema.org/CompletedActionStatus", "http://schema.org/FailedActionStatus"
-_FINISHED = (0, 3)
 
 
 def write_crate(out: Path) -> Path:
@@ -74,7 +73,7 @@ def write_crate(out: Path) -> Path:
         result=[{"@id": entity.id} for entity in outputs],
         startTime=began.isoformat(),
         endTime=(began + timedelta(seconds=summary.seconds or 0)).isoformat(),
-        actionStatus={"@id": _COMPLETED if summary.exit_code in _FINISHED else _FAILED},
+        actionStatus={"@id": _COMPLETED if summary.exit_code in (0, 3) else _FAILED},
         **({"error": summary.stopped} if summary.stopped else {}),
     )
     profile = described(_PROFILE, "CreativeWork", name="Process Run Crate", version="0.5")

@@ -20,25 +20,16 @@ from pano_mvs.results.records import Direction, PairLink, PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import FAIR_CONSISTENT, compares_views
 
-_KNOWN_NEIGHBOURS = 6
-
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
-    """The cameras of a group, with what is known of their surroundings.
-
-    Attributes:
-        poses: of the group; the centres of all cameras are known.
-        centers: (N, 3), N > 1.
-        neighbours: (N, K) up to six nearest other cameras, nearest first.
-        coverage: what the views see, as far as known.
-    """
+    """The cameras of a group, with what is known of their surroundings."""
 
     number: int
-    poses: PosesSummary
-    centers: FloatArray
-    neighbours: NDArray[np.intp]
-    coverage: Mapping[str, ViewCoverage]
+    poses: PosesSummary  # of the group; the centres of all cameras are known
+    centers: FloatArray  # (N, 3), N > 1
+    neighbours: NDArray[np.intp]  # (N, K) up to six nearest other cameras, nearest first
+    coverage: Mapping[str, ViewCoverage]  # what the views see, as far as known
 
     @staticmethod
     def of(number: int, poses: PosesSummary, coverage: Mapping[str, ViewCoverage]) -> CameraGroup | None:
@@ -79,7 +70,7 @@ class CameraGroup:
 def nearest_neighbours(centers: FloatArray) -> NDArray[np.intp]:
     """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
     count = len(centers)
-    found = cKDTree(centers).query(centers, k=min(count, _KNOWN_NEIGHBOURS + 1))
+    found = cKDTree(centers).query(centers, k=min(count, 7))
     distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
     near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
     own = near == np.arange(count)[:, None]
@@ -117,11 +108,8 @@ LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 
 _USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
 _GOOD_BASELINE = 0.05, 0.2
-_NEIGHBOURS = 4
 _WEAK = 0.5  # of the median share that other views confirm
-_MAX_ADDED = 20
 _MAX_UNREGISTERED = 4
-_MAX_AREAS = 3
 
 
 class _Severity(IntEnum):
@@ -130,25 +118,16 @@ class _Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Something to do when the place is captured again.
+    """Something to do when the place is captured again."""
 
-    Attributes:
-        action: what to do, in a sentence that names images.
-        reasons: why, with figures.
-        group: number of the group in whose world `at` is.
-        at: where to stand; None if no place is known.
-    """
-
-    action: str
-    reasons: tuple[str, ...]
-    group: int = 0
-    at: Direction | None = None
+    action: str  # what to do, in a sentence that names images
+    reasons: tuple[str, ...]  # why, with figures
+    group: int = 0  # number of the group in whose world `at` is
+    at: Direction | None = None  # where to stand; None if no place is known
 
 
 @dataclass
 class _Between:
-    """Reasons for a panorama between two images."""
-
     severity: _Severity
     group: int
     at: Direction | None
@@ -160,7 +139,6 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
     """Return what to do when the place is captured again, the most urgent first.
 
     Args:
-        summary: of the run.
         coverage: what the views see, as far as known; see `pano_mvs.results.coverage`.
     """
     found = _Collected()
@@ -204,7 +182,6 @@ class _Collected:
         entry.reasons.append(reason)
 
     def add(self, severity: _Severity, suggestion: Suggestion) -> None:
-        """Add a suggestion that is not about two images."""
         self._others.append((severity, suggestion))
 
     def in_order(self) -> tuple[Suggestion, ...]:
@@ -293,7 +270,7 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"
             )
-            count = min(_MAX_ADDED, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
+            count = min(20, max(1, math.ceil(length / typical * (1 - 1e-6)) - 1))
             _stand_between(group, found, (first, second), severity=_Severity.SPACING, reason=reason, count=count)
     for idx, name in enumerate(group.names):
         known = group.typical_range(idx)
@@ -316,7 +293,7 @@ def _too_close(group: CameraGroup, first: int, second: int) -> bool:
 def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     """Suggest larger distances if all near neighbours of cameras are too close for their ranges."""
     known = [idx for idx in range(len(group.names)) if group.typical_range(idx)]
-    farthest = {idx: group.distance(idx, int(group.nearest(idx)[:_NEIGHBOURS][-1])) for idx in known}
+    farthest = {idx: group.distance(idx, int(group.nearest(idx)[:4][-1])) for idx in known}
     ratios = {idx: length / (group.typical_range(idx) or 1.0) for idx, length in farthest.items()}
     close = [idx for idx in known if ratios[idx] < SHORT_BASELINE]
     if not close:
@@ -384,7 +361,7 @@ def _lonely(group: CameraGroup, found: _Collected) -> None:
         for area in group.coverage[name].areas
     ]
     areas.sort(key=lambda pair: -pair[0].share)
-    for area, idx in areas[:_MAX_AREAS]:
+    for area, idx in areas[:3]:
         name, where = group.names[idx], direction_words(area)
         reason = (
             f"{share(area.share)} of the sphere around {name}, {where}, about {group.length(area.distance)} away, is "

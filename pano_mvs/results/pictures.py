@@ -15,25 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from pano_mvs.core.file_names import file_inside
 
 _QUALITIES = (82, 70, 55, 40)
-_MIN_PX = 32
-_LINE_PX = 4
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of the page.
+    """One picture of the page."""
 
-    Attributes:
-        uri: `data:image/jpeg;base64,…`.
-        size_hw: (height, width) in pixels.
-        key: by which a later page can reuse it; "" if it cannot.
-    """
-
-    uri: str
+    uri: str  # `data:image/jpeg;base64,…`
     size_hw: tuple[int, int]
-    key: str = ""
+    key: str = ""  # by which a later page can reuse it; "" if it cannot
 
 
 def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str = "") -> Picture:
@@ -43,14 +35,13 @@ def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str =
         image: (H, W, 3) uint8 RGB.
         width: in pixels, at most.
         most_bytes: of the JPEG, before base64 encoding.
-        key: see `Picture`.
     """
     shown = resized(image, width)
     while True:
         bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         for quality in _QUALITIES:
             data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
-            if len(data) <= most_bytes or (min(shown.shape[:2]) <= _MIN_PX and quality == _QUALITIES[-1]):
+            if len(data) <= most_bytes or (min(shown.shape[:2]) <= 32 and quality == _QUALITIES[-1]):
                 size_hw = int(shown.shape[0]), int(shown.shape[1])
                 return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}", size_hw, key)
         shown = resized(shown, shown.shape[1] * 3 // 4)
@@ -93,7 +84,7 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     height = rgb.shape[1] // 2
     # They are separated by a white line; the scale is below.
-    start = height if small else height + _LINE_PX
+    start = height if small else height + 4
     return rgb[:height], rgb[start : start + height]
 
 

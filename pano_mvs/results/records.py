@@ -39,28 +39,18 @@ class OptionalEntry(Entry):
 
 
 class WorkflowSummary(Entry):
-    """The workflow that ran.
-
-    Attributes:
-        path: its file; empty if it was not read from one.
-        overrides: settings that were changed, as `STAGE.PARAM=VALUE`.
-    """
+    """The workflow that ran."""
 
     name: str = ""
-    path: str = ""
-    overrides: tuple[str, ...] = ()
+    path: str = ""  # its file; empty if it was not read from one
+    overrides: tuple[str, ...] = ()  # settings that were changed, as `STAGE.PARAM=VALUE`
 
 
 class MergedSummary(Entry):
-    """The blocks of a merged capture.
+    """The blocks of a merged capture."""
 
-    Attributes:
-        blocks: the output folders of the blocks.
-        images: folder of all images; empty if the blocks are not links to one folder.
-    """
-
-    blocks: tuple[str, ...] = ()
-    images: str = ""
+    blocks: tuple[str, ...] = ()  # the output folders of the blocks
+    images: str = ""  # folder of all images; empty if the blocks are not links to one folder
 
 
 class UnitCounts(Entry):
@@ -73,41 +63,24 @@ class UnitCounts(Entry):
 
 
 class StageOutcome(UnitCounts):
-    """What one stage did.
+    """What one stage did."""
 
-    Attributes:
-        name: of the stage in the workflow.
-        use: the registered stage, such as `depth.sweep`.
-        version: of the registered stage.
-        params: its settings, as JSON values.
-        units: number of units of work.
-        seconds: from the start of its first unit to the end of its last.
-        unit_seconds: sum over its computed units; None in files of early versions.
-        metrics: mean over its units of each figure that the stage reports.
-    """
-
-    name: str = ""
-    use: str = ""
-    version: int = 1
-    params: Mapping[str, Any] = {}
+    name: str = ""  # of the stage in the workflow
+    use: str = ""  # the registered stage, such as `depth.sweep`
+    version: int = 1  # of the registered stage
+    params: Mapping[str, Any] = {}  # its settings, as JSON values
     units: int = 0
-    seconds: float = 0.0
-    unit_seconds: float | None = None
-    metrics: Mapping[str, Number] = {}
+    seconds: float = 0.0  # from the start of its first unit to the end of its last
+    unit_seconds: float | None = None  # sum over its computed units; None in files of early versions
+    metrics: Mapping[str, Number] = {}  # mean over its units of each figure that the stage reports
 
 
 class BlockedUnit(Entry):
-    """A unit that could not run because an input of it failed.
+    """A unit that could not run because an input of it failed."""
 
-    Attributes:
-        stage: name of the stage in the workflow.
-        item: the image, pair or view; empty if the stage has one unit.
-        cause: what failed before.
-    """
-
-    stage: str = ""
-    item: str = ""
-    cause: str = ""
+    stage: str = ""  # name of the stage in the workflow
+    item: str = ""  # the image, pair or view; empty if the stage has one unit
+    cause: str = ""  # what failed before
 
     @property
     def label(self) -> str:
@@ -138,99 +111,61 @@ class ImageReason(Entry):
 
 
 class PairLink(NamedTuple):
-    """A pair of images that was matched.
-
-    Attributes:
-        first: one image.
-        second: the other.
-        inliers: matches that agree with one geometry; 0 if the pair was rejected.
-        candidates: matches before verification, if known.
-        residual_deg: median epipolar residual, if known.
-    """
+    """A pair of images that was matched."""
 
     first: str
     second: str
-    inliers: int
-    candidates: int | None = None
-    residual_deg: float | None = None
+    inliers: int  # matches that agree with one geometry; 0 if the pair was rejected
+    candidates: int | None = None  # matches before verification, if known
+    residual_deg: float | None = None  # median epipolar residual, if known
 
 
 class NearestPair(NamedTuple):
-    """The pair that comes closest to joining a group of cameras to the largest group.
+    """The pair that comes closest to joining a group of cameras to the largest group."""
 
-    Attributes:
-        first: image of the largest group.
-        second: image of the other group.
-        matches: verified matches of the pair.
-        candidates: matches before verification.
-    """
-
-    first: str
-    second: str
-    matches: int = 0
-    candidates: int = 0
+    first: str  # image of the largest group
+    second: str  # image of the other group
+    matches: int = 0  # verified matches of the pair
+    candidates: int = 0  # matches before verification
 
 
 class PoseGroup(Entry):
-    """A group of cameras with a world frame and a unit of length of its own.
-
-    Attributes:
-        images: names of its images.
-        frame: what the world frame is.
-        scale: what the unit of length is.
-        metric: whether lengths are in metres.
-        points: number of triangulated points.
-        up: mean of the cameras' up directions in the world, a unit vector; None if they do not agree.
-        z_up_from_world: rotation from the world to the axes of exports with `frame: upright`, by rows.
-        camera_height: median height of the cameras above the floor of the cloud, scene units; None if unknown.
-        nearest_pair: of a smaller group, the pair that nearly joins it to the largest; None if none was compared.
-    """
+    """A group of cameras with a world frame and a unit of length of its own."""
 
     images: tuple[str, ...] = ()
-    frame: str = ""
-    scale: str = ""
-    metric: bool = False
-    points: int | None = None
+    frame: str = ""  # what the world frame is
+    scale: str = ""  # what the unit of length is
+    metric: bool = False  # whether lengths are in metres
+    points: int | None = None  # number of triangulated points
+    # mean of the cameras' up directions in the world, a unit vector; None if they do not agree
     up: Direction | None = None
+    # rotation from the world to the axes of exports with `frame: upright`, by rows
     z_up_from_world: tuple[Direction, ...] = ()
+    # median height of the cameras above the floor of the cloud, scene units; None if unknown
     camera_height: float | None = None
+    # of a smaller group, the pair that nearly joins it to the largest; None if none was compared
     nearest_pair: NearestPair | None = None
 
 
 class PosesSummary(OptionalEntry):
-    """The camera poses; all empty if the run has none.
+    """The camera poses; all empty if the run has none."""
 
-    Attributes:
-        registered: images with a pose.
-        blocked: units that could not run.
-        rejected: image without a pose to the reason.
-        doubts: registered image whose pose is doubtful to the reason.
-        confirmed: image to the share of its texture that other images confirm, and the share that is expected.
-        p_right: image to the probability that its pose is right; None where nothing was measured about it.
-        centers: of the registered cameras in the world, in the order of `registered`.
-        points: number of triangulated points.
-        frame: what the world frame is; of the largest group, as are `scale`, `metric` and `up`.
-        scale: what the unit of length is.
-        metric: whether lengths are in metres.
-        up: mean of the cameras' up directions, a unit vector; None if they do not agree.
-        groups: of cameras that no reliable pair connects, the largest first.
-        links: the pairs that were matched.
-    """
-
-    registered: tuple[str, ...] = ()
-    blocked: tuple[BlockedUnit, ...] = ()
-    rejected: Mapping[str, str] = {}
-    doubts: Mapping[str, str] = {}
+    registered: tuple[str, ...] = ()  # images with a pose
+    blocked: tuple[BlockedUnit, ...] = ()  # units that could not run
+    rejected: Mapping[str, str] = {}  # image without a pose to the reason
+    doubts: Mapping[str, str] = {}  # registered image whose pose is doubtful to the reason
+    # image to the share of its texture that other images confirm, and the share that is expected
     confirmed: Mapping[str, tuple[float | None, float | None]] = {}
+    # image to the probability that its pose is right; None where nothing was measured about it
     p_right: Mapping[str, float | None] = {}
-    centers: tuple[Direction, ...] = ()
-    points: int = 0
-    frame: str = ""
-    scale: str = ""
-    metric: bool = False
-    up: Direction | None = None
-    groups: tuple[PoseGroup, ...] = ()
-    links: tuple[PairLink, ...] = ()
+    centers: tuple[Direction, ...] = ()  # of the registered cameras in the world, in the order of `registered`
+    points: int = 0  # number of triangulated points
+    frame: str = ""  # what the world frame is; of the largest group, as are `scale`, `metric` and `up`
+    scale: str = ""  # what the unit of length is
+    metric: bool = False  # whether lengths are in metres
+    up: Direction | None = None  # mean of the cameras' up directions, a unit vector; None if they do not agree
+    groups: tuple[PoseGroup, ...] = ()  # of cameras that no reliable pair connects, the largest first
+    links: tuple[PairLink, ...] = ()  # the pairs that were matched
 
     def by_group(self) -> tuple[PosesSummary, ...]:
         """Return the poses of each group, as those of a run that has this group alone."""
@@ -253,30 +188,19 @@ class PosesSummary(OptionalEntry):
 
 
 class ScoresSummary(OptionalEntry):
-    """How far a result is from the ground truth; all empty if none is known.
+    """How far a result is from the ground truth; all empty if none is known."""
 
-    Attributes:
-        poses: figure to value, over all cameras.
-        views: image to figure to value.
-        notes: what was left out, and why.
-    """
-
-    poses: Mapping[str, Any] = {}
-    views: Mapping[str, Mapping[str, Number]] = {}
-    notes: tuple[str, ...] = ()
+    poses: Mapping[str, Any] = {}  # figure to value, over all cameras
+    views: Mapping[str, Mapping[str, Number]] = {}  # image to figure to value
+    notes: tuple[str, ...] = ()  # what was left out, and why
 
 
 class ViewSummary(Entry):
-    """The final range map of one view; in run.json the metrics stand beside the name.
+    """The final range map of one view; in run.json the metrics stand beside the name."""
 
-    Attributes:
-        name: of the image.
-        preview: file in the output folder that shows it; empty if there is none.
-        metrics: what its stage reported, such as `completeness` and `consistent`, shares of the pixels.
-    """
-
-    name: str = ""
-    preview: str = ""
+    name: str = ""  # of the image
+    preview: str = ""  # file in the output folder that shows it; empty if there is none
+    # what its stage reported, such as `completeness` and `consistent`, shares of the pixels
     metrics: Mapping[str, Number] = {}
 
     @model_validator(mode="before")
@@ -303,61 +227,36 @@ class ViewSummary(Entry):
 
 
 class CloudSummary(OptionalEntry):
-    """The fused cloud.
+    """The fused cloud."""
 
-    Attributes:
-        points: number of points; None if the run has no cloud.
-    """
-
-    points: int | None = None
+    points: int | None = None  # number of points; None if the run has no cloud
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One headline figure of the report.
+    """One headline figure of the report."""
 
-    Attributes:
-        value: the figure, as text.
-        label: what it counts.
-        mood: "good", "fair" or "bad"; "" if it is not judged.
-    """
-
-    value: str
-    label: str
-    mood: str = ""
+    value: str  # the figure, as text
+    label: str  # what it counts
+    mood: str = ""  # "good", "fair" or "bad"; "" if it is not judged
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding about a run.
+    """A finding about a run."""
 
-    Attributes:
-        mood: "bad" or "fair"; "" for a note.
-        text: what it is.
-        remedy: what to do about it, or "".
-    """
-
-    mood: str
-    text: str
-    remedy: str = ""
+    mood: str  # "bad" or "fair"; "" for a note
+    text: str  # what it is
+    remedy: str = ""  # what to do about it, or ""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the result of a run is reliable.
+    """Whether the result of a run is reliable."""
 
-    Attributes:
-        mood: "good", "fair" or "bad".
-        outcome: how the run ended.
-        judgement: whether the result is reliable, in a sentence; empty if there is nothing to judge.
-        sentence: what was done, in one sentence.
-        tiles: the headline figures.
-        findings: what is wrong or doubtful, the worst first.
-    """
-
-    mood: str
-    outcome: str
-    judgement: str
-    sentence: str
-    tiles: tuple[Tile, ...]
-    findings: tuple[Finding, ...]
+    mood: str  # "good", "fair" or "bad"
+    outcome: str  # how the run ended
+    judgement: str  # whether the result is reliable, in a sentence; empty if there is nothing to judge
+    sentence: str  # what was done, in one sentence
+    tiles: tuple[Tile, ...]  # the headline figures
+    findings: tuple[Finding, ...]  # what is wrong or doubtful, the worst first

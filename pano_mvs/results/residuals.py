@@ -11,26 +11,18 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 
-_MAX_OBSERVATIONS = 2_000_000
 _BLOCK = 250_000
 _BINS = 30
-_MAX_TICKS = 5
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Counts over bins of equal width, the last of which includes all larger values.
-
-    Attributes:
-        upper_deg: nominal end of the last bin.
-        p95_deg: 95 % are smaller.
-        total: number of values.
-    """
+    """Counts over bins of equal width, the last of which includes all larger values."""
 
     counts: tuple[int, ...]
-    upper_deg: float
+    upper_deg: float  # nominal end of the last bin
     median_deg: float
-    p95_deg: float
+    p95_deg: float  # 95 % are smaller
     total: int
 
     @property
@@ -44,23 +36,18 @@ class Histogram:
         largest = max(1, *self.counts)
         power = 10 ** (len(str(largest)) - 1)
         steps = [step for step in (power // 5, power // 2, power, 2 * power) if step] or [1]
-        step = next(step for step in (*steps, 5 * power) if -(-largest // step) <= _MAX_TICKS)
+        step = next(step for step in (*steps, 5 * power) if -(-largest // step) <= 5)
         return tuple(range(0, step * -(-largest // step) + 1, step))
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Reprojection residuals of the points.
+    """Reprojection residuals of the points."""
 
-    Attributes:
-        overall: of all observations.
-        views: image name to (median, 95 % quantile) in degrees and the number of observations.
-        sampled: whether only evenly spaced observations were used.
-    """
-
-    overall: Histogram
+    overall: Histogram  # of all observations
+    # image name to (median, 95 % quantile) in degrees and the number of observations
     views: Mapping[str, tuple[float, float, int]]
-    sampled: bool
+    sampled: bool  # whether only evenly spaced observations were used
 
 
 def histogram(values_deg: Sequence[float] | FloatArray) -> Histogram | None:
@@ -83,7 +70,7 @@ def reprojection_residuals(poses: Poses) -> Residuals | None:
     total = len(poses.track_point_idx)
     if not total:
         return None
-    step = -(-total // _MAX_OBSERVATIONS)
+    step = -(-total // 2_000_000)
     image_idx = np.asarray(poses.track_image_idx[::step])
     residuals_deg = _residuals_deg(poses, step)
     overall = histogram(residuals_deg)

@@ -135,11 +135,9 @@ class Views(Mapping[str, "RunView"]):
         return RunView(self._run, self._summaries[name])
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the images."""
         return iter(self._summaries)
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self._summaries)
 
     def __repr__(self) -> str:
@@ -149,12 +147,7 @@ class Views(Mapping[str, "RunView"]):
 
 
 class RunView:
-    """One view of a run.
-
-    Attributes:
-        name: of the image.
-        summary: the entry of the view in run.json.
-    """
+    """One view of a run."""
 
     def __init__(self, run: RunOutput, summary: ViewSummary) -> None:
         self.name = summary.name
@@ -214,7 +207,6 @@ class RunView:
         return file_inside(self._run.out, self.summary.preview)
 
     def __repr__(self) -> str:
-        """Return the name."""
         return f"RunView({self.name!r})"
 
     def _exported(self, folder: str, suffix: str) -> Path | None:
@@ -223,7 +215,6 @@ class RunView:
         return next((self._run.out / name for name in candidates if self._run.has_file(name)), None)
 
 
-_MAX_VIEWS = 6
 _WIDTH = 320
 _MAX_BYTES = 40_000
 _COLORS = {"good": "#1a7f37", "fair": "#9a6700", "bad": "#cf222e", "": "inherit"}
@@ -240,7 +231,7 @@ def run_html(run: RunOutput) -> str:
         f"<p>{title} {judgement} {escape(verdict.sentence)}</p>",
         f"<p>{tiles}</p>" if tiles else "",
         f"<ul>{findings}</ul>" if findings else "",
-        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), _MAX_VIEWS)),
+        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), 6)),
         _stages_html(run),
         f"<p>{escape(str(run.out))}</p>",
     ]

@@ -33,16 +33,12 @@ _Kind = TypeVar("_Kind", bound=Record)
 
 @dataclass(frozen=True)
 class StoredValues:
-    """The values of one run.
+    """The values of one run."""
 
-    Attributes:
-        store: the cache; None if it is unknown or was deleted.
-        refs: role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
-        notes: values that could not be read, with the reason; grows as values are loaded.
-    """
-
-    store: Store | None = None
+    store: Store | None = None  # the cache; None if it is unknown or was deleted
+    # role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
     refs: Mapping[str, Mapping[str, ItemRef]] = field(default_factory=dict)
+    # values that could not be read, with the reason; grows as values are loaded
     notes: list[str] = field(default_factory=list)
 
     @staticmethod
@@ -59,10 +55,6 @@ class StoredValues:
     @staticmethod
     def of_folder(out: Path, summary: RunSummary, store: Store) -> StoredValues:
         """Return the values of the latest run into a folder, using the list of runs in the cache.
-
-        Args:
-            out: the output folder.
-            summary: its run.json.
 
         Raises:
             StoreError: if the list of runs is damaged.

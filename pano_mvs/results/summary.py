@@ -31,9 +31,7 @@ from pano_mvs.results.records import (
 )
 
 RUN_JSON = "run.json"
-BLOCKS = "blocks"
-"""Folder in the output folder in which `pano-mvs run --block-size` computes the blocks."""
-
+BLOCKS = "blocks"  # folder in the output folder in which `pano-mvs run --block-size` computes the blocks
 CACHE_VARIABLE = "PANO_MVS_CACHE"
 SCHEMA = 1
 

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.results.figures import degrees, figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary, Tile, Verdict
 from pano_mvs.results.residuals import Residuals
@@ -120,7 +120,6 @@ def _cloud(summary: RunSummary) -> list[Tile]:
 
 
 def _accuracy(summary: RunSummary) -> list[Tile]:
-    """Return the errors against ground truth, if known."""
     scores = summary.scores
     tiles = []
     error_deg = median([scores.poses.get("median_pair_error_deg")])
@@ -150,7 +149,6 @@ def mood_of(value: float, good: float, fair: float) -> str:
     """Return "good", "fair" or "bad".
 
     Args:
-        value: the figure to judge.
         good: threshold of "good"; a lower bound if it is greater than `fair`, else an upper bound.
         fair: threshold of "fair".
     """
@@ -159,7 +157,6 @@ def mood_of(value: float, good: float, fair: float) -> str:
     return "good" if value <= good else "fair" if value <= fair else "bad"
 
 
-_FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
 _NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
@@ -272,7 +269,7 @@ def _groups(summary: RunSummary) -> Iterator[Finding]:
 
 def _named(group: PoseGroup) -> str:
     names = group.images
-    return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
+    return f"{len(names)} ({shortened_list(names, rest=' …')})"
 
 
 def pictures_between(groups: Sequence[PoseGroup]) -> str:
@@ -307,10 +304,10 @@ def _graph(summary: RunSummary) -> Iterator[Finding]:
     if len(names) < 4 or not links:
         return
     count = Counter(name for link in links if link.inliers for name in link[:2])
-    loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
+    loose = [name for name in names if 0 < count[name] < 2]
     if not loose:
         return
-    shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
+    shown = shortened_list(loose, rest=" …")
     mood = "fair" if len(loose) > len(names) / 4 else ""
     sharing = plural(len(loose), "camera shares", "cameras share")
     yield Finding(

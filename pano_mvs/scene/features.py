@@ -110,20 +110,14 @@ class WeakImage(Record):
 
 @dataclass(frozen=True, eq=False)
 class WeakImages(Record):
-    """Which images of a capture are weakly matched.
-
-    Attributes:
-        weak: names of these images.
-        similar: names of other images that they may match.
-        others: names of all other images.
-    """
+    """Which images of a capture are weakly matched."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
     explodes_into: ClassVar[type[Record] | None] = WeakImage
 
-    weak: tuple[str, ...] = field(default=())
-    similar: tuple[str, ...] = field(default=())
-    others: tuple[str, ...] = field(default=())
+    weak: tuple[str, ...] = field(default=())  # names of these images
+    similar: tuple[str, ...] = field(default=())  # names of other images that they may match
+    others: tuple[str, ...] = field(default=())  # names of all other images
 
     def __post_init__(self) -> None:
         """Convert the names, which are stored as lists."""

@@ -96,21 +96,14 @@ FaceLayout = Literal["cube", "octagon", "icosahedron"]
 
 @dataclass(frozen=True, eq=False)
 class FaceFiles(Files):
-    """Files of the faces of one panorama for the output folder, with the layout of the faces.
-
-    Attributes:
-        layout: name of the layout; see `panorama_faces`.
-        fov_deg: horizontal and vertical field of view of a face.
-        size_px: width and height of a face.
-        suffix: suffix of the image files, such as ".jpg".
-    """
+    """Files of the faces of one panorama for the output folder, with the layout of the faces."""
 
     axis: ClassVar[Axis | None] = Axis.VIEW
 
-    layout: FaceLayout = "cube"
-    fov_deg: float = 96.0
-    size_px: int = 0
-    suffix: str = ".jpg"
+    layout: FaceLayout = "cube"  # name of the layout; see `panorama_faces`
+    fov_deg: float = 96.0  # horizontal and vertical field of view of a face
+    size_px: int = 0  # width and height of a face
+    suffix: str = ".jpg"  # suffix of the image files, such as ".jpg"
 
     def check(self) -> None:
         """Raise ContractError if a target would leave the output folder, or the faces have no size."""
@@ -139,19 +132,15 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True, eq=False)
 class LevelPanorama(Files):
-    """The files of one level panorama.
-
-    Attributes:
-        picture: target of the picture; `{item}` stands for the name of the panorama.
-        level_from_world: rotation (three rows) from the world of its group into the axes of the level panorama: x
-            right, y down along gravity, z towards the middle of the picture.
-        heading_deg: compass heading of the middle of the picture, or None if north is not known.
-    """
+    """The files of one level panorama."""
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
-    picture: str = ""
+    picture: str = ""  # target of the picture; `{item}` stands for the name of the panorama
+    # rotation (three rows) from the world of its group into the axes of the level panorama: x right, y down along
+    # gravity, z towards the middle of the picture
     level_from_world: Rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    # compass heading of the middle of the picture, or None if north is not known
     heading_deg: float | None = None
 
     def to_parts(self) -> Parts:

@@ -28,14 +28,10 @@ from pano_mvs.scene.image_header import (
 )
 from pano_mvs.scene.record import FilePart
 
-MAX_PIXELS = 512_000_000
-"""Default limit of pixels of an image that is decoded."""
-
+MAX_PIXELS = 512_000_000  # default limit of pixels of an image that is decoded
 MASK_BYTES_PER_PIXEL = 8
 """Peak memory while a mask is read and resized: grey levels, flags, and counts of masked pixels."""
 
-# Measured worst cases, including the file: uncompressed TIFF of 16 bits, and PNG of 16 bits; JPEG takes 6.
-_TIFF_BYTES_PER_PIXEL, _BYTES_PER_PIXEL = 18, 8
 
 # Our own errors replace OpenCV's messages about images that it cannot decode.
 _SILENT = 0
@@ -44,11 +40,6 @@ if hasattr(cv2, "setLogLevel"):  # OpenCV 4
 else:
     cv2.utils.logging.setLogLevel(_SILENT)
 
-# Headers that state at most this many pixels are accepted whatever the size of the file. Above that, a JPEG, PNG or
-# TIFF cannot have more pixels per byte than this: deflate expands one byte to at most 1032, each with 8 bilevel pixels.
-# HEIC and AVIF could, but not of a photograph.
-_ACCEPTED_PIXELS = 64_000_000
-_MAX_PIXELS_PER_BYTE = 10_000
 _COMPRESSED_STARTS = (JPEG_START, PNG_START, *TIFF_STARTS)
 
 _OPENCV_PIXELS, _OPENCV_SIDE = 1 << 30, 1 << 20  # CV_IO_MAX_IMAGE_PIXELS, _WIDTH and _HEIGHT
@@ -64,15 +55,14 @@ _redirected = threading.Lock()
 
 def decoding_bytes_per_pixel(path: Path) -> int:
     """Return the peak memory in bytes per pixel of decoding an image file, including the file."""
-    return _TIFF_BYTES_PER_PIXEL if path.suffix.lower() in {".tif", ".tiff"} else _BYTES_PER_PIXEL
+    # Measured worst cases, including the file: uncompressed TIFF of 16 bits, and PNG of 16 bits; JPEG takes 6.
+    return 18 if path.suffix.lower() in {".tif", ".tiff"} else 8
 
 
 def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.generic] | None:
     """Return an image as OpenCV decodes it, BGR, or None if OpenCV does not know its format.
 
     Args:
-        data: the file's bytes.
-        path: the file, for error messages.
         flags: `cv2.IMREAD_…`.
         max_pixels: the limit of pixels, which is compared with the header before memory is allocated.
 
@@ -134,7 +124,10 @@ def readable_pixels(path: Path, max_pixels: int) -> int:
 
 def _is_too_short(data: bytes, length: int, pixels: int) -> bool:
     is_compressed = data.startswith(_COMPRESSED_STARTS) or data[4:8] == b"ftyp"
-    return is_compressed and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * length)
+    # Up to 64 megapixels are accepted whatever the size of the file. Above that, a JPEG, PNG or TIFF cannot have more
+    # than 10,000 pixels per byte: deflate expands one byte to at most 1032, each with 8 bilevel pixels. HEIC and AVIF
+    # could, but not of a photograph.
+    return is_compressed and pixels > max(64_000_000, 10_000 * length)
 
 
 def _decoded(data: bytes, flags: int) -> tuple[NDArray[np.generic] | None, str]:

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 Size: TypeAlias = "tuple[int, int]"
-ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]
-"""`heif` includes AVIF."""
-
+ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]  # `heif` includes AVIF
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _WIDTH, _HEIGHT = 256, 257
@@ -187,7 +185,6 @@ def is_cut_short(data: bytes) -> bool:
 _MAX_ENTRIES = 1000
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
-_RATIONAL = 5
 
 
 class Entry(NamedTuple):
@@ -200,19 +197,12 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Tiff:
-    """A TIFF in memory.
-
-    Attributes:
-        data: its bytes.
-        order: "<" or ">".
-        first: offset of its first directory.
-        is_big: whether it is a BigTIFF.
-    """
+    """A TIFF in memory."""
 
     data: bytes
-    order: str
-    first: int
-    is_big: bool
+    order: str  # "<" or ">"
+    first: int  # offset of its first directory
+    is_big: bool  # whether it is a BigTIFF
 
     def directory(self, offset: int) -> Mapping[int, Entry]:
         """Return the entries of the directory at an offset by tag, without those that point outside of the data."""
@@ -242,7 +232,7 @@ class Tiff:
 
     def rationals(self, entry: Entry, count: int) -> tuple[float, ...] | None:
         """Return the first `count` numbers of a field of fractions, or None if it has not as many."""
-        if entry.kind != _RATIONAL or entry.end - entry.start < 8 * count:
+        if entry.kind != 5 or entry.end - entry.start < 8 * count:
             return None
         numbers = struct.unpack_from(f"{self.order}{2 * count}I", self.data, entry.start)
         return tuple(above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True))

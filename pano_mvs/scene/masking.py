@@ -89,10 +89,6 @@ def _inner(count: int, whole: int, *, first: int, length: int) -> slice:
 
 
 _JPEG_START = b"\xff\xd8"
-_JPEG_THRESHOLD = 127  # compression turns black and white into greys
-# Masked pixels take the mean colour of the smallest box with valid pixels, up to this radius.
-_MAX_BOX_RADIUS = 64
-_GREY_WITHOUT_VALID_PIXELS = 128
 
 
 def decode_mask(path: Path, data: bytes | None = None) -> Mask:
@@ -113,7 +109,7 @@ def decode_mask(path: Path, data: bytes | None = None) -> Mask:
     channels = np.atleast_3d(picture)
     has_alpha = channels.shape[2] in (2, 4)
     colors = channels[..., :-1] if has_alpha else channels
-    threshold = _JPEG_THRESHOLD if data.startswith(_JPEG_START) else 0
+    threshold = 127 if data.startswith(_JPEG_START) else 0  # compression turns black and white into greys
     valid = np.asarray((colors > threshold).any(axis=-1))
     if not has_alpha:
         return valid
@@ -153,9 +149,10 @@ def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
     painted = picture.copy()
     shown = valid.astype(np.uint8)
     if not shown.any():
-        painted[...] = _GREY_WITHOUT_VALID_PIXELS
+        painted[...] = 128
         return painted
-    margin = min(_MAX_BOX_RADIUS, picture.shape[0])
+    # Masked pixels take the mean colour of the smallest box with valid pixels, up to this radius.
+    margin = min(64, picture.shape[0])
     seen = pad_panorama(np.dstack([cv2.bitwise_and(picture, picture, mask=shown), shown]), margin)
     todo, radius = 1 - shown, 1
     while radius <= margin and todo.any():

@@ -253,17 +253,13 @@ Camera: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class StaticMasks(Record):
-    """The content that stays in place in the images while the world moves: tripod, rig, stick, hand.
-
-    Attributes:
-        pixels: (G, h, 2 h) uint8, one mask for each camera in which something was found: 1 where it is.
-        cameras: the camera of each mask, see `camera_of`.
-    """
+    """The content that stays in place in the images while the world moves: tripod, rig, stick, hand."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
 
+    # (G, h, 2 h) uint8, one mask for each camera in which something was found: 1 where it is
     pixels: NDArray[np.uint8]
-    cameras: tuple[Camera, ...] = ()
+    cameras: tuple[Camera, ...] = ()  # the camera of each mask, see `camera_of`
 
     def check(self) -> None:
         """Raise ContractError unless there is one mask of a full sphere for each camera."""

@@ -18,32 +18,22 @@ class Photographs(Record):
 
     A point (x, y, z) of the camera frame has the pixel f (1 + k r²) (x / z, y / z) + c with r² = (x² + y²) / z², where
     c is the centre of the picture.
-
-    Attributes:
-        names: (N) paths of the files, relative to the folder of the photographs' folder.
-        sizes_hw: (N, 2) int32 height and width as stored, whatever EXIF says about the orientation.
-        focals_px: (N,) float64 focal length f.
-        radials: (N,) float64 coefficient k.
-        rotations: (N, 3, 3) float64 of cam_from_world.
-        translations: (N, 3) float64 of cam_from_world, scene units.
-        inliers: (N,) int32 number of key points that agree with the pose.
-        errors_px: (N,) float32 median reprojection error of the inliers.
-        pictures: (N) the files.
-        rejected: name of every photograph that could not be localised, with the reason.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
     kind_version: ClassVar[int] = 2  # since the pictures are part of it
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (N) paths of the files, relative to the folder of the photographs' folder
+    # (N, 2) int32 height and width as stored, whatever EXIF says about the orientation
     sizes_hw: NDArray[np.int32]
-    focals_px: NDArray[np.float64]
-    radials: NDArray[np.float64]
-    rotations: NDArray[np.float64]
-    translations: NDArray[np.float64]
-    inliers: NDArray[np.int32]
-    errors_px: NDArray[np.float32]
-    pictures: tuple[FilePart, ...] = ()
+    focals_px: NDArray[np.float64]  # (N,) float64 focal length f
+    radials: NDArray[np.float64]  # (N,) float64 coefficient k
+    rotations: NDArray[np.float64]  # (N, 3, 3) float64 of cam_from_world
+    translations: NDArray[np.float64]  # (N, 3) float64 of cam_from_world, scene units
+    inliers: NDArray[np.int32]  # (N,) int32 number of key points that agree with the pose
+    errors_px: NDArray[np.float32]  # (N,) float32 median reprojection error of the inliers
+    pictures: tuple[FilePart, ...] = ()  # (N) the files
+    # name of every photograph that could not be localised, with the reason
     rejected: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:

@@ -14,21 +14,16 @@ from pano_mvs.scene.record import Axis, Record, positions_fit, require, require_
 
 @dataclass(frozen=True, eq=False)
 class Structure(Record):
-    """Planes that a place consists of, n · X = offset in the world, unbounded.
-
-    Attributes:
-        normals_in_world: (K, 3) float64 unit normals n, towards the side from which the plane was seen.
-        offsets: (K,) float64 in scene units.
-        uncertainties: (K,) float64 standard deviation of ranges on the plane, relative to them.
-        group_idx: (K,) int32 group of the poses in whose world the plane is.
-    """
+    """Planes that a place consists of, n · X = offset in the world, unbounded."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
 
+    # (K, 3) float64 unit normals n, towards the side from which the plane was seen
     normals_in_world: NDArray[np.float64]
-    offsets: NDArray[np.float64]
+    offsets: NDArray[np.float64]  # (K,) float64 in scene units
+    # (K,) float64 standard deviation of ranges on the plane, relative to them
     uncertainties: NDArray[np.float64]
-    group_idx: NDArray[np.int32]
+    group_idx: NDArray[np.int32]  # (K,) int32 group of the poses in whose world the plane is
 
     def __len__(self) -> int:
         """Return the number of planes."""
@@ -47,21 +42,14 @@ class Structure(Record):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples(Record):
-    """Points of the surfaces in one view.
-
-    Attributes:
-        bearings: (N, 3) float64 unit rays in the view's camera frame.
-        ranges: (N,) float32 along the rays, scene units.
-        colors_rgb: (N, 3) uint8.
-        confidence: (N,) uint8, of the range map.
-    """
+    """Points of the surfaces in one view."""
 
     axis: ClassVar[Axis | None] = Axis.VIEW
 
-    bearings: NDArray[np.float64]
-    ranges: NDArray[np.float32]
-    colors_rgb: NDArray[np.uint8]
-    confidence: NDArray[np.uint8]
+    bearings: NDArray[np.float64]  # (N, 3) float64 unit rays in the view's camera frame
+    ranges: NDArray[np.float32]  # (N,) float32 along the rays, scene units
+    colors_rgb: NDArray[np.uint8]  # (N, 3) uint8
+    confidence: NDArray[np.uint8]  # (N,) uint8, of the range map
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -79,28 +67,19 @@ class SurfaceSamples(Record):
 
 @dataclass(frozen=True, eq=False)
 class TrackedPoints(Record):
-    """Points with tracks as in `Poses`, but from range maps.
-
-    Attributes:
-        names: (N) names of the images that the tracks refer to.
-        points_in_world: (P, 3) float64.
-        colors_rgb: (P, 3) uint8.
-        errors_rad: (P,) float32 mean angle, in the image of whose range map the point is, to the positions from the
-            range maps of the other images of its track.
-        track_point_idx: (T,) int32: observation t is of this point …
-        track_image_idx: (T,) int32: … in this image (a position in `names`) …
-        track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
-    """
+    """Points with tracks as in `Poses`, but from range maps."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
 
-    names: tuple[str, ...]
-    points_in_world: NDArray[np.float64]
-    colors_rgb: NDArray[np.uint8]
+    names: tuple[str, ...]  # (N) names of the images that the tracks refer to
+    points_in_world: NDArray[np.float64]  # (P, 3) float64
+    colors_rgb: NDArray[np.uint8]  # (P, 3) uint8
+    # (P,) float32 mean angle, in the image of whose range map the point is, to the positions from the range maps of the
+    # other images of its track
     errors_rad: NDArray[np.float32]
-    track_point_idx: NDArray[np.int32]
-    track_image_idx: NDArray[np.int32]
-    track_bearings: NDArray[np.float64]
+    track_point_idx: NDArray[np.int32]  # (T,) int32: observation t is of this point …
+    track_image_idx: NDArray[np.int32]  # (T,) int32: … in this image (a position in `names`) …
+    track_bearings: NDArray[np.float64]  # (T, 3) float64: … along this unit ray in the camera frame
 
     def __len__(self) -> int:
         """Return the number of points."""

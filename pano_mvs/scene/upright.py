@@ -20,8 +20,6 @@ from pano_mvs.scene.poses import Poses
 WORLD_UP: Final = (0.0, -1.0, 0.0)
 """The up direction of a world that nothing has levelled: −y, that of the first camera."""
 
-_MIN_AGREEMENT = 0.5
-
 
 def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
     """Return the mean of the cameras' own up directions, −y of each camera, in the world.
@@ -33,12 +31,11 @@ def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
     ups = -np.asarray(rotations, np.float64).reshape(-1, 3, 3)[:, 1]
     mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
     length = float(np.linalg.norm(mean))
-    return mean / length if length > _MIN_AGREEMENT else None
+    return mean / length if length > 0.5 else None
 
 
 _Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_MAX_SNAP_DEG: Final = 20.0
 _STATES_DOWN: Final = re.compile(r"\by down\b")
 _STATES_NORTH: Final = re.compile(r"\bz north\b")
 
@@ -56,7 +53,7 @@ def world_up(poses: Poses) -> FloatArray:
     largest = int(np.argmax(np.abs(mean)))
     axis = np.zeros(3)
     axis[largest] = np.sign(mean[largest])
-    return axis if float(axis @ mean) >= np.cos(np.deg2rad(_MAX_SNAP_DEG)) else mean
+    return axis if float(axis @ mean) >= np.cos(np.deg2rad(20.0)) else mean
 
 
 def states_y_down(frame: str) -> bool:

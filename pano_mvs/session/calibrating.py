@@ -23,7 +23,6 @@ ASSUMED_DISTANCE_M = 0.03
 
 _FIELDS_OF_VIEW_DEG = {"theta s": 202.0, "gear 360": 195.0}
 """Field of view of the image circles by parts of the camera's name in EXIF: start values."""
-_USUAL_FIELD_OF_VIEW_DEG = 195.0
 
 QUARTER_TURNS = {"top": 0, "right": 1, "bottom": 2, "left": -1}
 """Turn of the rig about the axis of the first lens by the side of its picture where the top of the scene is."""
@@ -44,14 +43,12 @@ def calibrate_camera(
 
     Args:
         folder: the pictures, as for source.dual_fisheye.
-        names: names of the lenses.
         layout: see `list_rig_pictures`.
         distance_m: distance between the centres of the lenses; None if unknown, then the rig is not metric.
         field_of_view_deg: about the full angle of the image circles; None for that of the camera in the EXIF data.
         up: side of the first lens's picture where the top of the scene is, one of QUARTER_TURNS; the panoramas are
             then upright.
         max_captures: number of captures that are used, the first ones.
-        progress: is called with each step.
 
     Raises:
         InputError: if there are fewer than two captures, or they do not determine the lenses.
@@ -65,7 +62,7 @@ def calibrate_camera(
     if field_of_view_deg is None:
         camera = camera_from_exif(read_container(captures[0].files[0].read_bytes()).exif).lower()
         known = (field for part, field in _FIELDS_OF_VIEW_DEG.items() if part in camera)
-        field_of_view_deg = next(known, _USUAL_FIELD_OF_VIEW_DEG)
+        field_of_view_deg = next(known, 195.0)
     try:
         found = calibrate_lenses(
             _loader(captures),

@@ -118,9 +118,7 @@ def run_in_blocks(session: Session, execution: Execution, decision: BlockDecisio
     If the run of a block ends early, its output is returned.
 
     Args:
-        execution: how units are computed.
         decision: with a division.
-        progress: receives the events.
 
     Raises:
         UsageError: if the session cannot be run in blocks.

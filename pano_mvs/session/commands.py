@@ -18,9 +18,6 @@ def run_command(session: Session, *options: str) -> str:
     """Return the `pano-mvs run` of a session: its workflow, images, settings, output folder and cache.
 
     It can be pasted in the current folder.
-
-    Args:
-        options: further options.
     """
     name, is_preset = _workflow_word(session)
     words = ["pano-mvs", "run", name]
@@ -42,7 +39,6 @@ def reopen(target: str, *, overrides: Sequence[str], images: Path | None, cache:
 
     Args:
         target: a workflow file, the name of a preset, or an output folder.
-        overrides: further settings.
         images: folder of panoramas; None for that of the run, or of the workflow.
         cache: folder of the cache; None for that of the run, or the default.
 

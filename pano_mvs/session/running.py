@@ -37,8 +37,6 @@ from pano_mvs.session.time_estimator import EventObserver
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
-_MAX_REPAIRS = 3  # more damage than this suggests a failing disk
-
 
 @dataclass(frozen=True, slots=True)
 class Execution:
@@ -172,7 +170,7 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
             return outputs
         except DamagedBlobError as error:  # it has been removed, so another round computes it
             repairs += 1
-            if repairs > _MAX_REPAIRS:
+            if repairs > 3:  # more damage than this suggests a failing disk
                 raise
             run.observer(Warned(str(error)))
 
@@ -222,7 +220,6 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
 
     Args:
         run: after `execute`, also if it raised.
-        started: when it began.
         clock: the same by `time.perf_counter`.
 
     Raises:

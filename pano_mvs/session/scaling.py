@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import replacing
 from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.engine.workflows.wiring import Edge, Graph, wire
@@ -32,9 +33,7 @@ from pano_mvs.scene.two_view import Pairs, Views
 from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import chain_of
 
-WORKFLOW_FILE = "metres.yaml"
-"""The workflow with the scale, in the output folder."""
-
+WORKFLOW_FILE = "metres.yaml"  # the workflow with the scale, in the output folder
 _PREFIX = "metres_"
 _SCALED: Mapping[type[Record], tuple[str, str]] = {
     Poses: ("poses.scale", "poses"),
@@ -48,19 +47,12 @@ _METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.304
 
 @dataclass(frozen=True)
 class Measurement:
-    """A known length.
+    """A known length."""
 
-    Attributes:
-        length: in the units of the run.
-        metres: the same in metres.
-        group: number of the group of poses in which it was measured.
-        origin: what was measured.
-    """
-
-    length: float
-    metres: float
-    group: int
-    origin: str
+    length: float  # in the units of the run
+    metres: float  # the same in metres
+    group: int  # number of the group of poses in which it was measured
+    origin: str  # what was measured
 
     @property
     def factor(self) -> float:
@@ -90,7 +82,6 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
     """Return the measurement of a distance between two cameras or two points.
 
     Args:
-        run: the output of a run.
         first: name of a registered image, or coordinates `x,y,z`, as the viewer and other programs show them.
         second: the other end.
         group: the group of poses in which points were measured; images state theirs.
@@ -172,7 +163,6 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     ranges and clouds. A run that is in metres already is corrected: its factor changes.
 
     Args:
-        known: the length.
         cache: folder of the cache; None for that of the run.
 
     Raises:
@@ -246,7 +236,6 @@ class _Rewiring:
         self.added: dict[str, StageEntry] = {}
 
     def workflow(self) -> Workflow:
-        """Return the workflow."""
         changed = {}
         for name, entry in self.stages.items():
             if name not in self.upstream:
@@ -317,8 +306,8 @@ def _camera(groups: list[Poses], text: str) -> tuple[int, str]:
     matched = match_image_names([text], names)
     if text not in matched:
         raise UsageError(
-            f"{text[:80]!r} is not one registered image, nor coordinates x,y,z. Images: {', '.join(names[:8])}"
-            f"{' …' if len(names) > 8 else ''}"
+            f"{text[:80]!r} is not one registered image, nor coordinates x,y,z. Images: "
+            f"{shortened_list(names, 8, rest=' …')}"
         )
     name = matched[text]
     return next(number for number, group in enumerate(groups) if name in group.names), name

@@ -22,7 +22,6 @@ from pano_mvs.results.summary import FAILED_ITEMS
 from pano_mvs.session.progress import Event, Progress, RunFinished, RunStarted
 
 _WAIT_S = 5.0
-_REASON_CHARACTERS = 300
 
 
 class Spans:
@@ -198,7 +197,7 @@ class _Messages(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         error = f": {record.exc_info[1]}" if record.exc_info else ""
-        self.first = self.first or shortened(f"{record.getMessage()}{error}", _REASON_CHARACTERS)
+        self.first = self.first or shortened(f"{record.getMessage()}{error}", 300)
 
     def close(self) -> None:
         self._logger.removeHandler(self)

@@ -53,8 +53,6 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
 
     Args:
         run: after `execute`, also if it raised.
-        started: when it began.
-        seconds: that it took.
     """
     workflow, result = run.workflow, run.result
     scores = _scores(run)
@@ -186,10 +184,6 @@ def poses_summary(
     """Return the summary of poses.
 
     Args:
-        rejected: image without a pose to the reason.
-        doubts: registered image whose pose is doubtful to the reason.
-        links: the pairs that were matched.
-        blocked: units that could not run.
         heights: group to the height of its cameras above the floor, where it is known.
     """
     groups = split_groups(poses)
@@ -251,7 +245,6 @@ def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[P
     Args:
         largest: images of the largest group.
         other: images of another one.
-        links: the pairs that were matched.
 
     Returns:
         The pair; None if no image of one group was compared with one of the other.
@@ -361,11 +354,8 @@ def _versions() -> dict[str, str]:
     return found
 
 
-PLAUSIBLE_HEIGHT_M = 1.6
-"""A usual height of a camera on a tripod or a stick."""
-
+PLAUSIBLE_HEIGHT_M = 1.6  # a usual height of a camera on a tripod or a stick
 _BLOCKS, _BLOCK_POINTS = 300, 1000
-_MIN_POINTS = 1000
 
 
 def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
@@ -377,7 +367,7 @@ def camera_height(poses: Poses, cloud: PointCloud) -> float | None:
         poses: of one group.
         cloud: of the same group.
     """
-    if not poses.names or len(cloud) < _MIN_POINTS:
+    if not poses.names or len(cloud) < 1000:
         return None
     turn = z_up_from_world(world_up(poses))
     chosen = _sample(len(cloud))

@@ -32,12 +32,8 @@ from pano_mvs.session.progress import (
     WorkersChanged,
 )
 
-_OVERDUE = 1.2
-"""A unit that takes longer than expected is expected to take this multiple of its time so far …"""
-
-_UNKNOWN = 2.0
-"""… and this one if nothing is known of its stage."""
-
+_OVERDUE = 1.2  # a unit that takes longer than expected is expected to take this multiple of its time so far …
+_UNKNOWN = 2.0  # … and this one if nothing is known of its stage
 _START_S = 10.0
 """A worker process starts within this time, which is not evidence that the units of its stage are slow."""
 
@@ -49,27 +45,17 @@ _COMPUTED = ("run", "failed")
 
 @dataclass(slots=True)
 class StageProgress:
-    """What is known of one stage.
-
-    Attributes:
-        forecast: from earlier runs.
-        units: number of its units; None until the stage has started.
-        done: number of settled units.
-        computed: number of these that were computed.
-        seconds: computing time of these.
-        running: unit to the time at which it began.
-        most_at_once: the largest number of units of all stages that ran at a time while one of this stage did.
-        finished: whether all units are settled.
-    """
+    """What is known of one stage."""
 
     forecast: StageForecast
-    units: int | None = None
-    done: int = 0
-    computed: int = 0
-    seconds: float = 0.0
-    running: dict[str, float] = field(default_factory=dict)
+    units: int | None = None  # number of its units; None until the stage has started
+    done: int = 0  # number of settled units
+    computed: int = 0  # number of these that were computed
+    seconds: float = 0.0  # computing time of these
+    running: dict[str, float] = field(default_factory=dict)  # unit to the time at which it began
+    # the largest number of units of all stages that ran at a time while one of this stage did
     most_at_once: int = 0
-    finished: bool = False
+    finished: bool = False  # whether all units are settled
     _own_s: float = 0.0
     _began: float = 0.0
 
@@ -136,18 +122,9 @@ class StageProgress:
 
 
 class TimeEstimator:
-    """Keeps track of a run by its events; several threads may use it at a time.
-
-    Attributes:
-        stages: what is known of each stage, in order.
-    """
+    """Keeps track of a run by its events; several threads may use it at a time."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin to estimate.
-
-        Args:
-            clock: returns the time in seconds.
-        """
         self.stages: dict[str, StageProgress] = {}
         self._clock = clock
         self._lock = threading.Lock()
@@ -219,14 +196,10 @@ class TimeEstimator:
             {name: stage.forecast.after for name, stage in self.stages.items()},
             workers=self._workers,
         )
-        report = self._report_work_s(now)
+        so_far_s = now - self._latest_end if self.is_reporting else 0.0
+        report = max(self._report_s - so_far_s, (_OVERDUE - 1) * so_far_s), so_far_s
         self._most_done = max(self._most_done, _share([*known.values(), report], len(unknown)))
         return TimeLeft(left_s + report[0], at_least=bool(unknown), done=self._most_done, unknown=unknown)
-
-    def _report_work_s(self, now: float) -> tuple[float, float]:
-        """Return the time left for the report, and that which it has taken."""
-        so_far_s = now - self._latest_end if self.is_reporting else 0.0
-        return max(self._report_s - so_far_s, (_OVERDUE - 1) * so_far_s), so_far_s
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))
@@ -321,14 +294,11 @@ class EventObserver:
             self._estimator(compiled)
             self._progress(compiled)
         if self._executor is not None:
-            self._report_workers(self._executor)
+            if (workers := self._executor.places()) != self._workers:
+                self._workers = workers
+                changed = WorkersChanged(workers)
+                self._estimator(changed)
+                self._progress(changed)
+            if notice := self._executor.notice():
+                self._progress(Warned(notice))
         self._progress(self._estimator.estimate())
-
-    def _report_workers(self, executor: Executor) -> None:
-        if (workers := executor.places()) != self._workers:
-            self._workers = workers
-            changed = WorkersChanged(workers)
-            self._estimator(changed)
-            self._progress(changed)
-        if notice := executor.notice():
-            self._progress(Warned(notice))

@@ -21,17 +21,12 @@ _LEVELS = 65535
 
 @dataclass(frozen=True, eq=False)
 class LogSteps:
-    """Positive values as whole steps of their logarithm.
+    """Positive values as whole steps of their logarithm."""
 
-    Attributes:
-        steps: of the shape of the values; 0 where there is none, 1 for `low`, the largest step for `high`.
-        low: the smallest value.
-        high: the largest value, always more than `low`.
-    """
-
+    # of the shape of the values; 0 where there is none, 1 for `low`, the largest step for `high`
     steps: NDArray[np.unsignedinteger]
-    low: float
-    high: float
+    low: float  # the smallest value
+    high: float  # the largest value, always more than `low`
 
 
 def log_steps(values: ArrayLike, dtype: type[np.uint8 | np.uint16]) -> LogSteps:
@@ -104,15 +99,10 @@ _Z_BITS = 10
 
 @dataclass(frozen=True, eq=False)
 class VertexFacts:
-    """What the page knows of vertices besides their place and colour.
+    """What the page knows of vertices besides their place and colour."""
 
-    Attributes:
-        sigma_steps: (V,) uint8 steps of the standard deviation of the position; 0 if unknown.
-        view_counts: (V,) uint8 number of views that agree on the surface there.
-    """
-
-    sigma_steps: NDArray[np.uint8]
-    view_counts: NDArray[np.uint8]
+    sigma_steps: NDArray[np.uint8]  # (V,) uint8 steps of the standard deviation of the position; 0 if unknown
+    view_counts: NDArray[np.uint8]  # (V,) uint8 number of views that agree on the surface there
 
 
 def mesh_pieces(mesh: SharedMesh, facts: VertexFacts) -> Iterator[tuple[dict[str, Any], str]]:

@@ -19,27 +19,16 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import FilePart, PointCloud
 from pano_mvs.scene.image_file import decode_image
 
-MAP_PIXELS = 512
-"""Length of the longer side of a map."""
-
-_MARGIN = 0.04
-# Red, yellow and green, as in the page's view of the coverage.
-_RAMP_VIEWS = (1.0, 3.5, 6.0)
+MAP_PIXELS = 512  # length of the longer side of a map
 
 
 @dataclass(frozen=True, eq=False)
 class MapPlace:
-    """Where a map lies, in x and z of the page.
+    """Where a map lies, in x and z of the page."""
 
-    Attributes:
-        corner: (2,) its upper-left corner.
-        right: (2,) its upper side, from left to right.
-        down: (2,) its left side, from top to bottom.
-    """
-
-    corner: FloatArray
-    right: FloatArray
-    down: FloatArray
+    corner: FloatArray  # (2,) its upper-left corner
+    right: FloatArray  # (2,) its upper side, from left to right
+    down: FloatArray  # (2,) its left side, from top to bottom
 
     @property
     def size_hw(self) -> tuple[int, int]:
@@ -59,7 +48,7 @@ def place_around(points: NDArray[np.float32], centers: ArrayLike) -> MapPlace:
     box = np.percentile(points.astype(np.float64), [1, 99], axis=0)
     shown = np.concatenate([box, np.asarray(centers, np.float64).reshape(-1, 3)])[:, [0, 2]]
     lower, upper = shown.min(axis=0), shown.max(axis=0)
-    margin = _MARGIN * max(float((upper - lower).max()), 1e-6)
+    margin = 0.04 * max(float((upper - lower).max()), 1e-6)
     extent = upper - lower + 2 * margin
     return MapPlace(lower - margin, np.array([extent[0], 0.0]), np.array([0.0, extent[1]]))
 
@@ -103,7 +92,8 @@ def top_view(
 def coverage_colors(views: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the colours of view counts, (..., 4) RGBA: red for one, yellow for three or four, green from six."""
     seen = np.where(views > 0, np.uint8(255), np.uint8(0))
-    return np.concatenate([ramp_rgb(views, _RAMP_VIEWS), seen[..., None]], axis=-1)
+    # Red, yellow and green, as in the page's view of the coverage.
+    return np.concatenate([ramp_rgb(views, (1.0, 3.5, 6.0)), seen[..., None]], axis=-1)
 
 
 def closed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -120,22 +110,14 @@ def closed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 PLAN = "floor_plan/floor_plan.json"
 
-_SHARPER = 2  # a drawing needs more pixels than a picture of points
-
 
 @dataclass(frozen=True, eq=False)
 class StoreyMap:
-    """The plan of one storey.
+    """The plan of one storey."""
 
-    Attributes:
-        picture: (H, W, 3) uint8 RGB.
-        place: where it lies in the page.
-        heights: the y of the page between which it lies.
-    """
-
-    picture: NDArray[np.uint8]
-    place: MapPlace
-    heights: tuple[float, float]
+    picture: NDArray[np.uint8]  # (H, W, 3) uint8 RGB
+    place: MapPlace  # where it lies in the page
+    heights: tuple[float, float]  # the y of the page between which it lies
 
 
 def run_plans(run: RunOutput, page_from_world: Rigid3) -> tuple[list[StoreyMap], str]:
@@ -164,7 +146,8 @@ def _storey(entry: dict[str, Any], picture: NDArray[np.uint8], page_from_file: R
     corners = [(left, top, lower), (left + width, top, lower), (left, top - height, lower), (left, top, upper)]
     corner, right, down, above = page_from_file.apply(np.array(corners, np.float64))
     flat = [0, 2]
-    shrink = min(1.0, _SHARPER * MAP_PIXELS / max(picture.shape[:2]))
+    # A drawing needs more pixels than a picture of points.
+    shrink = min(1.0, 2 * MAP_PIXELS / max(picture.shape[:2]))
     size = (max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink)))
     return StoreyMap(
         np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8),

@@ -16,29 +16,20 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.upright import WORLD_UP, world_up, y_up_from_world
 
-_TEXELS = 4  # along a side, of which a vertex of a coarser mesh shows the mean
-
 TEXTURED = "mesh_textured.glb"
 COLORED = "mesh.ply"
 
 
 @dataclass(frozen=True, eq=False)
 class SharedMesh:
-    """Triangles with a texture, or else with coloured vertices.
+    """Triangles with a texture, or else with coloured vertices."""
 
-    Attributes:
-        vertices: (V, 3) float32.
-        faces: (F, 3) int32, anticlockwise as seen from the side that was seen.
-        colors_rgb: (V, 3) uint8; None with a texture.
-        uv: (V, 2) float32 places in the texture, from its lower-left corner; None without a texture.
-        texture: (H, W, 3) uint8 RGB; None without a texture.
-    """
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    colors_rgb: NDArray[np.uint8] | None = None
+    vertices: NDArray[np.float32]  # (V, 3) float32
+    faces: NDArray[np.int32]  # (F, 3) int32, anticlockwise as seen from the side that was seen
+    colors_rgb: NDArray[np.uint8] | None = None  # (V, 3) uint8; None with a texture
+    # (V, 2) float32 places in the texture, from its lower-left corner; None without a texture
     uv: NDArray[np.float32] | None = None
-    texture: NDArray[np.uint8] | None = None
+    texture: NDArray[np.uint8] | None = None  # (H, W, 3) uint8 RGB; None without a texture
 
     def moved(self, target_from_source: Rigid3) -> SharedMesh:
         """Return the mesh in another frame."""
@@ -92,7 +83,8 @@ def coarser(mesh: SharedMesh, max_faces: int) -> SharedMesh | None:
         return None
     colors = mesh.colors_rgb
     if mesh.texture is not None and mesh.uv is not None:
-        height, width = (max(1, side // _TEXELS) for side in mesh.texture.shape[:2])
+        # A vertex of a coarser mesh shows the mean of some texels.
+        height, width = (max(1, side // 4) for side in mesh.texture.shape[:2])
         means = cv2.resize(mesh.texture, (width, height), interpolation=cv2.INTER_AREA)
         places = (mesh.uv * [width, -height] + [0, height]).astype(int)
         colors = np.asarray(means[places[:, 1].clip(0, height - 1), places[:, 0].clip(0, width - 1)], np.uint8)

@@ -21,20 +21,14 @@ from pano_mvs.scene import FilePart
 _SAMPLED_HW = (16, 32)
 _TOLERANCE = 0.1
 _MIN_SHARED = 0.5
-_MAX_VIEWS = 400  # all pairs are compared
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a panorama saw.
+    """What a panorama saw."""
 
-    Attributes:
-        cam_from_page: its pose.
-        ranges: (H, W) float32; NaN where there is none.
-    """
-
-    cam_from_page: Rigid3
-    ranges: NDArray[np.float32]
+    cam_from_page: Rigid3  # its pose
+    ranges: NDArray[np.float32]  # (H, W) float32; NaN where there is none
 
 
 def given_rooms(given: Mapping[str, Sequence[str]] | str | Path) -> dict[str, tuple[str, ...]]:
@@ -115,7 +109,7 @@ def rooms_by_sight(sights: Sequence[Sight]) -> list[int]:
     Panoramas belong to one room if on average each sees more than half of what the other one sees, in terms of solid
     angle: through a door one sees less. More than 400 panoramas are not divided.
     """
-    if not 1 < len(sights) <= _MAX_VIEWS:
+    if not 1 < len(sights) <= 400:  # all pairs are compared
         return [1] * len(sights)
     shared = np.array([[_share(first, second) for second in sights] for first in sights])
     apart = 1 - np.minimum(shared, shared.T)

@@ -34,16 +34,7 @@ from pano_mvs.share.maps import MapPlace, StoreyMap, cut_height, place_around, t
 from pano_mvs.share.mesh_file import SharedMesh, coarser
 from pano_mvs.share.page_folder import PageFolder
 
-RANGES_HW = (256, 512)
-"""Size of the range map that the page walks and measures on."""
-
-COARSE_FACES = 40_000
-"""About the number of triangles of the mesh that the page shows first: 0.6 MB, half a second at 10 Mbit/s."""
-
-_OUTLINE_SAMPLE = 50_000
-
-MAX_TEXTURE = 4096
-"""Largest width and height of the texture of a mesh, which all graphics processors in use can hold."""
+RANGES_HW = (256, 512)  # size of the range map that the page walks and measures on
 
 
 @dataclass(frozen=True)
@@ -133,7 +124,7 @@ def put_cloud(page: PageFolder, shown: ShownCloud) -> dict[str, Any]:
 
 def outline(points: NDArray[np.float32]) -> list[list[float]]:
     """Return at most 64 of the outermost points, [x, y, z], but no strays: the page opens with all of them in view."""
-    sampled = points[:: max(1, len(points) // _OUTLINE_SAMPLE)].astype(np.float64)
+    sampled = points[:: max(1, len(points) // 50_000)].astype(np.float64)
     if not len(sampled):
         return []
     along = sampled @ spiral_rays(64).T
@@ -147,14 +138,16 @@ def put_mesh(page: PageFolder, mesh: SharedMesh, shown: ShownCloud, *, jpeg_qual
 
     A mesh that would arrive slowly is preceded by a coarse one.
     """
-    coarse = coarser(mesh, COARSE_FACES)
+    # About the number of triangles of the mesh that the page shows first: 0.6 MB, half a second at 10 Mbit/s.
+    coarse = coarser(mesh, 40_000)
     described: dict[str, list[dict[str, Any]]] = {"mesh": [], "mesh/coarse": []}
     for folder, part in (("mesh", mesh), ("mesh/coarse", coarse)):
         for idx, (piece, text) in enumerate(mesh_pieces(part, shown.facts(part.vertices)) if part is not None else ()):
             page.put(f"{folder}/{idx}", text)
             described[folder].append(piece)
     if mesh.texture is not None:
-        shrink = min(1.0, MAX_TEXTURE / max(mesh.texture.shape[:2]))
+        # Largest width and height of the texture of a mesh, which all graphics processors in use can hold.
+        shrink = min(1.0, 4096 / max(mesh.texture.shape[:2]))
         size = (max(1, round(mesh.texture.shape[1] * shrink)), max(1, round(mesh.texture.shape[0] * shrink)))
         texture = mesh.texture if shrink == 1 else cv2.resize(mesh.texture, size, interpolation=cv2.INTER_AREA)
         page.put("mesh/texture", encode_jpeg(np.asarray(texture, np.uint8), jpeg_quality))

@@ -60,8 +60,7 @@ def page_from_world(cameras: Sequence[Rigid3], *, is_level: bool = False) -> Rig
     return Rigid3(rotation, -rotation @ origin)
 
 
-Progress = Callable[[int, int], None]
-"""Receives the number of panoramas that are written, and of all."""
+Progress = Callable[[int, int], None]  # receives the number of panoramas that are written, and of all
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,6 @@ class Shared:
     Attributes:
         page: the page to open, which needs its folder.
         single_file: the same as one file; None if it would be too large.
-        points: number of points of the cloud.
-        panoramas: number of panoramas.
         triangles: number of triangles of the mesh; 0 without one.
         total_bytes: size of the data.
         notes: what is missing.

@@ -269,11 +269,6 @@ def exchange(
     return exchanged
 
 
-# Bytes: of a pixel of a strip for each source and beside; of a pixel of the largest size for each source; of the
-# reference, and of decoding a picture.
-_STRIP_SOURCE_BYTES, _STRIP_BYTES, _GREY_BYTES, _REFERENCE_BYTES = 8, 130, 2, 9
-
-
 @params_from(refine_range)
 class FullSizeParams(Params):
     """Settings of depth.full_size."""
@@ -287,8 +282,10 @@ def full_size_memory_bytes(params: FullSizeParams, inputs: Mapping[str, Any]) ->
     """Return the memory for the grey levels of the sources, the reference, a strip, and the result of half the size."""
     width: int = inputs["ref"].at_width(params.max_width).size_hw[1]
     sources = min(len(inputs["sources"]), params.max_sources)
-    strip = width * (STRIP_ROWS + 64) * (_STRIP_BYTES + _STRIP_SOURCE_BYTES * sources)
-    return width * width // 2 * (_GREY_BYTES * sources + _REFERENCE_BYTES) + strip
+    # Bytes: of a pixel of a strip for each source and beside; of a pixel of the largest size for each source; of the
+    # reference, and of decoding a picture.
+    strip = width * (STRIP_ROWS + 64) * (130 + 8 * sources)
+    return width * width // 2 * (2 * sources + 9) + strip
 
 
 @stage("depth.full_size", memory=full_size_memory_bytes)

@@ -20,9 +20,6 @@ from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses,
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
-_UP_OF_WORLD = np.array([0.0, -1.0, 0.0])
-_UPSIDE_DOWN = -0.8  # cosine between the up directions of a camera and of the world
-
 
 @params_from(level_poses)
 class LevelParams(Params):
@@ -71,7 +68,7 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
 
 def _turned_over(level_group: Poses) -> list[str]:
     """Return the images that are upside down in a level world; none if all are."""
-    over = level_group.rotations[:, 1, 1] < _UPSIDE_DOWN
+    over = level_group.rotations[:, 1, 1] < -0.8  # the cosine between up of a camera and of the world
     return [] if over.all() else [name for name, is_over in zip(level_group.names, over, strict=True) if is_over]
 
 
@@ -252,7 +249,7 @@ def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, *, ctx: Co
 
 def _up(poses: Poses, images: All[Panorama], evidence: Literal[Evidence, "world"]) -> NDArray[np.float64]:
     if evidence == "world":
-        return _UP_OF_WORLD
+        return np.array([0.0, -1.0, 0.0])
     vertical = find_vertical(poses, _up_in_cam(images), _pictures(images), evidence=evidence)
     if not vertical:
         raise InputError(f"the vertical is not known: {vertical.reason}. Level the poses and set vertical: world")

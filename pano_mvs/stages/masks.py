@@ -13,7 +13,7 @@ from pano_mvs.algorithms.masks.areas import WIDTH, areas_of_color, reduced_to_wi
 from pano_mvs.algorithms.masks.expected_view import OtherView
 from pano_mvs.algorithms.masks.moving import MAX_OTHERS, moving_pixels
 from pano_mvs.algorithms.masks.people import people
-from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, StaticContent, static_content
+from pano_mvs.algorithms.masks.static_content import MAX_VIEWS, static_content
 from pano_mvs.api import (
     All,
     Context,
@@ -70,7 +70,13 @@ def static(images: All[Panorama], params: StaticParams, ctx: Context) -> StaticM
         cameras.setdefault(camera_of(images[name]), []).append(name)
     found = {}
     for camera, names in cameras.items():
-        content = _static_content([images[name] for name in _spread(names)], params)
+        chosen = [images[name] for name in _spread(names)]
+        reduced = [reduced_to_width(panorama.load(), panorama.load_mask()) for panorama in chosen]
+        content = static_content(
+            [picture for picture, _ in reduced],
+            [valid for _, valid in reduced],
+            **arguments_from(static_content, params),
+        )
         which = f"{len(names)} images of {camera[1]}×{camera[0]} px: " if len(cameras) > 1 else ""
         if content.reason:
             ctx.note(f"{which}nothing that moves with the camera was looked for: {content.reason}")
@@ -177,15 +183,6 @@ def _resized(pixels: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.
     """Return a mask of the full sphere at another size, with interpolated edges."""
     shares = cv2.resize(pixels.astype(np.float32), size_hw[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(shares >= 0.5)
-
-
-def _static_content(panoramas: list[Panorama], params: StaticParams) -> StaticContent:
-    reduced = [reduced_to_width(panorama.load(), panorama.load_mask()) for panorama in panoramas]
-    return static_content(
-        [picture for picture, _ in reduced],
-        [valid for _, valid in reduced],
-        **arguments_from(static_content, params),
-    )
 
 
 def _spread(names: list[str]) -> list[str]:

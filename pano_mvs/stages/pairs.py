@@ -41,8 +41,6 @@ from pano_mvs.api import (
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
 
-_BYTES_OF_A_PAIR = 64  # the most of eight matrices of float64 that `automatic_pairs` and its parts hold at a time
-
 
 @params_from(automatic_pairs)
 class AutoParams(Params):
@@ -51,7 +49,8 @@ class AutoParams(Params):
 
 def _memory_of_auto(params: AutoParams, count: int) -> int:
     """Return the memory for pairs of this number of images."""
-    return _BYTES_OF_A_PAIR * count**2 if most_pairs(count, _candidates(params)) < count * (count - 1) // 2 else 0
+    # `automatic_pairs` and its parts hold at most eight matrices of float64 at a time.
+    return 64 * count**2 if most_pairs(count, _candidates(params)) < count * (count - 1) // 2 else 0
 
 
 def _candidates(params: AutoParams) -> int:

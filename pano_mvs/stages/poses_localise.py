@@ -44,7 +44,6 @@ from pano_mvs.stages.features import NetworkParams
 
 # Photographs whose panoramas are chosen together: the larger, the less often the panoramas are read.
 _BLOCK = 32
-_BASE_BYTES, _BYTES_OF_A_PHOTOGRAPH, _BYTES_OF_A_PANORAMA = 900_000_000, 7_000_000, 6_000_000
 
 
 def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
@@ -52,7 +51,7 @@ def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
     candidates, count = _candidates(params), len(inputs["ranges"])
     photographs = _BLOCK if 0 < candidates < count else 1
     kept = LocatedPanoramas.kept(candidates, count)
-    return _BASE_BYTES + _BYTES_OF_A_PHOTOGRAPH * photographs + _BYTES_OF_A_PANORAMA * kept
+    return 900_000_000 + 7_000_000 * photographs + 6_000_000 * kept
 
 
 @params_from(localise_photograph, own_last=True)

@@ -137,7 +137,9 @@ def dual_fisheye(item: SourceItem, params: DualFisheyeParams, ctx: Context) -> P
     pictures = [_decoded(first, data, params)]
     if second is not None:
         pictures.append(_decoded(second, second.read_bytes(), params))
-    size_hw = _panorama_size(rig, params)
+    natural = round(2 * np.pi * max(max(lens.focal_xy) for lens in rig.lenses))
+    width = params.width or min(natural, params.max_width)
+    size_hw = working_size((width // 2, width), width)
     picture, valid = stitch_lenses(
         _by_lens(pictures, rig, item, params=params), rig, size_hw=size_hw, threads=ctx.threads
     )
@@ -172,7 +174,6 @@ def _decoded(file: FilePart, data: bytes, params: DualFisheyeParams) -> NDArray[
 def _by_lens(
     pictures: list[NDArray[np.uint8]], rig: LensRig, item: SourceItem, *, params: DualFisheyeParams
 ) -> list[NDArray[np.uint8]]:
-    """Return the picture of each lens."""
     assert params.calibration is not None
     sizes = [lens.size_hw for lens in rig.lenses]
     if len(pictures) == 2:
@@ -191,12 +192,6 @@ def _by_lens(
                 "camera in the mode in which it took these pictures, see docs/rigs.md"
             )
     return pictures if len(pictures) == 2 else [pictures[0][:, : sizes[0][1]], pictures[0][:, sizes[0][1] :]]
-
-
-def _panorama_size(rig: LensRig, params: DualFisheyeParams) -> tuple[int, int]:
-    natural = round(2 * np.pi * max(max(lens.focal_xy) for lens in rig.lenses))
-    width = params.width or min(natural, params.max_width)
-    return working_size((width // 2, width), width)
 
 
 FOLDER = "colmap_rig"

@@ -312,7 +312,6 @@ def _equirectangular(item: SourceItem, params: TourParams, ctx: Context) -> Pano
 
 
 def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:
-    """Return a face from its tiles."""
     tiles = {tuple(map(int, key.split("_")[1:])): key for key in item.files if key.startswith(f"{face}_")}
     rows = [
         [_picture(item, tiles[row, column]) for column in sorted({column for _, column in tiles})]

@@ -141,7 +141,9 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         ctx.note(stereo_note(path.name, info.stereo))
     if info.is_turned:
         ctx.note(f"{path.name} has a rotation in its metadata, which was ignored: frames are used as stored")
-    time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info=info, threads=ctx.threads)
+    match = _TIME_IN_NAME.fullmatch(item.name)
+    assert match is not None, item.name
+    time_s, quality, frame = _best_frame(path, int(match[1]) / 1000, params, info=info, threads=ctx.threads)
     if is_dual_fisheye(frame):
         raise InputError(_dual_fisheye(path))
     ctx.metric("time_s", time_s)
@@ -277,12 +279,6 @@ def _best_frame(
             "the video is damaged there, ends early, or pauses. Set end_s or start_s, or copy it again"
         )
     return best
-
-
-def _time_from_name(name: str) -> float:
-    match = _TIME_IN_NAME.fullmatch(name)
-    assert match is not None, name
-    return int(match[1]) / 1000
 
 
 def _dual_fisheye(path: Path) -> str:

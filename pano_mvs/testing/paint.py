@@ -24,15 +24,6 @@ class Pattern(Protocol):
         """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), for pixels of width `footprint`."""
 
 
-WHITE: Colors = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
-OAK: Colors = ((0.62, 0.44, 0.27), (0.42, 0.28, 0.17))
-BRICK: Colors = ((0.62, 0.36, 0.27), (0.50, 0.40, 0.33))
-STONE: Colors = ((0.62, 0.60, 0.54), (0.47, 0.46, 0.44))
-LEAVES: Colors = ((0.22, 0.42, 0.16), (0.40, 0.50, 0.22))
-STEEL: Colors = ((0.36, 0.40, 0.46), (0.60, 0.60, 0.62))
-BLUE: Colors = ((0.25, 0.38, 0.62), (0.45, 0.60, 0.75))
-RED: Colors = ((0.70, 0.26, 0.22), (0.80, 0.52, 0.40))
-
 # Cell sizes in scene units, with the amplitude of the noise on each.
 _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
     "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
@@ -50,7 +41,6 @@ _HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
     "outdoor": ((0.25, 0.8),),
     "none": (),
 }
-_CLOUDS = ((0.06, 0.8),)
 # Mean wavelength of the noise in cells.
 _WAVELENGTH = 7.0
 
@@ -63,8 +53,6 @@ def albedo_at(
     Args:
         points: in world coordinates; a point has the same colour from every viewpoint.
         colors_rgb: the two colours between which the hue varies.
-        texture: kind of texture.
-        seed: seed of the texture.
         footprint: (N,) width of a pixel at each point. The texture "outdoor" fades where a pixel averages over its
             waves, since a far wall would otherwise flicker between views; the others do not depend on it.
     """
@@ -95,14 +83,12 @@ def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: in
     clear: FloatArray = height * zenith + (1 - height) * horizon
     if not clouds:
         return clear
-    cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=_CLOUDS, seed=seed + 0x5C))[:, None]
+    cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=((0.06, 0.8),), seed=seed + 0x5C))[:, None]
     mixed: FloatArray = clear + clouds * cloud * (1 - clear)
     return mixed
 
 
 _CELLS = 64
-# Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
-_SHORTEST, _LONGEST = 4.0, 12.0
 
 
 def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int) -> FloatArray:
@@ -151,6 +137,7 @@ def _volume() -> FloatArray:
     white = np.random.default_rng(0x3D).normal(size=(_CELLS,) * 3)
     frequency = np.fft.fftfreq(_CELLS)
     radius = np.sqrt(np.sum(np.stack(np.meshgrid(frequency, frequency, frequency)) ** 2, axis=0))
-    band = (radius >= 1 / _LONGEST) & (radius <= 1 / _SHORTEST)
+    # Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
+    band = (radius >= 1 / 12) & (radius <= 1 / 4)
     filtered = np.fft.ifftn(np.fft.fftn(white) * band).real
     return np.asarray(filtered / filtered.std())

@@ -20,7 +20,6 @@ class Room:
     """Surfaces with a texture, and one lamp.
 
     Attributes:
-        surfaces: in any order.
         texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
             "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
         lamp: position of the light; the shading is diffuse, without shadows.
@@ -54,8 +53,6 @@ def capture_poses(count: int, *, seed: int = 0, spread: float = 0.6, tilt_deg: f
     """Return cameras in the free centre of the default room, with arbitrary heading and small tilt.
 
     Args:
-        count: number of cameras.
-        seed: seed of the draw.
         spread: half the side of the cube that contains the centres; heights vary by half of it.
         tilt_deg: standard deviation of the tilt about a horizontal axis.
 
@@ -81,7 +78,6 @@ def render(
 
     Args:
         cam_from_world: any pose.
-        size_hw: (height, width) of the panorama.
         supersample: number of rays per pixel along each side, averaged for the colour.
 
     Returns:

@@ -24,35 +24,25 @@ from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """The result of a call.
+    """The result of a call."""
 
-    Attributes:
-        value: the value that the stage returned; None if it rejected its inputs.
-        digest: digest of the value and of the metrics.
-        refusal: the error by which the stage rejected its inputs.
-        mask: (H, W) valid pixels of a returned panorama, whose files no longer exist after the call.
-    """
-
-    value: Record | None
-    digest: str
-    refusal: PanoMvsError | None = None
+    value: Record | None  # the value that the stage returned; None if it rejected its inputs
+    digest: str  # digest of the value and of the metrics
+    refusal: PanoMvsError | None = None  # the error by which the stage rejected its inputs
+    # (H, W) valid pixels of a returned panorama, whose files no longer exist after the call
     mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class StageCase:
-    """A stage with its test inputs.
-
-    Attributes:
-        settings: replace the defaults; `{capture}` in a string stands for the folder of the capture.
-        inputs: port to a value, for ports of kinds that the tiny capture does not have.
-        size_hw: size of the ordinary images.
-    """
+    """A stage with its test inputs."""
 
     spec: StageSpec
+    # replace the defaults; `{capture}` in a string stands for the folder of the capture
     settings: Mapping[str, Any] = field(default_factory=dict)
+    # port to a value, for ports of kinds that the tiny capture does not have
     inputs: Mapping[str, Any] = field(default_factory=dict)
-    size_hw: tuple[int, int] = (32, 64)
+    size_hw: tuple[int, int] = (32, 64)  # size of the ordinary images
 
     @property
     def capture(self) -> TinyCapture:

@@ -49,45 +49,29 @@ _folders: list[TemporaryDirectory[str]] = []
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of the tiny capture.
-
-    Attributes:
-        size_hw: (height, width) of the images.
-        rolled: number of columns by which all images are rolled to the right, with rotated cameras.
-        masked: whether the tripod and a patch across the seam are masked in every image.
-        scribbled: whether masked pixels show noise instead of the room.
-        cropped: whether the files lack the uppermost and lowest eighth of the sphere.
-        mixed: whether every second image has half as many rows.
-        blank: whether there is nothing to see: everything is masked, and earlier stages found nothing.
-    """
+    """A variant of the tiny capture."""
 
     size_hw: tuple[int, int] = (32, 64)
-    rolled: int = 0
-    masked: bool = False
-    scribbled: bool = False
-    cropped: bool = False
-    mixed: bool = False
+    rolled: int = 0  # number of columns by which all images are rolled to the right, with rotated cameras
+    masked: bool = False  # whether the tripod and a patch across the seam are masked in every image
+    scribbled: bool = False  # whether masked pixels show noise instead of the room
+    cropped: bool = False  # whether the files lack the uppermost and lowest eighth of the sphere
+    mixed: bool = False  # whether every second image has half as many rows
+    # whether there is nothing to see: everything is masked, and earlier stages found nothing
     blank: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TinyCapture:
-    """Some views of a synthetic room.
+    """Some views of a synthetic room."""
 
-    Attributes:
-        folder: folder with images/ and truth/poses.json.
-        names: image names.
-        poses: cam_from_world of each image.
-        pictures: the images, equal to the files unless these are cropped or scribbled.
-        ranges: true ranges, (H, W) float32.
-    """
-
-    folder: Path
+    folder: Path  # folder with images/ and truth/poses.json
     variant: Variant
     names: tuple[str, ...]
-    poses: tuple[Rigid3, ...]
+    poses: tuple[Rigid3, ...]  # cam_from_world of each image
+    # the images, equal to the files unless these are cropped or scribbled
     pictures: tuple[NDArray[np.uint8], ...]
-    ranges: tuple[NDArray[np.float32], ...]
+    ranges: tuple[NDArray[np.float32], ...]  # true ranges, (H, W) float32
 
     @functools.cached_property
     def images(self) -> dict[str, Panorama]:

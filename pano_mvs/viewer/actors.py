@@ -79,16 +79,11 @@ class CloudActor:
 
 @dataclass(frozen=True, eq=False)
 class SphereMesh:
-    """Triangles of a sphere with texture coordinates.
+    """Triangles of a sphere with texture coordinates."""
 
-    Attributes:
-        vertices: (V, 3) float64 in the world.
-        triangles: (T, 3) int64; clockwise as seen from inside.
-        texture_uv: (V, 2) float32, u to the right, v upwards from the lower edge of the image.
-    """
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    vertices: NDArray[np.float64]  # (V, 3) float64 in the world
+    triangles: NDArray[np.int64]  # (T, 3) int64; clockwise as seen from inside
+    # (V, 2) float32, u to the right, v upwards from the lower edge of the image
     texture_uv: NDArray[np.float32]
 
 
@@ -278,8 +273,6 @@ class Overlay:
 
 
 SMALL_WIDTH, LARGE_WIDTH = 512, 4096
-# Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
-_SKY, _GROUND = (150, 160, 175), (90, 95, 105)
 
 
 def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
@@ -295,8 +288,12 @@ def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
             picture = _panorama_in(path, preview=path == camera.preview)
         except InputError:
             continue
-        return _at_most(picture, width)
-    rows = np.linspace(_SKY, _GROUND, 64)[:, None]
+        if picture.shape[1] <= width:
+            return np.ascontiguousarray(picture)
+        size = width, max(1, round(picture.shape[0] * width / picture.shape[1]))
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    # Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
+    rows = np.linspace((150, 160, 175), (90, 95, 105), 64)[:, None]
     return np.ascontiguousarray(np.broadcast_to(rows, (64, 128, 3)).astype(np.uint8))
 
 
@@ -311,10 +308,3 @@ def _panorama_in(path: Path, *, preview: bool) -> NDArray[np.uint8]:
     sphere = np.zeros((*info.size_hw, 3), np.uint8)
     sphere[top : top + height, left : left + width] = picture
     return sphere
-
-
-def _at_most(picture: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    if picture.shape[1] <= width:
-        return np.ascontiguousarray(picture)
-    size = width, max(1, round(picture.shape[0] * width / picture.shape[1]))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -14,7 +14,6 @@ from pano_mvs.io.ply import PlyPoints
 POINT_BUDGET = 2_000_000
 COLORINGS = ("rgb", "confidence", "views", "normals", "height")
 
-_PLAIN = 200
 _COLORS, _NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 _NEEDED = {"rgb": (), "confidence": ("confidence",), "views": ("views",), "normals": _NORMALS, "height": ()}
 
@@ -97,7 +96,7 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
 
 def _photographed(cloud: DrawnCloud) -> Coloring:
     if not set(_COLORS) <= set(cloud.vertices.dtype.names or ()):
-        return Coloring(np.full((len(cloud.points), 3), _PLAIN, np.uint8), "this cloud has no colours")
+        return Coloring(np.full((len(cloud.points), 3), 200, np.uint8), "this cloud has no colours")
     stacked = np.stack([cloud.vertices[name] for name in _COLORS], axis=-1)
     # Some programs write colours from 0 to 1.
     scaled = stacked * 255.0 if stacked.dtype.kind == "f" and stacked.max(initial=0) <= 1 else stacked

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.text import shortened_list
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
@@ -47,63 +48,36 @@ def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], 
 
 @dataclass(frozen=True, eq=False)
 class TourState:
-    """State of the viewer.
-
-    Attributes:
-        viewpoint: position and direction of view.
-        surface: "cloud", "mesh" or "both".
-        coloring: name of the cloud's colouring.
-        inside: index of the camera whose panorama surrounds the viewer, or None.
-        outside: viewpoint to return to from inside.
-        measuring: whether clicks pick points.
-        picked: none, one or two points (3,) in the world.
-        hovered: index of the camera under the pointer, or None.
-        labels: whether all cameras are named.
-        cameras: whether cameras are shown.
-        blended: whether the cloud is shown inside a panorama.
-        ranges: whether a camera's ranges are shown inside it instead of its panorama.
-        backs: whether points and triangles that face away from the viewer are shown; hiding them opens rooms
-            to view.
-        all_points: whether all points of the file are drawn.
-        help: whether the keys are listed.
-        message: the latest message.
-    """
+    """State of the viewer."""
 
     viewpoint: Viewpoint
-    surface: str = "cloud"
-    coloring: str = "rgb"
-    inside: int | None = None
-    outside: Viewpoint | None = None
-    measuring: bool = False
-    picked: tuple[FloatArray, ...] = ()
-    hovered: int | None = None
+    surface: str = "cloud"  # "cloud", "mesh" or "both"
+    coloring: str = "rgb"  # name of the cloud's colouring
+    inside: int | None = None  # index of the camera whose panorama surrounds the viewer, or None
+    outside: Viewpoint | None = None  # viewpoint to return to from inside
+    measuring: bool = False  # whether clicks pick points
+    picked: tuple[FloatArray, ...] = ()  # none, one or two points (3,) in the world
+    hovered: int | None = None  # index of the camera under the pointer, or None
     labels: bool = False
     cameras: bool = True
-    blended: bool = False
-    ranges: bool = False
+    blended: bool = False  # whether the cloud is shown inside a panorama
+    ranges: bool = False  # whether a camera's ranges are shown inside it instead of its panorama
+    # whether points and triangles that face away from the viewer are shown; hiding them opens rooms to view
     backs: bool = False
-    all_points: bool = False
+    all_points: bool = False  # whether all points of the file are drawn
     help: bool = False
     message: str = ""
 
 
 @dataclass(eq=False)
 class Tour:
-    """A scene and the state of its viewer.
+    """A scene and the state of its viewer."""
 
-    Attributes:
-        scene: cloud, mesh and cameras.
-        cloud: the points that are drawn, or None.
-        box: (2, 3) that contains nearly everything.
-        aspect: width of the window as a multiple of its height.
-        corners: (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh.
-        state: current state.
-    """
-
-    scene: ShownScene
-    cloud: DrawnCloud | None
-    box: FloatArray
-    aspect: float = 1.5
+    scene: ShownScene  # cloud, mesh and cameras
+    cloud: DrawnCloud | None  # the points that are drawn, or None
+    box: FloatArray  # (2, 3) that contains nearly everything
+    aspect: float = 1.5  # width of the window as a multiple of its height
+    # (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh
     corners: NDArray[np.float32] | None = None
     state: TourState = field(init=False)
 
@@ -129,7 +103,12 @@ class Tour:
         """
         kind, _, name = view.partition(":")
         if kind == "inside":
-            found = self._camera_called(name)
+            names = [camera.name for camera in self.scene.cameras]
+            matched = match_image_names([name], names)
+            if name not in matched:
+                shown = shortened_list(names, 6, rest=" …")
+                raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
+            found = names.index(matched[name])
             self.step_into(found)
             pose = self.scene.cameras[found].cam_from_world
             self.moved_to(looking_along(pose.center, pose.rotation[2], self.scene.up))
@@ -234,7 +213,6 @@ class Tour:
         }
 
     def _look(self, viewpoint: Viewpoint) -> None:
-        """Look from outside."""
         self.state = replace(self.state, viewpoint=viewpoint, inside=None, outside=None, message="")
 
     def _toggle(self, name: str) -> None:
@@ -284,14 +262,6 @@ class Tour:
         if distance is not None and self.scene.unit != "m":
             said += f" from {_place_text(picked[0])} to {_place_text(picked[1])}"
         self.state = replace(self.state, message=said)
-
-    def _camera_called(self, name: str) -> int:
-        names = [camera.name for camera in self.scene.cameras]
-        matched = match_image_names([name], names)
-        if name not in matched:
-            shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
-            raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
-        return names.index(matched[name])
 
 
 def _place_text(point: FloatArray) -> str:

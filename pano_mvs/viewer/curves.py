@@ -44,7 +44,6 @@ _STYLE: Any = {  # matplotlib's type of the keys depends on its version
     "ytick.left": False,
 }
 _LEGEND_COLUMNS = 5
-_MIN_TICK_DISTANCE_PX = 44
 _TAG_WIDTH = 0.18  # largest width of the text at a mark, as a share of a panel
 
 
@@ -86,7 +85,7 @@ def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -
     labels, taken = [], -np.inf
     for value, place in zip(values, places, strict=True):
         x = place / (len(ranges) - 1) * (_RIGHT - _LEFT)
-        is_shown = with_labels and x - taken > _MIN_TICK_DISTANCE_PX
+        is_shown = with_labels and x - taken > 44
         labels.append(f"{value:g}" if is_shown else "")
         taken = x if is_shown else taken
     axes.set_xticks(places, labels)
@@ -164,7 +163,6 @@ def _drawable(text: str) -> str:
 
 _ROWS = 8
 _MARGIN = 6
-_LABEL_STEP = 16
 # Eighths of a character if the terminal supports them, otherwise whole characters.
 _EIGHTHS, _WHOLE = " ▁▂▃▄▅▆▇█", " #"
 _SIGNS = {"winner": "▲", "next valley": "△", "truth": "◆"}
@@ -225,7 +223,7 @@ def _marks(curve: CostCurve, true_range: float) -> Mapping[str, int]:
 def _scale(ranges: Sequence[float] | NDArray[np.float64], group: int, bars: int) -> str:
     """Return as many range labels below the bars as fit."""
     line = ""
-    for bar in range(0, bars, _LABEL_STEP):
+    for bar in range(0, bars, 16):
         line = line.ljust(bar) + f"{ranges[bar * group]:.3g}"
     last = f"{ranges[-1]:.3g}"
     return line[: max(0, bars - len(last) - 1)].ljust(bars - len(last)) + last

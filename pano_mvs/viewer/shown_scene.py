@@ -13,7 +13,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import file_inside
 from pano_mvs.core.paths import is_file, is_folder, resolved
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
@@ -23,31 +23,19 @@ from pano_mvs.scene.files import group_file
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
-_HEAD_BYTES = 1 << 14
-_NAMED_DOUBTS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ShownCamera:
-    """A camera to step into.
-
-    Attributes:
-        name: of its image.
-        cam_from_world: its pose.
-        picture: its panorama, or None if the file is missing.
-        preview: a small image whose upper half is the panorama, or None.
-        range_file: its ranges as float32 TIFF, or None.
-        confidence_file: its confidences as PNG, or None.
-        doubtful: whether the run found its pose doubtful.
-    """
+    """A camera to step into."""
 
     name: str
     cam_from_world: Rigid3
-    picture: Path | None
-    preview: Path | None
-    range_file: Path | None = None
-    confidence_file: Path | None = None
-    doubtful: bool = False
+    picture: Path | None  # its panorama, or None if the file is missing
+    preview: Path | None  # a small image whose upper half is the panorama, or None
+    range_file: Path | None = None  # its ranges as float32 TIFF, or None
+    confidence_file: Path | None = None  # its confidences as PNG, or None
+    doubtful: bool = False  # whether the run found its pose doubtful
 
     @property
     def label(self) -> str:
@@ -57,27 +45,16 @@ class ShownCamera:
 
 @dataclass(frozen=True, eq=False)
 class ShownScene:
-    """The scene to show.
+    """The scene to show."""
 
-    Attributes:
-        name: of the folder or file.
-        cloud: the vertices of the cloud, or None.
-        mesh: a PLY file with faces, or None.
-        cameras: in the order of the capture.
-        unit: of lengths: "m" or "scene units".
-        up: (3,) unit vector, up in the world.
-        ahead: (3,) unit vector orthogonal to `up`: the viewing direction of the first camera.
-        notes: what is missing, and why.
-    """
-
-    name: str
-    cloud: PlyPoints | None
-    mesh: Path | None
-    cameras: tuple[ShownCamera, ...]
-    unit: str
-    up: FloatArray
-    ahead: FloatArray
-    notes: tuple[str, ...] = ()
+    name: str  # of the folder or file
+    cloud: PlyPoints | None  # the vertices of the cloud, or None
+    mesh: Path | None  # a PLY file with faces, or None
+    cameras: tuple[ShownCamera, ...]  # in the order of the capture
+    unit: str  # of lengths: "m" or "scene units"
+    up: FloatArray  # (3,) unit vector, up in the world
+    ahead: FloatArray  # (3,) unit vector orthogonal to `up`: the viewing direction of the first camera
+    notes: tuple[str, ...] = ()  # what is missing, and why
 
     @property
     def centers(self) -> FloatArray:
@@ -108,7 +85,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     mesh_file = _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images=images, notes=notes)
     if doubtful := [camera.name for camera in cameras if camera.doubtful]:
-        shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
+        shown = shortened_list(doubtful, 5, rest=" …")
         notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
     cloud = _cloud(_written(path, run, cloud_name), cloud_name, notes)
     if cloud is None and mesh_file is None and not cameras:
@@ -171,7 +148,7 @@ def has_faces(path: Path) -> bool:
     """Return whether a PLY file contains faces."""
     try:
         with path.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES)
+            head = stream.read(1 << 14)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     counted = re.search(rb"^element face ([0-9]{1,18})\s*$", head.partition(b"end_header")[0], re.MULTILINE)

@@ -23,7 +23,6 @@ from pano_mvs.viewer.viewpoint import box_of
 
 _SIZE = re.compile(r"([1-9][0-9]{1,4})[x×]([1-9][0-9]{1,4})")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
-_QUALITY = 90
 
 
 @dataclass(frozen=True)
@@ -84,8 +83,8 @@ def view_run(
     options = options or ViewOptions()
     images, screenshot = (None if path is None else Path(path) for path in (options.images, options.screenshot))
     size_wh = _size_wh(options.size)
-    if screenshot is not None:
-        _check_screenshot(screenshot)
+    if screenshot is not None and screenshot.suffix.lower() not in _SUFFIXES:
+        raise UsageError(f"--screenshot {screenshot}: images must end in {', '.join(_SUFFIXES)}")
     path = run.out if isinstance(run, RunOutput) else Path(run)
     scene = open_scene(path, images=images, group=options.group)
     if screenshot is None:
@@ -159,14 +158,9 @@ def _size_wh(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _check_screenshot(path: Path) -> None:
-    if path.suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"--screenshot {path}: images must end in {', '.join(_SUFFIXES)}")
-
-
 def _write(path: Path, picture: NDArray[np.uint8]) -> None:
     quality = {".webp": cv2.IMWRITE_WEBP_QUALITY}.get(path.suffix.lower(), cv2.IMWRITE_JPEG_QUALITY)
-    data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [quality, _QUALITY])[1]
+    data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [quality, 90])[1]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data.tobytes())

@@ -10,32 +10,19 @@ from numpy.typing import ArrayLike, NDArray
 from pano_mvs.core.arrays import FloatArray
 
 OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
-_MIN_ANGLE_DEG, _MAX_ANGLE_DEG = 15.0, 110.0
-# Limit of the elevation: straight up and down, the up direction is undefined.
-_STEEPEST_DEG = 89.0
 # Share of the window that the scene fills.
 _FILLED = 0.94
-# Height of a plan or an elevation in halves of the scene, with space for the scale bar below.
-_PARALLEL_ROOM = 2.25
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Position and direction of view.
+    """Position and direction of view."""
 
-    Attributes:
-        eye: (3,) in the world.
-        target: (3,) point in the centre of the window.
-        up: (3,) unit vector, up in the window.
-        angle_deg: vertical field of view.
-        height: visible height in parallel projection, scene units; 0 for perspective.
-    """
-
-    eye: FloatArray
-    target: FloatArray
-    up: FloatArray
-    angle_deg: float = OUTSIDE_ANGLE_DEG
-    height: float = 0.0
+    eye: FloatArray  # (3,) in the world
+    target: FloatArray  # (3,) point in the centre of the window
+    up: FloatArray  # (3,) unit vector, up in the window
+    angle_deg: float = OUTSIDE_ANGLE_DEG  # vertical field of view
+    height: float = 0.0  # visible height in parallel projection, scene units; 0 for perspective
 
     @property
     def axes(self) -> FloatArray:
@@ -70,7 +57,7 @@ class Viewpoint:
         up = self.up
         level = forward - up * float(forward @ up)
         elevation = np.arctan2(float(forward @ up), float(np.linalg.norm(level)))
-        steepest = np.deg2rad(_STEEPEST_DEG)
+        steepest = np.deg2rad(89.0)  # straight up and down, the up direction is undefined
         elevation = float(np.clip(elevation + dy_px * rad_per_px, -steepest, steepest))
         level = level / max(float(np.linalg.norm(level)), 1e-12)
         aside = np.cross(level, up)
@@ -82,7 +69,7 @@ class Viewpoint:
 
     def zoomed(self, steps: float) -> Viewpoint:
         """Return the view with a smaller angle for positive steps, within limits."""
-        angle = float(np.clip(self.angle_deg * 0.9**steps, _MIN_ANGLE_DEG, _MAX_ANGLE_DEG))
+        angle = float(np.clip(self.angle_deg * 0.9**steps, 15.0, 110.0))
         return replace(self, angle_deg=angle)
 
 
@@ -112,7 +99,8 @@ def outside_view(name: str, box: FloatArray, up: FloatArray, *, ahead: FloatArra
         return Viewpoint(middle + _distance(corners @ seen.axes.T, aspect) * direction, middle, up)
     away, upright = (up, ahead) if name == "top" else (-ahead, up)
     across, high = np.abs(corners @ right).max(), np.abs(corners @ upright).max()
-    height = _PARALLEL_ROOM * max(float(high), float(across) / aspect)
+    # Height of a plan or an elevation in halves of the scene, with space for the scale bar below.
+    height = 2.25 * max(float(high), float(across) / aspect)
     return Viewpoint(middle + 2 * radius * away, middle, upright, height=height)
 
 
@@ -125,7 +113,6 @@ def _distance(corners: FloatArray, aspect: float) -> float:
 
 # Radius of a sphere as a share of the distance to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)
-_CROWDED_SHARE = 0.4
 _BOX_SHARES, _OUTER_SHARES = (0.01, 0.99), (0.0005, 0.9995)
 
 
@@ -140,7 +127,7 @@ def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
     gaps = np.asarray(cKDTree(centers).query(centers, k=2)[0])[:, 1]
     gap = float(np.median(gaps))
     wanted = min(max(_RADIUS_SHARE * gap, least), most)
-    return min(wanted, _CROWDED_SHARE * gap) if gap > 0 else wanted
+    return min(wanted, 0.4 * gap) if gap > 0 else wanted
 
 
 def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:

@@ -30,12 +30,6 @@ TEXTURED = 64
 
 _BACKGROUND, _BACKGROUND_TOP, _INK = "#15181d", "#2b313a", "#e8ebf0"
 _ACCENT, _DOTS, _RIM = "#ffb454", "#7fb4ff", "#4da3ff"
-_RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
-_MAX_LABELS = 300
-_SURROUND_SHARE = 2.0
-_FONT_SHARE = 1 / 72
-# Upper right corner, as minimum and maximum x and y: the scale bar is at the lower edge, texts are in other corners.
-_TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 
 class SceneWindow:
@@ -50,7 +44,7 @@ class SceneWindow:
             off_screen=off_screen, window_size=list(size_wh), lighting="none", title=f"pano-mvs · {tour.scene.name}"
         )
         self.plotter.set_background(_BACKGROUND, top=_BACKGROUND_TOP)
-        self._font = max(7, round(size_wh[1] * _FONT_SHARE))
+        self._font = max(7, round(size_wh[1] / 72))
         self._overlay = Overlay(self.plotter, self._font, ink=_INK, paper=_BACKGROUND)
         self._shown: TourState | None = None
         self._cloud: CloudActor | None = None
@@ -62,7 +56,10 @@ class SceneWindow:
         self._add_mesh()
         self._add_cloud()
         self._add_bar()
-        self.plotter.add_axes(color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2, viewport=_TRIAD)
+        # The upper right corner: the scale bar is at the lower edge, and texts are in the other corners.
+        self.plotter.add_axes(
+            color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2, viewport=(0.8, 0.8, 1.0, 1.0)
+        )
         self._hands = Hands(tour, seen_from=self.seen_from, update=self.update)
         self.plotter.clear_events_for_key("b")
         self.plotter.iren.style = self._hands.attach(self.plotter.iren.interactor)
@@ -100,7 +97,12 @@ class SceneWindow:
         state, before = self.tour.state, self._shown
         self._shown = state
         self.plotter.suppress_rendering = True  # once, at the end
-        self._place_camera(state.viewpoint)
+        camera = self.plotter.camera
+        camera.position, camera.focal_point = tuple(state.viewpoint.eye), tuple(state.viewpoint.target)
+        camera.up, camera.view_angle = tuple(state.viewpoint.up), state.viewpoint.angle_deg
+        camera.parallel_projection = bool(state.viewpoint.height)
+        if state.viewpoint.height:
+            camera.parallel_scale = state.viewpoint.height / 2
         if before is None or before.all_points != state.all_points:
             self._reload_points(state)
         if before is None or (before.inside, before.ranges) != (state.inside, state.ranges):
@@ -113,14 +115,6 @@ class SceneWindow:
         self.plotter.suppress_rendering = False
         self.plotter.renderer.ResetCameraClippingRange()
         self.plotter.render()
-
-    def _place_camera(self, viewpoint: Viewpoint) -> None:
-        camera = self.plotter.camera
-        camera.position, camera.focal_point = tuple(viewpoint.eye), tuple(viewpoint.target)
-        camera.up, camera.view_angle = tuple(viewpoint.up), viewpoint.angle_deg
-        camera.parallel_projection = bool(viewpoint.height)
-        if viewpoint.height:
-            camera.parallel_scale = viewpoint.height / 2
 
     def _add_cloud(self) -> None:
         if self.tour.cloud is not None:
@@ -212,7 +206,7 @@ class SceneWindow:
         if camera_idx is None:
             return
         camera = self.tour.scene.cameras[camera_idx]
-        radius = _SURROUND_SHARE * float(np.linalg.norm(np.ptp(self.tour.box, axis=0)))
+        radius = 2.0 * float(np.linalg.norm(np.ptp(self.tour.box, axis=0)))
         picture = None
         if ranges:
             picture, self._range_legend = range_panorama(camera, self.tour.scene.unit)
@@ -237,7 +231,7 @@ class SceneWindow:
         self.plotter.remove_actor("names", render=False)
         named = [state.hovered] if state.hovered is not None else []
         if state.labels and state.cameras:
-            named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MAX_LABELS) if idx != state.inside]
+            named = [int(idx) for idx in self._nearest(state.viewpoint.eye, 300) if idx != state.inside]
         if named:
             above = centers[named] + 1.4 * self.tour.radius * self.tour.scene.up
             self._overlay.label(above, [self.tour.scene.cameras[idx].label for idx in named], "names")
@@ -263,7 +257,7 @@ class SceneWindow:
         tour = self.tour
         self.plotter.remove_actor("rims", render=False)
         self.plotter.remove_actor("dots", render=False)
-        share = _RIM_OUTSIDE if tour.state.inside is None else _RIM_INSIDE
+        share = 1.1 if tour.state.inside is None else 1.03
         rimmed = [idx for idx in sorted(textured) if idx != tour.state.inside]
         self._rims = self._dots = None
         if rimmed:
@@ -321,8 +315,6 @@ def _looks_elsewhere(before: TourState, state: TourState) -> bool:
     return all(getattr(before, name) is getattr(state, name) for name in names)
 
 
-# A press and a release within this distance are a click.
-_CLICK_PX = 4
 _LEFT, _RIGHT = "LeftButton", "RightButton"
 
 
@@ -333,7 +325,6 @@ class Hands:
     """
 
     def __init__(self, tour: Tour, *, seen_from: Callable[[], Viewpoint], update: Callable[[], None]) -> None:
-        """Make a handler."""
         self._tour, self._seen_from, self._update = tour, seen_from, update
         self._pressed: dict[str, tuple[int, int]] = {}
         self._last = (0, 0)
@@ -382,7 +373,8 @@ class Hands:
         if not self._inside:
             (self._style.OnLeftButtonUp if button == _LEFT else self._style.OnRightButtonUp)()
             self._tour.moved_to(self._seen_from())
-        if start is not None and max(abs(start[0] - here[0]), abs(start[1] - here[1])) < _CLICK_PX:
+        # A press and a release within this distance are a click.
+        if start is not None and max(abs(start[0] - here[0]), abs(start[1] - here[1])) < 4:
             if button == _LEFT:
                 self._tour.click(here[0] + 0.5, here[1] + 0.5, self._size_wh)
             else:

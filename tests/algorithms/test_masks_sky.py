@@ -14,9 +14,9 @@ from pano_mvs.algorithms.masks.sky_comparison import compare_with_source, errors
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.paint import BRICK, LEAVES, OAK, STONE
 from pano_mvs.testing.room import Room, default_room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
+from tests.synthetic.paints import BRICK, LEAVES, OAK, STONE
 from tests.synthetic.places import window_room
 from tests.synthetic.rod import Rod
 from tests.synthetic.scenes import SKIES

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.rod import Rod
 from tests.synthetic.scenes import Painted, Scene, painted, placed
 

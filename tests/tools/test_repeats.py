@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, ray_grid, spiral_rays
-from pano_mvs.testing.paint import OAK
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.surfaces import Cuboid
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import OAK
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.repeating.drawings import Drawing
 from tools.benchmarks.repeating.places import REPEATS, doors, draw_capture, tiled_hall, twin_rooms

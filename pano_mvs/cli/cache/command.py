@@ -61,11 +61,7 @@ def _print_copied(copied: Copied, to: str, console: Console) -> None:
 
 
 def open_cache(cache: Path | None) -> Store:
-    """Open the cache given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
-
-    Raises:
-        UsageError: if there is none.
-    """
+    """Open the cache given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder."""
     root = cache_root(cache)
     if not is_file(root / "layout.json"):
         if is_denied(root / "layout.json"):
@@ -164,11 +160,7 @@ def size_text(size_bytes: int) -> str:
 
 
 def seconds_from_text(text: str) -> float:
-    """Return a time such as 30d, 12h or 90s in seconds.
-
-    Raises:
-        UsageError: if the text is not a time.
-    """
+    """Return a time such as 30d, 12h or 90s in seconds."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhdw])", text.strip())
     if match is None:
         raise UsageError(f"{text!r} is not a duration: write a number and s, m, h, d or w, such as 30d")

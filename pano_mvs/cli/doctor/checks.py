@@ -30,28 +30,19 @@ State: TypeAlias = Literal["ok", "note", "warning", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of one check.
+    """The result of one check."""
 
-    Attributes:
-        group: packages, libraries, machine, disk or plugins.
-        what: the subject of the check.
-        state: the verdict.
-        detail: what was found.
-        remedy: what to do; given with every warning and failure.
-    """
-
-    group: str
+    group: str  # packages, libraries, machine, disk or plugins
     what: str
     state: State
     detail: str
-    remedy: str = ""
+    remedy: str = ""  # what to do; given with every warning and failure
 
 
 KNOWN_VARIABLES = (
     *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER"),
     "PANO_MVS_WORKER",  # marks what a worker starts
 )
-_MIN_MEMORY_BYTES, _MIN_DISK_BYTES = 3_000_000_000, 5_000_000_000
 
 
 def machine_findings(environment: Mapping[str, str] = os.environ) -> Iterator[Finding]:
@@ -65,7 +56,7 @@ def machine_findings(environment: Mapping[str, str] = os.environ) -> Iterator[Fi
         if value.isdigit() and 0 < int(value) < threads:
             yield Finding("machine", name, "warning", f"limits threads to {value} of {threads}", f"unset {name}")
     free = free_memory_bytes()
-    if free and free < _MIN_MEMORY_BYTES:
+    if free and free < 3_000_000_000:
         remedy = "close other programs, or set a smaller images.max_width: a sweep of 2048 px takes up to 3 GB"
         yield Finding("machine", "memory", "warning", f"{size_text(free)} free", remedy)
     else:
@@ -120,7 +111,7 @@ def folder_finding(what: str, folder: Path, option: str) -> Finding:
         return finding("failed", detail, f"correct its permissions, or choose another folder with {option}")
     text = f"{folder}: {size_text(free)} free"
     remedy = f"free space, or choose another folder with {option}; a panorama of 2048 px takes about 60 MB in the cache"
-    return finding("ok", text) if free >= _MIN_DISK_BYTES else finding("warning", text, remedy)
+    return finding("ok", text) if free >= 5_000_000_000 else finding("warning", text, remedy)
 
 
 VersionOf: TypeAlias = Callable[[str], str | None]
@@ -161,7 +152,6 @@ def package_findings(
 
     Args:
         requirements: requirements as in a distribution's metadata; by default the program's own.
-        version_of: returns the version of a distribution.
     """
     yield Finding("packages", "Python", "ok", sys.version.split()[0])
     if requirements is None and not installed_version(_DISTRIBUTION):
@@ -233,13 +223,7 @@ _REINSTALL = "pip install --force-reinstall pano-mvs"
 def plugin_findings(
     registry: Registry, presets: Path, environment: Mapping[str, str] = os.environ
 ) -> Iterator[Finding]:
-    """Yield the state of the stages, the presets, the plugins and the folders of plugins.
-
-    Args:
-        registry: the stages and plugins that were found.
-        presets: the folder of the shipped workflows.
-        environment: the environment variables.
-    """
+    """Yield the state of the stages, the presets, the plugins and the folders of plugins."""
     if _BUILTIN in registry.stages:
         count = len(registry.plugins)
         origins = f"{count} {plural(count, 'package or file', 'packages and files')}"

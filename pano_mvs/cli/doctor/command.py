@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pano_mvs.cli.doctor.checks import Finding
 
 _COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "failed": "red"}
-_EXIT_FAILED = 2
 
 
 @guarded
@@ -40,7 +39,7 @@ def doctor(
         findings = list(all_findings(cache, out))
     show(findings, console, as_json=as_json)
     if any(finding.state == "failed" for finding in findings):
-        raise typer.Exit(_EXIT_FAILED)
+        raise typer.Exit(2)
 
 
 def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -38,6 +39,10 @@ evaluate_app = typer.Typer(
     no_args_is_help=True,
 )
 
+# Options by the panel of the help in which they are listed.
+_scale_option = partial(typer.Option, rich_help_panel="Scale and units")
+_score_option = partial(typer.Option, rich_help_panel="Scores")
+_mask_option = partial(typer.Option, rich_help_panel="Masks")
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -124,79 +129,50 @@ class DepthArguments:
         typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
     ] = None
     align: Annotated[
-        Literal["none", "median", "lsq"],
-        typer.Option("--align", help="Fit each view to its truth by one factor.", rich_help_panel="Scale and units"),
+        Literal["none", "median", "lsq"], _scale_option("--align", help="Fit each view to its truth by one factor.")
     ] = "none"
     scale: Annotated[
-        str,
-        typer.Option(
-            "--scale",
-            help="Factor to the unit of the ground truth; auto: from the camera centres.",
-            rich_help_panel="Scale and units",
-        ),
+        str, _scale_option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
     ] = "auto"
-    unit: Annotated[
-        float,
-        typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.", rich_help_panel="Scale and units"),
-    ] = 1.0
-    truth_unit: Annotated[
-        float, typer.Option("--truth-unit", help="Unit of the true ranges.", rich_help_panel="Scale and units")
-    ] = 1.0
-    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.", rich_help_panel="Scores")] = (
-        10.0
-    )
+    unit: Annotated[float, _scale_option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")] = 1.0
+    truth_unit: Annotated[float, _scale_option("--truth-unit", help="Unit of the true ranges.")] = 1.0
+    peak: Annotated[float, _score_option("--peak", help="Peak of MSE and PSNR, a range.")] = 10.0
     bad: Annotated[
         list[str] | None,
-        typer.Option(
-            "--bad",
-            help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated. Default: 5%.",
-            rich_help_panel="Scores",
+        _score_option(
+            "--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated. Default: 5%."
         ),
     ] = None
     min_confidence: Annotated[
         int,
-        typer.Option(
+        _score_option(
             "--min-confidence",
             min=0,
             max=255,
             help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
-            rich_help_panel="Scores",
         ),
     ] = 0
-    masks: Annotated[
-        Path | None,
-        typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.", rich_help_panel="Masks"),
-    ] = None
+    masks: Annotated[Path | None, _mask_option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")] = (
+        None
+    )
     mask: Annotated[
-        Path | None,
-        typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.", rich_help_panel="Masks"),
+        Path | None, _mask_option("--mask", help="Mask for all views; pixels with value 0 are ignored.")
     ] = None
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
     ] = None
     error_limit: Annotated[
-        float,
-        typer.Option("--error-limit", help="Relative error at the end of the colour scale.", rich_help_panel="Scores"),
+        float, _score_option("--error-limit", help="Relative error at the end of the colour scale.")
     ] = 0.1
     baseline: Annotated[
-        Literal["best", "median", "mean"],
-        typer.Option("--baseline", help="Constant range to compare with.", rich_help_panel="Scores"),
+        Literal["best", "median", "mean"], _score_option("--baseline", help="Constant range to compare with.")
     ] = "best"
     poses: Annotated[
-        Path | None,
-        typer.Option(
-            "--poses",
-            help="Estimated poses, for the scale; default: of the output folder.",
-            rich_help_panel="Scale and units",
-        ),
+        Path | None, _scale_option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
     ] = None
     true_poses: Annotated[
         Path | None,
-        typer.Option(
-            "--true-poses",
-            help="True poses, for the scale; default: those of the ground truth.",
-            rich_help_panel="Scale and units",
-        ),
+        _scale_option("--true-poses", help="True poses, for the scale; default: those of the ground truth."),
     ] = None
     csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None
     as_json: JsonOption = False

@@ -23,18 +23,12 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 @dataclass(frozen=True, slots=True)
 class PluginKind:
-    """A kind of plugin.
+    """A kind of plugin."""
 
-    Attributes:
-        prefix: of the stage's name; empty for a part of the sweep.
-        what: its purpose.
-        use: how a workflow uses it, with `{name}` for its name.
-        contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
-    """
-
-    prefix: str
+    prefix: str  # of the stage's name; empty for a part of the sweep
     what: str
-    use: str
+    use: str  # how a workflow uses it, with `{name}` for its name
+    # the function of `pano_mvs.testing.conformance` that returns its contract tests
     contract_tests: str = "stage_contract_tests"
 
 
@@ -66,11 +60,7 @@ KINDS = {
 
 
 def rendered(kind: str, name: str) -> tuple[str, str]:
-    """Return the text of a new plugin and that of its test.
-
-    Raises:
-        UsageError: if there is no such kind, or the name cannot be that of a Python file.
-    """
+    """Return the text of a new plugin and that of its test."""
     if kind not in KINDS:
         raise UsageError(f"unknown kind of plugin {kind!r}; known kinds: {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
@@ -100,12 +90,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
 
 
 def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> None:
-    """Write a new plugin and its test into a folder, and print how to use it.
-
-    Raises:
-        UsageError: if a file with that name exists or cannot be written, or as for `rendered`.
-        StoreError: if the disk is full.
-    """
+    """Write a new plugin and its test into a folder, and print how to use it."""
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:

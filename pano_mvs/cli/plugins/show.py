@@ -23,7 +23,6 @@ def show_plugins(console: Console, *, workflow: str | None = None, files: Sequen
     """List all plugins, broken ones included, then all stages, then the parts that plugins add.
 
     Args:
-        console: where to.
         workflow: a workflow whose plugin files are listed too.
         files: more plugin files.
     """
@@ -52,12 +51,8 @@ def show_stage(name: str, console: Console, *, workflow: str | None = None, file
     """Show a stage's documentation, typed ports and settings.
 
     Args:
-        console: where to.
         workflow: a workflow whose plugin files may define it.
         files: more plugin files that may define it.
-
-    Raises:
-        UsageError: if there is no such stage; with the traceback, if its plugin is broken.
     """
     registry, mistakes = _registry(workflow, files)
     spec = registry.stages.get(name)

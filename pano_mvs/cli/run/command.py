@@ -28,8 +28,6 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
     """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code.
 
     Args:
-        execution: how units are computed.
-        as_json: print events instead.
         advise: whether to print the commands that can follow.
     """
     if as_json:
@@ -65,13 +63,7 @@ def run_with_events(run: Callable[[Progress], RunOutput], watch: Progress = igno
 
 
 def run_shown(session: Session, execution: Execution, console: Console, *, advise: bool) -> RunSummary:
-    """Run a workflow, print progress and a summary, and return it.
-
-    Args:
-        execution: how units are computed.
-        console: where to print.
-        advise: whether to print the commands that can follow.
-    """
+    """Run a workflow, print progress and a summary, and return it."""
     with ProgressDisplay(console) as bars:
         output = run_session(session, execution, bars)
     print_summary(output, console, following=next_commands(output, session) if advise else ())

@@ -37,10 +37,6 @@ def notified(urls: Sequence[str], out: Path) -> Iterator[None]:
 
     Args:
         urls: where to, as apprise writes it; nothing is sent if there are none.
-        out: the output folder of the run.
-
-    Raises:
-        UsageError: before the run, if apprise is not installed or a URL is not valid.
     """
     if not urls:
         yield

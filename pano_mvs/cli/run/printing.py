@@ -27,7 +27,6 @@ def print_summary(output: RunOutput, console: Console, *, following: Sequence[st
     """Print the summary of a run: counts, failures, scores, the verdict and its reasons, and what to type next.
 
     Args:
-        console: where to print.
         following: the commands to type next; see `next_commands`.
     """
     summary = output.summary

@@ -24,12 +24,7 @@ from pano_mvs.engine.running.events import StageFinished, UnitFailed, Warned
 from pano_mvs.session.progress import Event, Forecast, KernelsCompiled, RunStarted, TimeLeft
 from pano_mvs.session.time_estimator import Countdown, StageProgress, TimeEstimator
 
-_COMPILING_S = 20.0
-"""Kernels are shown to be compiled for this long after one was: some take so long."""
-
-_SHOWN_LINES = 5
 _SHOWN_STAGES = 6
-_SHOWN_UNITS = 2
 _BAR_WIDTH = 20
 _NAME_WIDTH = 14
 
@@ -87,7 +82,10 @@ class ProgressDisplay:
             case KernelsCompiled(kernels=kernels):
                 self._kernels, self._kernels_at = kernels, self._clock()
             case UnitFailed():
-                self._print_failure(event)
+                label = f"{event.stage}:{event.item}" if event.item else event.stage
+                self.console.say(f"[red]failed[/] {escape(label)}")
+                for line in event.said[-5:]:
+                    self.console.say(f"  | {escape(line)}")
             case StageFinished():
                 self._print_stage(event)
             case Warned(text=text):
@@ -141,7 +139,8 @@ class ProgressDisplay:
 
     def _compiling(self) -> str:
         """Return how many kernels have been compiled, while they are; else nothing."""
-        is_current = self._clock() - self._kernels_at < _COMPILING_S
+        # Kernels are shown to be compiled for this long after one was: some take so long.
+        is_current = self._clock() - self._kernels_at < 20.0
         return f"compiling kernels (once): {self._kernels} so far" if is_current else ""
 
     def _left_text(self, left: TimeLeft, shown: str, seconds: float) -> str:
@@ -154,15 +153,7 @@ class ProgressDisplay:
             return f"time left not known yet: no earlier run has computed {unknown}"
         return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
 
-    def _print_failure(self, failure: UnitFailed) -> None:
-        """Print a failure and the last lines of the unit's output."""
-        label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
-        self.console.say(f"[red]failed[/] {escape(label)}")
-        for line in failure.said[-_SHOWN_LINES:]:
-            self.console.say(f"  | {escape(line)}")
-
     def _print_stage(self, summary: StageFinished) -> None:
-        """Print what a stage did."""
         parts = [f"{summary.run} run", f"{summary.cached} cached"]
         parts += [
             f"{count} {what}" for what, count in (("failed", summary.failed), ("blocked", summary.blocked)) if count
@@ -178,8 +169,7 @@ def _count(stage: StageProgress) -> str:
 def _units(stage: StageProgress) -> Text:
     """Return the units that are being computed; nothing for a stage with a single unit."""
     names = [one_line(item) for item in stage.running if item]
-    more = f" and {len(names) - _SHOWN_UNITS} more" if len(names) > _SHOWN_UNITS else ""
-    return Text(", ".join(names[:_SHOWN_UNITS]) + more, overflow="ellipsis", no_wrap=True)
+    return Text(shortened_list(names, 2, rest=" and {more} more"), overflow="ellipsis", no_wrap=True)
 
 
 class _Repeated:

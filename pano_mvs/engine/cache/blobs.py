@@ -42,19 +42,12 @@ class DamagedBlobError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class BlobRef:
-    """One stored part of a record.
+    """One stored part of a record."""
 
-    Attributes:
-        digest: of the bytes.
-        size_bytes: length.
-        suffix: `.npy`, `.json`, or that of the stored file.
-        external: whether the bytes are in a file of the user rather than in the cache.
-    """
-
-    digest: str
+    digest: str  # of the bytes
     size_bytes: int
-    suffix: str
-    external: bool = False
+    suffix: str  # `.npy`, `.json`, or that of the stored file
+    external: bool = False  # whether the bytes are in a file of the user rather than in the cache
 
     def to_json(self) -> list[Any]:
         """Return the reference as a JSON value."""
@@ -420,7 +413,6 @@ class PackedRefs(Mapping[str, BlobRef]):
         return self._packed
 
     def __getitem__(self, name: str) -> BlobRef:
-        """Return one reference."""
         idx, suffix, external = self._form[name]
         start = idx * _PART_BYTES
         middle, end = start + DIGEST_BYTES, start + _PART_BYTES
@@ -428,13 +420,10 @@ class PackedRefs(Mapping[str, BlobRef]):
         return BlobRef(self._packed[start:middle].hex(), size_bytes, suffix, external)
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._form)
 
     def __len__(self) -> int:
-        """Return the number of parts."""
         return len(self._form)
 
     def __repr__(self) -> str:
-        """Return the references as a dict prints them."""
         return repr(dict(self))

@@ -18,29 +18,18 @@ from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import read_regular, replacing
 from pano_mvs.core.paths import children, is_file, resolved
 
-Keys: TypeAlias = "dict[str, dict[str, str]]"
-"""Stage to unit to cache key."""
-
+Keys: TypeAlias = "dict[str, dict[str, str]]"  # stage to unit to cache key
 _PIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run or a pin.
+    """A run or a pin."""
 
-    Attributes:
-        name: the id of the run, or the name of the pin.
-        workflow: name of the workflow.
-        out: folder of the results.
-        when: end of the run, ISO 8601, UTC.
-        keys: cache keys of its units.
-        pinned: whether it is a pin.
-    """
-
-    name: str
+    name: str  # the id of the run, or the name of the pin
     workflow: str
     out: str
-    when: str
+    when: str  # end of the run, ISO 8601, UTC
     keys: Keys
     pinned: bool = False
 

@@ -35,56 +35,35 @@ _MIN_PACKED_FILES = 256  # fewer files stay as they are, as other programs can r
 
 @dataclass(frozen=True, slots=True)
 class StageUsage:
-    """The results of one stage in a cache.
+    """The results of one stage in a cache."""
 
-    Attributes:
-        stage: name of the stage in the registry.
-        units: number of finished units.
-        size_bytes: size of their blobs; a blob that several units share counts once.
-        seconds: their computing time.
-    """
-
-    stage: str
+    stage: str  # name of the stage in the registry
     units: int
-    size_bytes: int
+    size_bytes: int  # size of their blobs; a blob that several units share counts once
     seconds: float
 
 
 @dataclass(slots=True)
 class Verification:
-    """What a verification found.
-
-    Attributes:
-        records: number of intact records.
-        blobs: number of intact blobs.
-        removed: damaged files, which were removed; the next run computes them again.
-        incomplete: records with missing blobs, which runs ignore.
-        foreign: files that do not belong to the cache.
-        temporary: temporary files, each with the process that it belongs to, and unfinished packs.
-    """
+    """What a verification found."""
 
     records: int = 0
     blobs: int = 0
+    # damaged files, which were removed; the next run computes them again
     removed: list[str] = field(default_factory=list)
-    incomplete: list[str] = field(default_factory=list)
+    incomplete: list[str] = field(default_factory=list)  # records with missing blobs, which runs ignore
     foreign: list[str] = field(default_factory=list)
+    # temporary files, each with the process that it belongs to, and unfinished packs
     temporary: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class GarbageCollection:
-    """What a garbage collection deletes, or would delete.
+    """What a garbage collection deletes, or would delete."""
 
-    Attributes:
-        runs: remembered runs that are too old.
-        blobs: blobs, and packs that were not finished.
-        size_bytes: size of both.
-        kept_bytes: size of the blobs that are kept.
-    """
-
-    runs: list[RunEntry] = field(default_factory=list)
+    runs: list[RunEntry] = field(default_factory=list)  # remembered runs that are too old
     records: list[Path | Packed] = field(default_factory=list)
-    blobs: list[Path | Packed] = field(default_factory=list)
+    blobs: list[Path | Packed] = field(default_factory=list)  # blobs, and packs that were not finished
     size_bytes: int = 0
     kept_bytes: int = 0
 
@@ -252,11 +231,9 @@ def collect(
     """Find, and optionally delete, what no remembered run and no pin names.
 
     Args:
-        store: the cache.
         unused_s: keep what was computed within this time; files with times in the future count by their distance from
             now, as those of a clock that is wrong.
         forget_after_s: forget runs that ended longer ago than this; None forgets none. Pins are kept.
-        delete: delete what was found.
 
     Raises:
         StoreError: if a remembered run is damaged, so that it is not known what it protects, or if a file cannot be
@@ -364,7 +341,6 @@ def _of_packs(store: Store) -> Iterator[tuple[_Value, str]]:
 
 
 def _intact_records(store: Store) -> Iterator[tuple[_Value, UnitRecord]]:
-    """Yield every intact record."""
     for value in _records(store):
         record = record_from_bytes(_read(value.place) or b"")
         if record is not None and record.key == value.digest:

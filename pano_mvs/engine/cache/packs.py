@@ -26,36 +26,23 @@ from pano_mvs.core.paths import children, is_file, is_link
 
 RECORD, ARRAY, JSON = "record", ".npy", ".json"
 _KINDS = (RECORD, ARRAY, JSON)
-_ALIGNMENT = 64  # of arrays in memory, and so of .npy headers
 _MAX_PACK_BYTES = 1 << 30  # collection rewrites a pack as a whole, and needs this much free space
-_CHUNK_BYTES = 1 << 20
 _ENTRY = np.dtype(
     [("high", ">u8"), ("low", ">u8"), ("offset", "<u8"), ("size", "<u8"), ("time", "<f8"), ("kind", "u1")]
 )
-_NO_ENTRIES = np.zeros(0, _ENTRY)
-"""Of an index that cannot be read."""
-
+_NO_ENTRIES = np.zeros(0, _ENTRY)  # of an index that cannot be read
 _TABLE = np.dtype([("high", "u8"), ("low", "u8"), ("offset", "u8"), ("size", "u8"), ("pack", "u4"), ("kind", "u1")])
 
 
 class Packed(NamedTuple):  # created for each value that is looked up, four times as fast as a frozen dataclass
-    """One value in a pack.
-
-    Attributes:
-        pack: the file.
-        offset: of its first byte.
-        size_bytes: its length.
-        digest: of a blob, or the key of a record.
-        kind: `RECORD`, `ARRAY` or `JSON`.
-        time_s: when it was stored, in seconds since the epoch; 0 where this was not asked for.
-    """
+    """One value in a pack."""
 
     pack: Path
     offset: int
     size_bytes: int
-    digest: str
-    kind: str
-    time_s: float = 0.0
+    digest: str  # of a blob, or the key of a record
+    kind: str  # `RECORD`, `ARRAY` or `JSON`
+    time_s: float = 0.0  # when it was stored, in seconds since the epoch; 0 where this was not asked for
 
     @property
     def name(self) -> str:
@@ -160,7 +147,7 @@ class Packs:
             with replacing(pack, temporary_in=self._temporary, durable=True) as temporary, temporary.open("wb") as out:
                 while following is not None and (not entries or out.tell() < _MAX_PACK_BYTES):
                     value, path = following
-                    out.write(bytes(-out.tell() % _ALIGNMENT))
+                    out.write(bytes(-out.tell() % 64))  # the alignment of arrays in memory, and so of .npy headers
                     offset = out.tell()
                     if _copied(value, path, out):
                         used_s = max(value.time_s, _mtime(value.pack) if path is None else 0.0)
@@ -294,7 +281,7 @@ def _copied(value: Packed, path: Path | None, out: IO[bytes]) -> bool:
 def _copy(stream: IO[bytes], value: Packed, write: Callable[[bytes], object]) -> int:
     stream.seek(value.offset)
     left = value.size_bytes
-    while left and (chunk := stream.read(min(left, _CHUNK_BYTES))):
+    while left and (chunk := stream.read(min(left, 1 << 20))):
         write(chunk)
         left -= len(chunk)
     return value.size_bytes - left

@@ -27,9 +27,7 @@ from pano_mvs.engine.cache.blobs import SUFFIX
 from pano_mvs.engine.cache.packs import RECORD, values_of
 from pano_mvs.engine.cache.store import Store, record_from_bytes
 
-Progress = Callable[[int, int], None]
-"""Called with the bytes that are copied so far, and all bytes to copy."""
-
+Progress = Callable[[int, int], None]  # called with the bytes that are copied so far, and all bytes to copy
 _AT_A_TIME = 8
 _RUN_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 _ORDER = (
@@ -46,17 +44,11 @@ _MUTABLE = ("packs/*.index", "runs/*.json", "pins/*.json")
 
 @dataclass(frozen=True, slots=True)
 class Copied:
-    """What was copied.
-
-    Attributes:
-        files: number of files that were copied.
-        size_bytes: their size.
-        present: number of files that were there already.
-    """
+    """What was copied."""
 
     files: int
     size_bytes: int
-    present: int
+    present: int  # number of files that were there already
 
 
 class RemoteCache:

@@ -20,8 +20,7 @@ _MAX_ENTRIES = 500_000
 Entry: TypeAlias = "list[int | str]"
 """Size, modification time (mtime) and change time (ctime) in ns, inode, digest."""
 
-State: TypeAlias = "tuple[int, int, int, int]"
-"""An entry without the digest."""
+State: TypeAlias = "tuple[int, int, int, int]"  # an entry without the digest
 
 
 class StatCache:

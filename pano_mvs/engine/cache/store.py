@@ -165,7 +165,6 @@ class ItemRef:
         return PackedRefs.from_packed(self._form, self._packed[DIGEST_BYTES:])
 
     def __eq__(self, other: object) -> bool:
-        """Return whether two references are the same in every part."""
         if not isinstance(other, ItemRef):
             return NotImplemented
         if (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form):
@@ -176,7 +175,6 @@ class ItemRef:
     __hash__ = None  # type: ignore[assignment]  # as that of the mapping of its parts
 
     def __repr__(self) -> str:
-        """Return the reference as a dataclass prints it."""
         return f"ItemRef(kind={self.kind!r}, digest={self.digest!r}, parts={self.parts!r})"
 
     def to_json(self) -> dict[str, Any]:
@@ -192,27 +190,17 @@ class ItemRef:
 
 @dataclass(frozen=True, slots=True)
 class UnitRecord:
-    """The result of one finished unit of work.
-
-    Attributes:
-        key: its cache key.
-        identity: what the key was made of, for the reasons in plans.
-        output: the value.
-        items: the items of a collection, by image.
-        metrics: figures of the unit.
-        notes: what a user should know.
-        rejected: image name to the reason why the result leaves it out.
-        doubts: image name to the reason why the result is doubtful there.
-        seconds: computing time.
-    """
+    """The result of one finished unit of work."""
 
     key: str
-    identity: Mapping[str, Any]
+    identity: Mapping[str, Any]  # what the key was made of, for the reasons in plans
     output: ItemRef
-    items: Mapping[str, ItemRef] = field(default_factory=dict)
+    items: Mapping[str, ItemRef] = field(default_factory=dict)  # the items of a collection, by image
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    # image name to the reason why the result leaves it out
     rejected: Mapping[str, str] = field(default_factory=dict)
+    # image name to the reason why the result is doubtful there
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
@@ -278,7 +266,6 @@ class Store:
         """Open or create a store.
 
         Args:
-            root: its folder.
             durable: flush every blob and record to the disk at once, so that they survive a power cut.
             min_free_bytes: no unit is started with less free space on the disk; 0 to disable this.
             for_reading: also accept a folder that cannot be written or created.
@@ -294,7 +281,7 @@ class Store:
         self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
         self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
-        self._clear_abandoned()
+        clear_abandoned(self.root / "tmp", "*")
         self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.unit_times = UnitTimes(root / FILE_NAME)
@@ -464,10 +451,6 @@ class Store:
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
-
-    def _clear_abandoned(self) -> None:
-        """Remove temporary files of runs that were killed."""
-        clear_abandoned(self.root / "tmp", "*")
 
     def _create(self, path: Path) -> None:
         try:

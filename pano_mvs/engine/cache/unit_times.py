@@ -20,54 +20,34 @@ from pano_mvs.scene.image_header import image_kind, stated_size_of_file
 
 FILE_NAME = "unit-times.json"
 _MAX_SAMPLES = 8
-_MAX_STAGES = 1000
-_COMPARED_SAMPLES = 3
-_MEASURED_ITEMS = 9
-_FIRST_BYTES = 64
-_LARGEST = 1e15
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureSize:
-    """The size of a capture, by which times are scaled.
-
-    Attributes:
-        images: number of images.
-        pixels: of one image in the median; the bytes of its file if it is not an image file.
-    """
+    """The size of a capture, by which times are scaled."""
 
     images: int
-    pixels: float
+    pixels: float  # of one image in the median; the bytes of its file if it is not an image file
 
     @staticmethod
     def of_files(images: Sequence[Collection[Path]]) -> CaptureSize:
         """Measure the images of a source, given the files of each; of many, only some are opened."""
-        step = max(1, -(-len(images) // _MEASURED_ITEMS))
+        step = max(1, -(-len(images) // 9))
         sizes = [max(map(_file_size, files)) for files in images[::step] if files]
         return CaptureSize(len(images), max(1.0, median(sizes)) if sizes else 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The units of one stage that one run computed.
+    """The units of one stage that one run computed."""
 
-    Attributes:
-        settings: digest of the settings of the stage.
-        threads: that each unit could use.
-        images: number of images of the capture.
-        pixels: of one image; see `CaptureSize`.
-        units: number of units of the stage.
-        seconds: that a unit took in the mean.
-        stored_bytes: that a unit stored in the mean.
-    """
-
-    settings: str
-    threads: int
+    settings: str  # digest of the settings of the stage
+    threads: int  # that each unit could use
     images: int
     pixels: float
     units: int
-    seconds: float
-    stored_bytes: float
+    seconds: float  # that a unit took in the mean
+    stored_bytes: float  # that a unit stored in the mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +82,7 @@ class UnitTimes:
         samples = _read(self._path)
         for stage, sample in self._new:
             samples[stage] = [*samples.pop(stage, []), sample][-_MAX_SAMPLES:]
-        value = {stage: [astuple(sample) for sample in found] for stage, found in list(samples.items())[-_MAX_STAGES:]}
+        value = {stage: [astuple(sample) for sample in found] for stage, found in list(samples.items())[-1000:]}
         body = json.dumps(value, allow_nan=False)
         text = f"{digest_from_bytes(body.encode())}\n{body}"
         write_text(self._path, text, temporary_in=self._path.parent / "tmp")
@@ -118,9 +98,6 @@ class UnitTimes:
 
         Args:
             stage: name of the stage in the registry.
-            size: of the capture.
-            settings: digest of the settings.
-            threads: that a unit may use.
             whole: whether the unit reads the whole capture, so that the number of images counts too.
         """
         similar = self._similar(stage, size, settings=settings, threads=threads)
@@ -153,13 +130,13 @@ class UnitTimes:
 
         latest_first = self._samples.get(stage, [])[::-1]
         found = sorted(latest_first, key=lambda sample: (kind(sample), _distance(sample, size)))
-        return [sample for sample in found if kind(sample) == kind(found[0])][:_COMPARED_SAMPLES]
+        return [sample for sample in found if kind(sample) == kind(found[0])][:3]
 
 
 def _file_size(path: Path) -> float:
     try:
         with path.open("rb") as stream:
-            is_image = image_kind(stream.read(_FIRST_BYTES)) is not None
+            is_image = image_kind(stream.read(64)) is not None
     except OSError:
         return 1.0
     stated = stated_size_of_file(path) if is_image else None
@@ -195,6 +172,6 @@ def _sample(entry: list[object]) -> Sample:
     counts, sizes = (sample.threads, sample.images, sample.units), (sample.seconds, sample.stored_bytes, sample.pixels)
     if not isinstance(sample.settings, str) or not all(type(count) is int for count in counts):
         raise TypeError("not a sample")
-    if not all(0 <= number < _LARGEST for number in (*counts, *sizes)) or not sample.pixels >= 1:
+    if not all(0 <= number < 1e15 for number in (*counts, *sizes)) or not sample.pixels >= 1:
         raise ValueError("a number is not possible")
     return sample

@@ -39,14 +39,10 @@ def code_texts(path: Path) -> tuple[str, dict[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class _Roots:
-    """The folders in which absolute imports are looked up.
+    """The folders in which absolute imports are looked up."""
 
-    Attributes:
-        folder: folder of the file, which is on the path while a plugin file is imported.
-        package: the outermost package that contains the file, if any; other packages beside it are ignored.
-    """
-
-    folder: Path
+    folder: Path  # folder of the file, which is on the path while a plugin file is imported
+    # the outermost package that contains the file, if any; other packages beside it are ignored
     package: Path | None
 
     @staticmethod

@@ -22,9 +22,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import is_file
 
 _IMPORT, _WHOLE = "<import>", "<all>"
-_AT_RUN_TIME = "/"
-"""Prefix of the paths that `import_module` and its like import."""
-
+_AT_RUN_TIME = "/"  # prefix of the paths that `import_module` and its like import
 _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _STAGE_DECORATORS = frozenset(
     f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")
@@ -37,61 +35,40 @@ _PURE_DECORATORS = frozenset({"kernel", "inlined", "params_from", "checks_settin
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """The code that a function reaches.
-
-    Attributes:
-        digest: of all definitions.
-        definitions: `module:name` of each definition, to its digest.
-        libraries: top-level names of other packages that these use, except the standard library.
-    """
+    """The code that a function reaches."""
 
     digest: str
-    definitions: dict[str, str]
-    libraries: frozenset[str]
+    definitions: dict[str, str]  # `module:name` of each definition, to its digest
+    libraries: frozenset[str]  # top-level names of other packages that these use, except the standard library
 
 
 @dataclass(slots=True)
 class _Definition:
-    """A top-level name, or all that a module executes on import: its statements, and the names that these use.
+    """A top-level name, or all that a module executes on import: its statements, and the names that these use."""
 
-    Attributes:
-        text: the statements, without what cannot affect results.
-        uses: dotted names.
-        annotations: dotted names in the annotations of functions.
-        bindings: names that imports inside of it bind, each to everything that it stands for; see `_Module.bindings`.
-        loads: dotted paths that it imports when it runs.
-    """
-
-    text: str = ""
-    uses: set[str] = field(default_factory=set)
-    annotations: set[str] = field(default_factory=set)
+    text: str = ""  # the statements, without what cannot affect results
+    uses: set[str] = field(default_factory=set)  # dotted names
+    annotations: set[str] = field(default_factory=set)  # dotted names in the annotations of functions
+    # names that imports inside of it bind, each to everything that it stands for; see `_Module.bindings`
     bindings: dict[str, set[tuple[str, str]]] = field(default_factory=dict)
-    loads: set[str] = field(default_factory=set)
+    loads: set[str] = field(default_factory=set)  # dotted paths that it imports when it runs
 
 
 @dataclass(slots=True)
 class _Module:
-    """What a module holds.
+    """What a module holds."""
 
-    Attributes:
-        package: from which relative imports start.
-        statements: those that define each name; `_IMPORT` has what is executed on import beside definitions.
-        effect_names: names that these define.
-        bindings: imported name to (module, name in it); the name is empty for a module.
-        loads: dotted paths that importing it imports.
-        stars: modules from which all names are imported.
-    """
-
-    package: str
+    package: str  # from which relative imports start
+    # those that define each name; `_IMPORT` has what is executed on import beside definitions
     statements: dict[str, list[ast.stmt]] = field(default_factory=dict)
-    effect_names: set[str] = field(default_factory=set)
+    effect_names: set[str] = field(default_factory=set)  # names that these define
+    # imported name to (module, name in it); the name is empty for a module
     bindings: dict[str, tuple[str, str]] = field(default_factory=dict)
-    loads: list[str] = field(default_factory=list)
-    stars: list[str] = field(default_factory=list)
+    loads: list[str] = field(default_factory=list)  # dotted paths that importing it imports
+    stars: list[str] = field(default_factory=list)  # modules from which all names are imported
     _definitions: dict[int, _Definition] = field(default_factory=dict)
 
     def definition(self, name: str) -> _Definition:
-        """Return what a name stands for."""
         whole = _Definition()
         for statement in self.statements.get(name, ()):
             if id(statement) not in self._definitions:
@@ -275,8 +252,6 @@ def _analysed(text: str | bytes, package: str, followed: frozenset[str]) -> _Mod
     """Return what a module holds.
 
     Args:
-        text: the source.
-        package: from which relative imports start.
         followed: the packages that are followed, whose decorators may register something.
 
     Raises:

@@ -14,7 +14,6 @@ from pathlib import Path
 from pano_mvs.core.files import make_folder
 
 _STDOUT, _STDERR = 1, 2
-_TAIL_BYTES = 8192
 
 
 @contextmanager
@@ -54,7 +53,7 @@ def tail(log: Path, lines: int) -> tuple[str, ...]:
     """Return the last lines of a log; none if there is no log."""
     try:
         with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+            file.seek(max(0, log.stat().st_size - 8192))
             text = file.read().decode("utf-8", errors="replace")
     except OSError:
         return ()

@@ -68,7 +68,6 @@ def make_executor(
     """Return an executor; the caller closes it.
 
     Args:
-        store: the cache.
         name: of the executor; by default dask if a scheduler is given, else $PANO_MVS_EXECUTOR (unless a number of
             workers is given), else processes.
         workers: number of units at a time; 0 for as many as cores and memory (3 GB each) allow.

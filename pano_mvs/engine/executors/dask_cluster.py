@@ -36,9 +36,7 @@ from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.executors.unit_json import request_to_json
 
-_LARGE_BYTES = 200_000
 _CONNECT_S = 20.0
-_LISTEN_S = 0.5
 
 
 class DaskExecutor:
@@ -52,9 +50,7 @@ class DaskExecutor:
 
         Args:
             store: the cache; for an existing cluster, in a folder with the same path on all hosts.
-            workers: number of workers, for a new cluster on this host.
             threads: threads of each worker; 0 for an equal share of the cores of its host.
-            scheduler: address of an existing scheduler.
 
         Raises:
             UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
@@ -62,7 +58,13 @@ class DaskExecutor:
         """
         distributed = import_extra("distributed", "--executor dask", "dask")
         if scheduler:
-            _check_address(scheduler)
+            parts = urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}")
+            try:
+                is_complete = bool(parts.hostname and parts.port) or parts.scheme in {"inproc", "ucx"}
+            except ValueError:
+                is_complete = False
+            if not is_complete:
+                raise UsageError(f"--scheduler {scheduler}: must be an address such as tcp://host:8786")
             self._connect(store, scheduler)
         else:
             # Threads suffice for dask workers, because each starts one of our worker processes. They cannot be lost,
@@ -117,7 +119,7 @@ class DaskExecutor:
         request["cores"] = self.cores
         request["plugin_texts"] = {str(path.absolute()): self._texts(path) for path in job.plugins}
         text = json.dumps(request)
-        if len(text) > _LARGE_BYTES:
+        if len(text) > 200_000:
             path = job.log.with_suffix(".json").absolute()
             try:
                 path.write_text(text, encoding="utf-8")
@@ -140,7 +142,7 @@ class DaskExecutor:
         """Return the number and the outcome of a job that has ended; see `Executor`."""
         while self._out:
             try:
-                number, attempt, future = self._ended.get(timeout=_LISTEN_S if timeout_s is None else timeout_s or 0.0)
+                number, attempt, future = self._ended.get(timeout=0.5 if timeout_s is None else timeout_s or 0.0)
             except queue.Empty:
                 if timeout_s is None:
                     continue
@@ -223,16 +225,6 @@ def _outcome(future: Any) -> JobOutcome:
     return JobOutcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
 
 
-def _check_address(scheduler: str) -> None:
-    parts = urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}")
-    try:
-        is_complete = bool(parts.hostname and parts.port) or parts.scheme in {"inproc", "ucx"}
-    except ValueError:
-        is_complete = False
-    if not is_complete:
-        raise UsageError(f"--scheduler {scheduler}: must be an address such as tcp://host:8786")
-
-
 def with_waiting(places: int) -> int:
     """Return the number of units to submit for a number of places, so that none stays empty between two units."""
     return places + (places + 1) // 2
@@ -270,7 +262,6 @@ def introduce(store: str, token: str) -> dict[str, Any]:
     """Return what is checked about a worker before it gets units.
 
     Args:
-        store: folder of the cache.
         token: name of a file among the temporary files of the cache; an answer is written beside it.
     """
     path = Path(store) / "tmp" / token
@@ -314,20 +305,19 @@ def objection(answer: Mapping[str, Any], expected: tuple[str, str, Mapping[str, 
 
 def versions() -> dict[str, str]:
     """Return the versions of everything that affects results."""
-    found = {"python": ".".join(platform.python_version_tuple()[:2]), "pano_mvs": _own_version()}
+    package = Path(pano_mvs.__file__).parent
+    sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in below(package, "*.py")}
+    # Two checkouts of a version may differ.
+    found = {
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "pano_mvs": f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}",
+    }
     for name in _LIBRARIES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
-
-
-def _own_version() -> str:
-    """Return the version of pano_mvs with a digest of the code, as two checkouts of a version may differ."""
-    package = Path(pano_mvs.__file__).parent
-    sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in below(package, "*.py")}
-    return f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}"
 
 
 def _new_worker(threads: int) -> WorkerProcess:

@@ -45,10 +45,6 @@ from pano_mvs.scene import Axis
 from pano_mvs.scene.record import changed_text, vanished_text
 from pano_mvs.scene.two_view import pair_from_name
 
-# A process may open only about a thousand files, and a stage may read several kinds.
-_MAX_OPEN_FILES = 128
-_MAX_BYTES = 128_000_000
-
 
 class ChangedStateError(PluginError):
     """A plugin, in a thread that it left behind, changed what a unit of another stage computes."""
@@ -70,7 +66,12 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         context = Context(np.random.default_rng(_seed(unit)), scratch, threads)
         arguments = arguments_of(unit, store)
         value = _called(unit, arguments, context)
-        _check_kind(value, unit)
+        spec = unit.entry.spec
+        if not isinstance(value, spec.output):
+            raise ContractError(
+                f"stage {spec.name} ({spec.origin}) returned {type(value).__name__} for {unit.label}, "
+                f"it declares {spec.output.kind_name()}"
+            )
         if reasons := [*changed_items(unit, store).values(), *changed_settings(unit, store)]:
             raise ChangedFileError(reasons[0])
         try:
@@ -103,7 +104,10 @@ def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
     """
     process, before, changes = os.getpid(), ProcessState.now() if has_plugins() else None, Changes()
     try:
-        value = unit.entry.spec.function(**arguments, **_extras(unit, context))
+        offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
+        value = unit.entry.spec.function(
+            **arguments, **{name: offered[role] for name, role in unit.entry.spec.extras.items()}
+        )
     finally:
         if os.getpid() != process:  # the stage forked, and this is the child, which must not store or answer
             os._exit(0)
@@ -146,27 +150,13 @@ def max_kept_items(refs: Iterable[ItemRef]) -> int:
     for ref in refs:
         opened = max(opened, sum(part.is_mapped for part in ref.parts.values()))
         read = max(read, sum(part.size_bytes for part in ref.parts.values() if not part.is_mapped))
-    by_memory = max(1, _MAX_BYTES // read)
-    return min(by_memory, max(1, _MAX_OPEN_FILES // opened)) if opened else by_memory
+    by_memory = max(1, 128_000_000 // read)
+    # A process may open only about a thousand files, and a stage may read several kinds.
+    return min(by_memory, max(1, 128 // opened)) if opened else by_memory
 
 
 def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:
     return pair_from_name(name) if port.kind.axis is Axis.PAIR else name
-
-
-def _extras(unit: Unit, context: Context) -> dict[str, Any]:
-    """Return params, context and source item under the names by which the function takes them."""
-    offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
-    return {name: offered[role] for name, role in unit.entry.spec.extras.items()}
-
-
-def _check_kind(value: object, unit: Unit) -> None:
-    spec = unit.entry.spec
-    if not isinstance(value, spec.output):
-        raise ContractError(
-            f"stage {spec.name} ({spec.origin}) returned {type(value).__name__} for {unit.label}, "
-            f"it declares {spec.output.kind_name()}"
-        )
 
 
 Key = TypeVar("Key")
@@ -182,11 +172,9 @@ class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
     Args:
         refs: key to the reference that `load` takes, in the order of iteration.
         load: reads one value; its exceptions are raised by the access.
-        max_kept: number of values to keep.
     """
 
     def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value], *, max_kept: int = 64) -> None:
-        """Create the mapping; nothing is loaded yet."""
         self._max_kept = max_kept
         self._refs = refs
         self._load = load
@@ -207,11 +195,9 @@ class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
         return key in self._refs
 
     def __iter__(self) -> Iterator[Key]:
-        """Iterate over the keys."""
         return iter(self._refs)
 
     def __len__(self) -> int:
-        """Return the number of items."""
         return len(self._refs)
 
 
@@ -248,9 +234,6 @@ def _reason(path: Path, digest: str, store: Store) -> str:
         return vanished_text(path)
 
 
-_MAX_TRACE_CHARACTERS = 20_000
-
-
 def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
     """Return what went wrong, and the traceback if the code failed.
 
@@ -266,7 +249,7 @@ def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
         notes += " (a plugin imports the files beside it at its top, not inside functions)"
     frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
     cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
-    return cause, shortened("".join(traceback.format_exception(error)), _MAX_TRACE_CHARACTERS)
+    return cause, shortened("".join(traceback.format_exception(error)), 20_000)
 
 
 def _text(error: BaseException) -> str:

@@ -30,7 +30,6 @@ from pano_mvs.engine.executors.unit_json import request_to_json
 UNITS_PER_PROCESS = 500
 """A worker is replaced after this many units, so that memory leaks of libraries do not add up."""
 
-_MAX_FAILED_STARTS = 3
 _LISTEN_S = 0.5  # some systems notice interrupts only between waits
 
 
@@ -57,7 +56,15 @@ class ProcessExecutor:
         """Submit a job; another worker is started if all are busy."""
         request = request_to_json(job, self._store)
         if len(self._out) == len(self._workers):
-            self._add_worker()
+            errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
+            try:
+                make_folder(errors.parent)
+            except OSError as error:
+                raise self._store.cannot_write(error) from error
+            worker = WorkerProcess(self.cores, errors)
+            thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
+            self._workers.append((thread, worker))
+            thread.start()
         self._out.add(job.number)
         self._jobs.put((job, request))
 
@@ -110,17 +117,6 @@ class ProcessExecutor:
             thread.join()
         self._workers.clear()
 
-    def _add_worker(self) -> None:
-        errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
-        try:
-            make_folder(errors.parent)
-        except OSError as error:
-            raise self._store.cannot_write(error) from error
-        worker = WorkerProcess(self.cores, errors)
-        thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
-        self._workers.append((thread, worker))
-        thread.start()
-
     def _serve(self, worker: WorkerProcess) -> None:
         """Pass units to one worker until there are no more, and restart it after `units_per_process` units."""
         while (taken := self._jobs.get()) is not None and not self._closing:
@@ -142,7 +138,7 @@ class ProcessExecutor:
     def _judged(self, outcome: JobOutcome, *, refused: bool) -> JobOutcome:
         """Return the outcome, with status `stopped` if several workers in a row ended while starting."""
         self._failed_starts = self._failed_starts + 1 if refused else 0
-        if self._failed_starts < _MAX_FAILED_STARTS:
+        if self._failed_starts < 3:
             return outcome
         return replace(outcome, status="stopped", cause=f"workers do not start: {outcome.cause}", error="PanoMvsError")
 
@@ -150,7 +146,6 @@ class ProcessExecutor:
 _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from pano_mvs.engine.executors.worker import main; main()"
 )
-_STOP_S = 5.0
 
 
 class WorkerProcess:
@@ -296,7 +291,7 @@ def _close(process: subprocess.Popen[bytes], mark: str) -> None:
         if process.stdin is not None:
             process.stdin.close()
     with suppress(subprocess.TimeoutExpired):
-        process.wait(_STOP_S)
+        process.wait(5.0)
     _kill(process, mark)
     process.wait()
 

@@ -15,26 +15,17 @@ JobStatus = Literal["done", "failed", "damaged", "changed", "stopped"]
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A unit to be computed.
-
-    Attributes:
-        number: identifies the job in this run.
-        threads: number of threads that it may use.
-        timeout_s: time after which it is ended; 0 for no limit.
-        log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.
-        plugins: the plugin files of the workflow, with the digests of their code.
-        fresh: whether it needs a process of its own.
-        memory_bytes: memory that it needs; 0 if unknown.
-    """
+    """A unit to be computed."""
 
     number: int
     unit: Unit
     threads: int
-    timeout_s: float
-    log: Path
+    timeout_s: float  # time after which it is ended; 0 for no limit
+    log: Path  # file for everything that the unit prints; it does not exist afterwards if nothing was printed
+    # the plugin files of the workflow, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
-    fresh: bool = False
-    memory_bytes: int = 0
+    fresh: bool = False  # whether it needs a process of its own
+    memory_bytes: int = 0  # memory that it needs; 0 if unknown
 
     @property
     def inputs_file(self) -> Path:
@@ -44,30 +35,20 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class JobOutcome:
-    """What became of a job.
+    """What became of a job."""
 
-    Attributes:
-        status: `done`; `failed`: the unit has no result; `damaged`: an input turned out damaged and was removed;
-            `changed`: an input file has changed since it was listed; `stopped`: the run cannot go on (the disk is full,
-            or the stage raised RunStoppedError).
-        record: the stored result, if the status is `done`.
-        cause: what went wrong otherwise.
-        trace: the Python traceback, if the code of the stage failed.
-        error: name of the class of the error, if the run has to raise it again.
-        exit_code: exit code of an error that the user can fix, otherwise 0.
-        died: whether the worker process died, or must not compute anything else.
-        seconds: how long the job took.
-        changed: input files that have changed since they were listed, with the reasons.
-    """
-
+    # `done`; `failed`: the unit has no result; `damaged`: an input turned out damaged and was removed; `changed`: an
+    # input file has changed since it was listed; `stopped`: the run cannot go on (the disk is full, or the stage raised
+    # RunStoppedError)
     status: JobStatus
-    record: UnitRecord | None = None
+    record: UnitRecord | None = None  # the stored result, if the status is `done`
     cause: str = ""
-    trace: str = ""
-    error: str = ""
-    exit_code: int = 0
-    died: bool = False
+    trace: str = ""  # the Python traceback, if the code of the stage failed
+    error: str = ""  # name of the class of the error, if the run has to raise it again
+    exit_code: int = 0  # exit code of an error that the user can fix, otherwise 0
+    died: bool = False  # whether the worker process died, or must not compute anything else
     seconds: float = 0.0
+    # input files that have changed since they were listed, with the reasons
     changed: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -95,7 +76,6 @@ class Executor(Protocol):
     """Computes units, several at a time or one.
 
     Attributes:
-        name: as chosen on the command line.
         capacity: number of jobs that it takes at a time.
         threads: number of threads for a unit while `capacity` units run.
         cores: number of threads for a unit that runs alone.

@@ -36,8 +36,6 @@ SYSTEMS = {"slurm": "sbatch", "pbs": "qsub", "lsf": "bsub", "sge": "qsub"}
 """Queueing system to its command that submits a job."""
 
 _ACCOUNTS = {"slurm": "account", "pbs": "account", "lsf": "project", "sge": "project"}
-_IDLE_CHECKS = 60  # one a second
-_PATIENCE_S = 60.0
 _RETRY_S = 60.0
 _WALLTIME = re.compile(r"\d+([-:]\d+)*")
 
@@ -189,7 +187,8 @@ def patient(base: Any) -> Any:
         try:
             await base.start(self)
         except (RuntimeError, ValueError, OSError) as error:
-            refusals.append(_said(error))
+            lines = [line.strip() for line in str(error).split("stderr:")[-1].splitlines()]
+            refusals.append(" ".join(line for line in lines if line))
             self.status = status.running
             # The cluster submits the jobs that it plans and does not have.
             asyncio.get_running_loop().call_later(_RETRY_S, lambda: self._cluster().workers.pop(self.name, None))
@@ -209,7 +208,6 @@ class QueueExecutor(DaskExecutor):
 
         Args:
             store: the cache, in a folder with the same path on all hosts.
-            queue: settings of the jobs.
             threads: threads for a unit; 0 for an equal share of the cores.
 
         Raises:
@@ -260,7 +258,7 @@ class QueueExecutor(DaskExecutor):
         now = time.monotonic()
         if not self._is_started or self.places():
             self._had_workers_at = now
-        if now - self._had_workers_at < _PATIENCE_S:
+        if now - self._had_workers_at < 60.0:
             return ""
         self._had_workers_at = float("inf")
         return (
@@ -275,7 +273,7 @@ class QueueExecutor(DaskExecutor):
         if self._refusals:
             raise UsageError(f"--executor {self.name}: it refused the first job: {self._refusals[0]}")
         # Each waiting unit asks for a job.
-        cluster.adapt(maximum_jobs=self._queue.jobs, interval="1s", wait_count=_IDLE_CHECKS, target_duration="1ms")
+        cluster.adapt(maximum_jobs=self._queue.jobs, interval="1s", wait_count=60, target_duration="1ms")  # 60 s
         self._is_started, self._had_workers_at = True, time.monotonic()
 
     @property
@@ -296,9 +294,3 @@ class QueueExecutor(DaskExecutor):
 
 async def _submitted(cluster: Any) -> None:
     await cluster
-
-
-def _said(error: Exception) -> str:
-    """Return what the command that submits jobs printed, without the report of dask-jobqueue around it."""
-    lines = [line.strip() for line in str(error).split("stderr:")[-1].splitlines()]
-    return " ".join(line for line in lines if line)

@@ -18,15 +18,12 @@ from pano_mvs.core.paths import children
 MARK = "PANO_MVS_WORKER"
 """Environment variable of a worker and of what it starts, whose value no other worker has."""
 
-_PR_SET_CHILD_SUBREAPER = 36
-_LOOKS = 3  # a process that forks and ends while others are looked at is missed by a look, and so is its child
-
 
 def adopt_orphans() -> None:
     """Become the parent of descendants whose own parents end; has no effect except on Linux."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+            ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
 
 
 def end_started(worker: int, mark: str) -> None:
@@ -42,7 +39,8 @@ def end_started(worker: int, mark: str) -> None:
         if worker != os.getpid():
             os.kill(worker, signal.SIGSTOP)  # so that it starts no others meanwhile
     ended, unsuccessful = {worker, os.getpid()}, 0
-    while unsuccessful < _LOOKS:
+    # A process that forks and ends while others are looked at is missed by a look, and so is its child.
+    while unsuccessful < 3:
         found = _started(worker, mark) - ended
         for process in found:
             with suppress(ProcessLookupError, PermissionError):

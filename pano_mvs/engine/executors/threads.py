@@ -14,9 +14,7 @@ from collections.abc import MutableMapping
 from functools import cache
 from pathlib import Path
 
-WORKER_BYTES = 3_000_000_000
-"""Memory of a worker, by which their number is chosen by default."""
-
+WORKER_BYTES = 3_000_000_000  # memory of a worker, by which their number is chosen by default
 _BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 _OTHERS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 

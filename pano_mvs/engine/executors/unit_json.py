@@ -25,9 +25,7 @@ from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 TEXT_VERSION = 3
-LARGE_INPUT = 2000
-"""The inputs of an All port are written into a file if they are more than this."""
-
+LARGE_INPUT = 2000  # the inputs of an All port are written into a file if they are more than this
 _ITEMS_PER_LINE = 500
 
 

@@ -14,28 +14,17 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis
 
-_ROUNDING = 1e-9
-
 
 @dataclass(frozen=True, slots=True)
 class StageForecast:
-    """What a stage is expected to take.
-
-    Attributes:
-        stage: its name in the workflow.
-        after: the stages that feed it.
-        cached: number of units that are in the cache.
-        units: expected number of units to compute; None if unknown.
-        unit_s: expected seconds of one unit; None if no earlier run computed the stage.
-        unit_bytes: expected bytes that a unit adds to the cache; None likewise.
-    """
+    """What a stage is expected to take."""
 
     stage: str
-    after: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()  # the stages that feed it
     cached: int = 0
-    units: int | None = None
-    unit_s: float | None = None
-    unit_bytes: float | None = None
+    units: int | None = None  # expected number of units to compute; None if unknown
+    unit_s: float | None = None  # expected seconds of one unit; None if no earlier run computed the stage
+    unit_bytes: float | None = None  # expected bytes that a unit adds to the cache; None likewise
 
     @property
     def seconds(self) -> float | None:
@@ -69,11 +58,7 @@ def forecast(
     """Return what each stage of a plan is expected to take, in the order of the plan.
 
     Args:
-        plans: of `make_plan`.
-        workflow: the workflow that was planned.
-        size: of the capture.
         histories: times of earlier runs; the first that has samples of a stage counts.
-        threads: that a unit may use.
     """
     return tuple(
         _of_stage(
@@ -96,11 +81,6 @@ def expected_memory(
     """Return the bytes that the units for the whole capture are expected to need in memory, by stage.
 
     Only stages that declare it are included, unless the workflow states the memory of a unit.
-
-    Args:
-        workflow: that would be run.
-        histories: as in `forecast`.
-        threads: that a unit may use.
     """
     found = {}
     for name in graph.order:
@@ -197,7 +177,7 @@ def makespan(
         total_s += step_s
         for stage, rate in rates.items():
             rest_s = left[stage] - rate * step_s
-            left[stage] = rest_s if rest_s > _ROUNDING * seconds[stage] else 0.0
+            left[stage] = rest_s if rest_s > 1e-9 * seconds[stage] else 0.0
 
 
 def _rates(

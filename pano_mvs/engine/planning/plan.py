@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.resolve import SourceListing, resolve
 from pano_mvs.engine.planning.units import OF_CODE, StageState, Unit
@@ -17,23 +18,17 @@ from pano_mvs.engine.workflows.workflow import Workflow
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """The options of one run.
+    """The options of one run."""
 
-    Attributes:
-        until: the run ends after these stages; empty to run all.
-        only: units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
-        refresh: stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached.
-        accept_code: reuse results that differ from what is needed only in the code or the libraries that computed them.
-        keep_going: go on after a failed unit even if its stage says `on_error: stop`.
-        isolate: compute each unit of a plugin's stage in a process of its own.
-    """
-
-    until: tuple[str, ...] = ()
+    until: tuple[str, ...] = ()  # the run ends after these stages; empty to run all
+    # units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
     only: tuple[str, ...] = ()
+    # stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached
     refresh: tuple[str, ...] = ()
+    # reuse results that differ from what is needed only in the code or the libraries that computed them
     accept_code: bool = False
-    keep_going: bool = False
-    isolate: bool = False
+    keep_going: bool = False  # go on after a failed unit even if its stage says `on_error: stop`
+    isolate: bool = False  # compute each unit of a plugin's stage in a process of its own
 
     @property
     def is_partial(self) -> bool:
@@ -90,9 +85,6 @@ def _items_by_stage(units: Iterable[str]) -> Mapping[str, frozenset[str]]:
         stage, _, item = unit.partition(":")
         found.setdefault(stage, set()).add(item)
     return {stage: frozenset(items) for stage, items in found.items() if "" not in items}
-
-
-_SHOWN = 3
 
 
 def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
@@ -172,30 +164,21 @@ def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
     names = [name for name, entry in zip(value, new, strict=True) if str(entry) not in known]
     if not names:
         return "fewer items" if len(new) < len(old or []) else "another order"
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return shortened_list(names, rest=" and {more} more")
 
 
 @dataclass(slots=True)
 class StagePlan:
-    """What a run would do in one stage.
-
-    Attributes:
-        name: of the stage in the workflow.
-        use: of the stage in the registry.
-        cached: units that are in the cache.
-        run: unit that would be computed, to the reason.
-        may_run: units that depend on units that would be computed; they run if these give other results.
-        blocked: unit to the reason why it cannot run.
-        open: whether the number of units is not known yet.
-    """
+    """What a run would do in one stage."""
 
     name: str
     use: str
     cached: list[str] = field(default_factory=list)
-    run: dict[str, str] = field(default_factory=dict)
+    run: dict[str, str] = field(default_factory=dict)  # unit that would be computed, to the reason
+    # units that depend on units that would be computed; they run if these give other results
     may_run: list[str] = field(default_factory=list)
-    blocked: dict[str, str] = field(default_factory=dict)
-    open: bool = False
+    blocked: dict[str, str] = field(default_factory=dict)  # unit to the reason why it cannot run
+    open: bool = False  # whether the number of units is not known yet
 
 
 def make_plan(
@@ -210,8 +193,6 @@ def make_plan(
     """Return what a run would do, stage by stage, without running anything.
 
     Args:
-        workflow: with the options applied.
-        store: the cache.
         listing: what the run has listed so far; None to list the items of the sources again.
         visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 

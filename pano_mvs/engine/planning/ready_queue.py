@@ -58,7 +58,6 @@ class ReadyQueue:
 
     Attributes:
         states: stage to its results so far, in the order of the workflow.
-        listing: the items of the sources.
     """
 
     def __init__(

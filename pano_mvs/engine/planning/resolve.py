@@ -12,6 +12,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, InputError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.core.paths import reason_of
+from pano_mvs.core.text import shortened_list
 from pano_mvs.engine.cache.stat_cache import State
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.cache.unit_times import CaptureSize
@@ -33,15 +34,12 @@ class _ListedFile:
 
 @dataclass(slots=True)
 class SourceListing:
-    """The items of the sources of a run, and the digests of their files.
+    """The items of the sources of a run, and the digests of their files."""
 
-    Attributes:
-        lost: file to the reason why this run cannot use it any more.
-        with_digests: False to read no file as a whole: for a plan with an empty cache, where all units are computed,
-            whatever their keys.
-    """
-
+    # False to read no file as a whole: for a plan with an empty cache, where all units are computed, whatever their
+    # keys
     with_digests: bool = True
+    # file to the reason why this run cannot use it any more
     lost: dict[Path, str] = field(default_factory=dict)
     _items: dict[str, tuple[SourceItem, ...]] = field(default_factory=dict)
     _files: dict[Path, _ListedFile] = field(default_factory=dict)
@@ -136,8 +134,6 @@ def _path_digest(path: Path) -> str:
 KEY_SCHEMA = 3
 """Raise this if the engine passes other inputs, seeds or settings for the same key, or makes keys differently."""
 
-_MAX_SHOWN = 20
-
 
 def resolve_source(
     entry: StageEntry, store: Store, *, only: frozenset[str] | None = None, listing: SourceListing | None = None
@@ -145,7 +141,6 @@ def resolve_source(
     """List the items of a source, and return a unit for each.
 
     Args:
-        store: the cache.
         only: names of the items to return; None for all.
         listing: what the run has listed so far; None to list the items again.
 
@@ -253,8 +248,7 @@ class Resolver:
         missing = sorted(self.only - names.keys())
         if missing:
             raise UsageError(
-                f"{self.entry.name} has no unit {missing[0]!r}; it has: {', '.join(list(names)[:_MAX_SHOWN])}"
-                f"{' …' if len(names) > _MAX_SHOWN else ''}"
+                f"{self.entry.name} has no unit {missing[0]!r}; it has: {shortened_list(names, 20, rest=' …')}"
             )
         return {name: names[name] for name in names if name in self.only}
 
@@ -405,6 +399,7 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
     """Return the part of the identity that all units of a stage share."""
     plain, paths = key_fields(entry.params)
     code = stage_code(entry.spec, entry.params)
+    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
     return {
         "schema": KEY_SCHEMA,
         "stage": entry.spec.name,
@@ -412,10 +407,5 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
         "code": code.digest,
         "libraries": dict(code.libraries),
         "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
-        "kinds": _kind_versions(entry),
+        "kinds": {kind.kind_name(): kind.kind_version for kind in kinds},
     }
-
-
-def _kind_versions(entry: StageEntry) -> dict[str, int]:
-    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
-    return {kind.kind_name(): kind.kind_version for kind in kinds}

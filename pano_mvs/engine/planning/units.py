@@ -12,12 +12,8 @@ from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis
 
-WHOLE = ""
-"""The name of the unit of a stage that has only one."""
-
-PENDING = ItemRef("", "0" * 32, {})
-"""Placeholder for an item of which only the name is known."""
-
+WHOLE = ""  # the name of the unit of a stage that has only one
+PENDING = ItemRef("", "0" * 32, {})  # placeholder for an item of which only the name is known
 OF_CODE = frozenset({"code", "libraries"})
 """The parts of a unit's identity that describe the code that computes it."""
 
@@ -26,25 +22,16 @@ UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One unit of work, for an image, a pair, a view, or the whole capture.
-
-    Attributes:
-        entry: its stage in the workflow.
-        item: its name within the stage; `WHOLE` if the stage has only one unit.
-        members: the images that it concerns.
-        inputs: port to the item that it reads, or to items by name for Near, All and Names.
-        key: cache key.
-        identity: what the key is made of.
-        source: the item to read, for units of a source.
-    """
+    """One unit of work, for an image, a pair, a view, or the whole capture."""
 
     entry: StageEntry
-    item: str
-    members: tuple[str, ...]
+    item: str  # its name within the stage; `WHOLE` if the stage has only one unit
+    members: tuple[str, ...]  # the images that it concerns
+    # port to the item that it reads, or to items by name for Near, All and Names
     inputs: Mapping[str, UnitInput]
     key: str
-    identity: Mapping[str, Any]
-    source: SourceItem | None = None
+    identity: Mapping[str, Any]  # what the key is made of
+    source: SourceItem | None = None  # the item to read, for units of a source
 
     @property
     def label(self) -> str:
@@ -61,41 +48,25 @@ class Unit:
 
 @dataclass(slots=True)
 class StageState:
-    """The results of a stage, in a run or in a plan.
-
-    Attributes:
-        axis: of its units.
-        items: unit to its stored value.
-        exploded: image to its item, where the value is a collection.
-        members: unit to the images that it concerns.
-        failed: unit to the reason why it has no value.
-        pending: units that are not settled.
-        open: whether the list of units is not known yet.
-    """
+    """The results of a stage, in a run or in a plan."""
 
     axis: Axis
-    items: dict[str, ItemRef] = field(default_factory=dict)
+    items: dict[str, ItemRef] = field(default_factory=dict)  # unit to its stored value
+    # image to its item, where the value is a collection
     exploded: dict[str, ItemRef] = field(default_factory=dict)
-    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    failed: dict[str, str] = field(default_factory=dict)
-    pending: set[str] = field(default_factory=set)
-    open: bool = False
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)  # unit to the images that it concerns
+    failed: dict[str, str] = field(default_factory=dict)  # unit to the reason why it has no value
+    pending: set[str] = field(default_factory=set)  # units that are not settled
+    open: bool = False  # whether the list of units is not known yet
 
 
 @dataclass(slots=True)
 class Resolution:
-    """The units of a stage.
+    """The units of a stage."""
 
-    Attributes:
-        units: units whose inputs all exist.
-        blocked: unit to the reason why it cannot run, such as an input that failed.
-        waiting: units whose inputs are not known yet (plans only).
-        open: whether the list of units is not known yet (plans only).
-        members: unit to the images that it concerns.
-    """
-
-    units: list[Unit] = field(default_factory=list)
+    units: list[Unit] = field(default_factory=list)  # units whose inputs all exist
+    # unit to the reason why it cannot run, such as an input that failed
     blocked: dict[str, str] = field(default_factory=dict)
-    waiting: list[str] = field(default_factory=list)
-    open: bool = False
-    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    waiting: list[str] = field(default_factory=list)  # units whose inputs are not known yet (plans only)
+    open: bool = False  # whether the list of units is not known yet (plans only)
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)  # unit to the images that it concerns

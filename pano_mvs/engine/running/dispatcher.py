@@ -23,27 +23,17 @@ from pano_mvs.engine.planning.units import PENDING, Unit
 from pano_mvs.scene import Record
 
 LOG_FOLDER = "logs"
-_SHOWN_LINES = 20
-_RETRIES_AFTER_DEATH = 2
-_MIN_COUNTED_BYTES = 300_000_000  # memory for reading inputs counts only above this; every worker has that much
 _INVALID_CHARACTERS = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
 @dataclass(frozen=True, slots=True)
 class FinishedJob:
-    """A job that has ended, after all its retries.
-
-    Attributes:
-        unit: the unit that was to be computed.
-        outcome: what became of the last attempt.
-        log: file with what the unit printed; None if it printed nothing.
-        said: the last lines of the log.
-    """
+    """A job that has ended, after all its retries."""
 
     unit: Unit
-    outcome: JobOutcome
-    log: Path | None = None
-    said: tuple[str, ...] = ()
+    outcome: JobOutcome  # what became of the last attempt
+    log: Path | None = None  # file with what the unit printed; None if it printed nothing
+    said: tuple[str, ...] = ()  # the last lines of the log
 
 
 @dataclass(slots=True)
@@ -61,11 +51,7 @@ class Dispatcher:
         """Prepare.
 
         Args:
-            executor: computes the units.
-            store: the cache.
             out: the output folder, for logs.
-            plugins: the plugin files of the workflow, with the digests of their code.
-            isolate: whether each unit of a plugin's stage gets a process of its own.
         """
         self._executor = executor
         self._isolate = isolate
@@ -79,7 +65,6 @@ class Dispatcher:
         self._latest = ("", 0)  # key and memory of the unit that was asked for last
 
     def __len__(self) -> int:
-        """Return the number of running jobs."""
         return len(self._running)
 
     @property
@@ -133,7 +118,7 @@ class Dispatcher:
             number, outcome = found
             running = self._running[number]
             # The system may kill a process through no fault of the unit.
-            retries = max(running.job.unit.entry.policy.retries, _RETRIES_AFTER_DEATH if outcome.died else 0)
+            retries = max(running.job.unit.entry.policy.retries, 2 if outcome.died else 0)
             if outcome.status == "failed" and running.attempts <= retries:
                 running.attempts += 1
                 self._executor.submit(running.job)
@@ -157,7 +142,8 @@ class Dispatcher:
         """Return the bytes that a unit needs; 0 if neither the workflow, the stage nor the inputs state it."""
         if self._latest[0] != unit.key:
             loading = 0 if unit.entry.policy.memory_bytes else self._loading_of(unit)
-            counted = loading if loading >= _MIN_COUNTED_BYTES else 0
+            # Every worker has as much as this for reading inputs.
+            counted = loading if loading >= 300_000_000 else 0
             self._latest = unit.key, memory_of(unit, self._store) + counted
         return self._latest[1]
 
@@ -177,7 +163,7 @@ class Dispatcher:
         """Move a unit's log into the output folder, where it replaces that of an earlier run."""
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
-        said = tail(job.log, _SHOWN_LINES)
+        said = tail(job.log, 20)
         if not is_inside(path.parent, self._logs.parent):
             return None, said  # a link, or the name of an item of a plugin, leads outside
         with suppress(OSError):  # the run does not fail because of a log

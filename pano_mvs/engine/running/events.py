@@ -8,34 +8,21 @@ from typing import ClassVar, Literal
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-_MIN_UNITS_WITHOUT_SLOWEST = 4
-
 UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A unit without a result.
-
-    Attributes:
-        stage: name of the stage in the workflow.
-        item: the unit; empty if the stage has one only.
-        cause: what went wrong and what to do.
-        trace: the Python traceback, if the code of the stage failed.
-        consequence: what is missing in the results because of it.
-        blocked: whether the unit did not run because one of its inputs failed.
-        log: file with what the unit printed; empty if it printed nothing.
-        said: the last lines of the log.
-    """
+    """A unit without a result."""
 
     stage: str
-    item: str
-    cause: str
-    trace: str = ""
-    consequence: str = ""
-    blocked: bool = False
-    log: str = ""
-    said: tuple[str, ...] = ()
+    item: str  # the unit; empty if the stage has one only
+    cause: str  # what went wrong and what to do
+    trace: str = ""  # the Python traceback, if the code of the stage failed
+    consequence: str = ""  # what is missing in the results because of it
+    blocked: bool = False  # whether the unit did not run because one of its inputs failed
+    log: str = ""  # file with what the unit printed; empty if it printed nothing
+    said: tuple[str, ...] = ()  # the last lines of the log
 
     def event(self) -> UnitFailed:
         """Return the event that the unit has failed."""
@@ -50,44 +37,28 @@ def consequence_of(entry: StageEntry, item: str) -> str:
 
 @dataclass(slots=True)
 class StageSummary:
-    """What happened in one stage.
+    """What happened in one stage."""
 
-    Attributes:
-        name: of the stage in the workflow.
-        use: of the stage in the registry.
-        units: number of its units.
-        cached: number of units that were found in the cache.
-        run: number of units that were computed.
-        failed: number of units that failed.
-        blocked: number of units that did not run because an input failed.
-        seconds: time during which at least one of its units was being computed; other stages may have run too.
-        unit_seconds: computing time of its units together.
-        slowest_s: computing time of its slowest unit.
-        stored_bytes: bytes of the results that its computed units stored in the cache.
-        metrics: mean of each metric over the units.
-        unit_metrics: unit to its own metrics.
-        notes: what a user should know.
-    """
-
-    name: str
-    use: str
+    name: str  # of the stage in the workflow
+    use: str  # of the stage in the registry
     units: int = 0
     cached: int = 0
     run: int = 0
     failed: int = 0
     blocked: int = 0
+    # time during which at least one of its units was being computed; other stages may have run too
     seconds: float = 0.0
-    unit_seconds: float = 0.0
-    slowest_s: float = 0.0
-    stored_bytes: int = 0
-    metrics: dict[str, float] = field(default_factory=dict)
-    unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
+    unit_seconds: float = 0.0  # computing time of its units together
+    slowest_s: float = 0.0  # computing time of its slowest unit
+    stored_bytes: int = 0  # bytes of the results that its computed units stored in the cache
+    metrics: dict[str, float] = field(default_factory=dict)  # mean of each metric over the units
+    unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)  # unit to its own metrics
     notes: list[str] = field(default_factory=list)
 
     @property
     def typical_unit_s(self) -> float:
         """Mean time of its computed units; of four or more without the slowest, which may include compilation."""
-        if self.run >= _MIN_UNITS_WITHOUT_SLOWEST:
+        if self.run >= 4:
             return max(0.0, self.unit_seconds - self.slowest_s) / (self.run - 1)
         return self.unit_seconds / self.run if self.run else 0.0
 
@@ -100,32 +71,24 @@ class StageSummary:
 
 @dataclass(slots=True)
 class RunResult:
-    """What a run did.
+    """What a run did."""
 
-    Attributes:
-        stages: those that were started, in the order of the workflow.
-        failures: units without a result.
-        rejected: image to the stage that left it out and the reason.
-        doubts: image to the stage that finds it doubtful and the reason; see `Record.doubted`.
-        stopped: why the run ended early; empty if it did not.
-        exit_code: 0 ok, 3 finished with failed or doubtful items, 4 stopped by a threshold or by `on_error: stop`.
-        written: files that this run wrote into the output folder.
-        removed: files of earlier runs that this run deleted.
-        published: every file of the results, with its digest.
-        left_over: files of earlier runs, with their digests, that are not part of the results and still exist.
-        warnings: such as damaged files of the cache that were computed again.
-    """
-
+    # those that were started, in the order of the workflow
     stages: list[StageSummary] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)  # units without a result
+    # image to the stage that left it out and the reason
     rejected: dict[str, tuple[str, str]] = field(default_factory=dict)
+    # image to the stage that finds it doubtful and the reason; see `Record.doubted`
     doubts: dict[str, tuple[str, str]] = field(default_factory=dict)
-    stopped: str = ""
+    stopped: str = ""  # why the run ended early; empty if it did not
+    # 0 ok, 3 finished with failed or doubtful items, 4 stopped by a threshold or by `on_error: stop`
     exit_code: int = 0
     written: list[str] = field(default_factory=list)
-    removed: list[str] = field(default_factory=list)
-    published: Mapping[str, str] = field(default_factory=dict)
+    removed: list[str] = field(default_factory=list)  # files of earlier runs that this run deleted
+    published: Mapping[str, str] = field(default_factory=dict)  # every file of the results, with its digest
+    # files of earlier runs, with their digests, that are not part of the results and still exist
     left_over: Mapping[str, str] = field(default_factory=dict)
+    # such as damaged files of the cache that were computed again
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -164,24 +127,15 @@ class UnitStarted:
 
 @dataclass(frozen=True, slots=True)
 class UnitFailed:
-    """A unit failed; `UnitFinished` follows.
-
-    Attributes:
-        stage: name of the stage in the workflow.
-        item: the image, pair or view; empty if the stage has one unit.
-        cause: what went wrong and what to do about it.
-        consequence: what the result lacks because of it.
-        log: file with what the unit printed; empty if it printed nothing.
-        said: the last lines that it printed.
-    """
+    """A unit failed; `UnitFinished` follows."""
 
     kind: ClassVar[str] = "unit_failed"
-    stage: str
-    item: str
-    cause: str
-    consequence: str = ""
-    log: str = ""
-    said: tuple[str, ...] = ()
+    stage: str  # name of the stage in the workflow
+    item: str  # the image, pair or view; empty if the stage has one unit
+    cause: str  # what went wrong and what to do about it
+    consequence: str = ""  # what the result lacks because of it
+    log: str = ""  # file with what the unit printed; empty if it printed nothing
+    said: tuple[str, ...] = ()  # the last lines that it printed
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,32 +151,19 @@ class UnitFinished:
 
 @dataclass(frozen=True, slots=True)
 class StageFinished:
-    """A stage is done.
-
-    Attributes:
-        stage: its name in the workflow.
-        use: the registered stage, such as `depth.sweep`.
-        units: number of units.
-        run: of these computed.
-        cached: taken from the cache.
-        failed: without a result.
-        blocked: not run, because an input failed.
-        seconds: time during which at least one of its units was being computed.
-        unit_seconds: sum over its computed units.
-        metrics: mean over its units of each figure that the stage reports.
-    """
+    """A stage is done."""
 
     kind: ClassVar[str] = "stage_finished"
     stage: str
-    use: str
+    use: str  # the registered stage, such as `depth.sweep`
     units: int
-    run: int
-    cached: int
-    failed: int
-    blocked: int
-    seconds: float
-    unit_seconds: float
-    metrics: Mapping[str, float]
+    run: int  # of these computed
+    cached: int  # taken from the cache
+    failed: int  # without a result
+    blocked: int  # not run, because an input failed
+    seconds: float  # time during which at least one of its units was being computed
+    unit_seconds: float  # sum over its computed units
+    metrics: Mapping[str, float]  # mean over its units of each figure that the stage reports
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,6 @@ if os.name == "posix":
     import fcntl
 
 LOCK_NAME = ".pano-mvs-lock"
-_MAX_ATTEMPTS = 50
 _PAUSE_S = 0.02
 
 
@@ -63,7 +62,7 @@ def is_run_gone(out: Path) -> bool:
 
 
 def _acquire(path: Path, own: bytes) -> None:
-    for _ in range(_MAX_ATTEMPTS):
+    for _ in range(50):
         if _create(path, own):
             return
         text = _read(path)

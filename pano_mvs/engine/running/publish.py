@@ -41,15 +41,10 @@ class Owner(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """The result of a claim.
+    """The result of a claim."""
 
-    Attributes:
-        refusal: why the unit cannot deliver its files; empty if it can.
-        losers: units of the same stage that have to withdraw their files: item to the reason.
-    """
-
-    refusal: str
-    losers: dict[str, str]
+    refusal: str  # why the unit cannot deliver its files; empty if it can
+    losers: dict[str, str]  # units of the same stage that have to withdraw their files: item to the reason
 
 
 class FileClaims:
@@ -151,8 +146,6 @@ class Publisher:
     """Writes the files of one run into one folder.
 
     Attributes:
-        store: the cache.
-        written: the files that were written.
         published: every file of the run, and its digest.
         earlier: file to digest, as an earlier run or an earlier pass of this run wrote them.
         set_aside: files of the user that were renamed to make room: original name to new name.
@@ -225,8 +218,6 @@ class Publisher:
         the order in which the units are computed.
 
         Args:
-            stage: name of the stage.
-            item: name of the unit.
             to: folder for them inside the output folder.
 
         Returns:
@@ -280,7 +271,6 @@ class Publisher:
         return self._ranks.get(owner.item, len(self._ranks)), owner.item
 
     def _withdraw(self, files: Iterable[str]) -> None:
-        """Delete the files of a unit from the output folder."""
         for name in files:
             del self.published[name]
             with suppress(ValueError):

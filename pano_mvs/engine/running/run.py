@@ -42,12 +42,8 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis, Files, Record
 
-GRACE_S = 10.0
-"""Time for which running units may go on after an interrupt, so that their results are not lost."""
-
-WAIT_S = 5.0
-"""Time without an event after which observers are notified that the run is waiting for units."""
-
+GRACE_S = 10.0  # time for which running units may go on after an interrupt, so that their results are not lost
+WAIT_S = 5.0  # time without an event after which observers are notified that the run is waiting for units
 _MAX_REPAIRS = 3
 _STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 
@@ -65,7 +61,6 @@ class Run:
 
     Attributes:
         keys: stage to unit to cache key, of all units that were looked up.
-        computed: keys of the units that this run computed.
         refreshed: labels of the units that `--refresh` named and that were reached.
     """
 
@@ -83,13 +78,7 @@ class Run:
         """Prepare a run.
 
         Args:
-            workflow: what to run.
-            graph: how its stages are connected.
-            store: the cache.
-            out: folder of the results.
-            observer: is notified of progress.
             executor: computes the units; by default one after another with all threads. The caller closes it.
-            options: what the user asked for beyond the workflow.
 
         Raises:
             UsageError: if the output folder cannot be written, the options name a stage that does not exist, or units
@@ -213,14 +202,10 @@ class Run:
         except StoreError as error:
             self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
         if self._has_passed and self.computed:
-            self._pack()
-
-    def _pack(self) -> None:
-        """Move the results into few files; the run does not fail if that is impossible."""
-        try:
-            pack(self.store)
-        except StoreError as error:
-            self.warn(f"the results stay in many files, because they could not be packed: {error}")
+            try:
+                pack(self.store)
+            except StoreError as error:
+                self.warn(f"the results stay in many files, because they could not be packed: {error}")
 
     def _remember_times(self) -> None:
         """Store what the units of each stage took, for the estimates of later runs."""
@@ -282,7 +267,6 @@ class RunPass:
     """One pass over a workflow, with a result and statistics of its own.
 
     Attributes:
-        result: what happened in this pass.
         queue: the units that can run, and the results so far.
         damaged: damaged files of the cache (which have been removed) and changed input files that this pass met.
             Units that need any of them are left to the next pass, while the others go on, so that much damage takes no
@@ -383,11 +367,15 @@ class RunPass:
         return True
 
     def _end(self, finished: FinishedJob) -> None:
-        """Act on what became of a job."""
         outcome, unit = finished.outcome, finished.unit
         duplicates = self._duplicates.pop(unit.key)
         if outcome.status == "damaged":
-            self._drop_producers(unit)
+            # The incomplete records that led to a damaged file are dropped, so that they are computed again.
+            for producer in self.queue.producers(unit.entry.name):
+                for key in self._run.keys.get(producer, {}).values():
+                    record = self._store.read_record(key)
+                    if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
+                        self._store.drop(key)
             self.damaged.append(outcome.cause)
             return
         if outcome.status == "changed" and self._run.listing.report(outcome.changed):
@@ -457,14 +445,6 @@ class RunPass:
         if entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
         self.queue.fail(unit, outcome.cause)
-
-    def _drop_producers(self, unit: Unit) -> None:
-        """Drop the incomplete records that led a unit to a damaged file, so that they are computed again."""
-        for producer in self.queue.producers(unit.entry.name):
-            for key in self._run.keys.get(producer, {}).values():
-                record = self._store.read_record(key)
-                if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
-                    self._store.drop(key)
 
     def _replaced(self) -> set[str]:
         """Return the stages whose results a finished later stage reads and replaces by its own, of the same kind."""

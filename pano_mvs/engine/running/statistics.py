@@ -28,8 +28,6 @@ from pano_mvs.engine.running.events import (
 from pano_mvs.engine.stages.context import COUNT_IN_NOTES
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-_MAX_SHOWN_CAUSES = 10
-
 
 @dataclass(slots=True)
 class _StageCount:
@@ -59,8 +57,6 @@ class RunStatistics:
 
         Args:
             result: is filled in.
-            observer: is notified.
-            states: returns the state of a stage.
             name_items: is called with the names of a source's images once they are known.
         """
         self._result = result
@@ -171,7 +167,7 @@ class RunStatistics:
         summary.notes = [_counted(note, units, len(state.items)) for note, units in Counter(notes).items()]
         self._observer(summary.event())
         if entry.spec.list_items is not None and not state.items:
-            shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_MAX_SHOWN_CAUSES])
+            shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:10])
             listed = len(state.members)
             raise InputError(f"{entry.name}: none of the {listed} {plural(listed, 'item')} can be used{shown}")
         _check_thresholds(entry, summary)
@@ -255,19 +251,15 @@ class PackedFigures(Mapping[str, float]):
         self._packed = self._form[1].pack(*figures.values())
 
     def __getitem__(self, name: str) -> float:
-        """Return one figure."""
         positions, layout = self._form
         figures: tuple[float, ...] = layout.unpack(self._packed)
         return figures[positions[name]]
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._form[0])
 
     def __len__(self) -> int:
-        """Return the number of figures."""
         return len(self._form[0])
 
     def __repr__(self) -> str:
-        """Return the figures as a dict prints them."""
         return repr(dict(self))

@@ -33,20 +33,14 @@ ENTRY_POINT_GROUP = "pano_mvs.plugins"
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """A plugin that was found.
+    """A plugin that was found."""
 
-    Attributes:
-        origin: the distribution, or the file.
-        names: what it defines, or, if it is broken, declares in its source: ("stage", name), or the kind and name of a
-            registration.
-        error: why it could not be loaded, in one line; empty if it was loaded.
-        trace: the traceback of that error.
-    """
-
-    origin: str
+    origin: str  # the distribution, or the file
+    # what it defines, or, if it is broken, declares in its source: ("stage", name), or the kind and name of a
+    # registration
     names: tuple[tuple[str, str], ...]
-    error: str = ""
-    trace: str = ""
+    error: str = ""  # why it could not be loaded, in one line; empty if it was loaded
+    trace: str = ""  # the traceback of that error
 
     def why_broken(self) -> str:
         """Return the error message for the use of one of its names."""
@@ -55,19 +49,14 @@ class Plugin:
 
 @dataclass(slots=True)
 class Registry:
-    """The stages by name, and the plugins that define them.
-
-    Attributes:
-        registrations: what plugins registered beside stages, by kind and name.
-        origins: stage name to the plugin that defines it.
-        plugins: all that were found, including broken ones.
-        clashes: names that are defined twice, as in `Plugin.names`, to the two places; such names cannot be used.
-    """
+    """The stages by name, and the plugins that define them."""
 
     stages: dict[str, StageSpec] = field(default_factory=dict)
+    # what plugins registered beside stages, by kind and name
     registrations: dict[tuple[str, str], Registration] = field(default_factory=dict)
-    origins: dict[str, str] = field(default_factory=dict)
-    plugins: list[Plugin] = field(default_factory=list)
+    origins: dict[str, str] = field(default_factory=dict)  # stage name to the plugin that defines it
+    plugins: list[Plugin] = field(default_factory=list)  # all that were found, including broken ones
+    # names that are defined twice, as in `Plugin.names`, to the two places; such names cannot be used
     clashes: dict[tuple[str, str], str] = field(default_factory=dict)
     _files: dict[Path, tuple[str, Plugin]] = field(default_factory=dict)
 

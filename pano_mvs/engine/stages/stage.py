@@ -130,42 +130,28 @@ its params, the number of images and the bytes that it is expected to store."""
 
 @dataclass(frozen=True, slots=True)
 class StageSpec:
-    """The declaration of a stage.
+    """The declaration of a stage."""
 
-    Attributes:
-        name: the `use:` name, such as `depth.sweep`.
-        version: the author raises it if results change for a reason that is not in the code.
-        function: called with the ports by name, `params` and `ctx`.
-        ports: what it reads.
-        params_type: model of its settings.
-        output: the kind that it returns.
-        list_items: the function that lists the items, for sources.
-        origin: where it is defined, `file:line`.
-        code_digest: digest of the code, for stages from user files; otherwise empty, see `stage_code`.
-        extras: name of each argument that is not a port, and its role.
-        memory_bytes: memory that one unit needs; 0 if not declared.
-        memory_needed: returns the memory that a unit needs, if it depends on settings and inputs.
-        every_image: whether the stage has a unit for images without neighbours as well; see `stage`.
-        needs: distributions that must be installed, by the module that each provides.
-        expected_units: of a stage that returns an index, for plans; None if only earlier runs show it.
-        expected_memory: of a stage with one unit, whose memory grows with the capture; None if it does not.
-    """
-
-    name: str
-    version: int
-    function: Callable[..., Record]
+    name: str  # the `use:` name, such as `depth.sweep`
+    version: int  # the author raises it if results change for a reason that is not in the code
+    function: Callable[..., Record]  # called with the ports by name, `params` and `ctx`
     ports: tuple[Port, ...]
     params_type: type[Params]
     output: type[Record]
-    list_items: ListItems | None = None
-    origin: str = ""
-    code_digest: str = ""
+    list_items: ListItems | None = None  # the function that lists the items, for sources
+    origin: str = ""  # where it is defined, `file:line`
+    code_digest: str = ""  # digest of the code, for stages from user files; otherwise empty, see `stage_code`
+    # name of each argument that is not a port, and its role
     extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
-    memory_bytes: int = 0
+    memory_bytes: int = 0  # memory that one unit needs; 0 if not declared
+    # returns the memory that a unit needs, if it depends on settings and inputs
     memory_needed: MemoryNeeded | None = None
-    every_image: bool = False
+    every_image: bool = False  # whether the stage has a unit for images without neighbours as well; see `stage`
+    # distributions that must be installed, by the module that each provides
     needs: Mapping[str, str] = field(default_factory=dict)
+    # of a stage that returns an index, for plans; None if only earlier runs show it
     expected_units: ExpectedUnits | None = None
+    # of a stage with one unit, whose memory grows with the capture; None if it does not
     expected_memory: ExpectedMemory | None = None
 
     @property

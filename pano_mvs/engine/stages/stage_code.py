@@ -47,15 +47,10 @@ _IGNORED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class StageCode:
-    """What the results of a stage depend on beside its settings and inputs.
+    """What the results of a stage depend on beside its settings and inputs."""
 
-    Attributes:
-        digest: of the code that the stage reaches.
-        libraries: name to version of the libraries that this code uses.
-    """
-
-    digest: str
-    libraries: Mapping[str, str]
+    digest: str  # of the code that the stage reaches
+    libraries: Mapping[str, str]  # name to version of the libraries that this code uses
 
 
 def stage_code(spec: StageSpec, params: Params) -> StageCode:
@@ -82,7 +77,6 @@ def reach_of_function(module: str, name: str, graph: CodeGraph) -> Reach:
     Args:
         module: dotted name of its module.
         name: its qualified name there.
-        graph: of its package and pano_mvs.
     """
     if "." in name:
         # It is made by another function with unknown arguments: its whole package counts.
@@ -117,8 +111,7 @@ def _version(module: str) -> str:
     return "not installed"
 
 
-_Code = tuple[str, tuple[str, ...]]
-"""A digest, and the libraries that the code uses."""
+_Code = tuple[str, tuple[str, ...]]  # a digest, and the libraries that the code uses
 
 
 @cache

@@ -22,17 +22,10 @@ TOP_KEYS = ("pano_mvs", "name", "description", "extends", "plugins", "stages")
 
 @dataclass(frozen=True, slots=True)
 class WorkflowFile:
-    """The content of one workflow file.
+    """The content of one workflow file."""
 
-    Attributes:
-        shown_as: its name in messages.
-        base: folder that its relative paths start from.
-        text: the YAML.
-        root: the top-level mapping.
-    """
-
-    shown_as: str
-    base: Path
+    shown_as: str  # its name in messages
+    base: Path  # folder that its relative paths start from
     text: str
     root: Located
 
@@ -81,16 +74,10 @@ def read_text(path: Path, what: str = "workflow") -> str:
 
 @dataclass(slots=True)
 class ExtendsReader:
-    """Reads a workflow file and all files that it extends, each once, the extended ones first.
-
-    Attributes:
-        problems: the errors found.
-        presets: folder of the workflows that can be extended by name, or None.
-        files: the files that were read.
-    """
+    """Reads a workflow file and all files that it extends, each once, the extended ones first."""
 
     problems: Problems
-    presets: Path | None = None
+    presets: Path | None = None  # folder of the workflows that can be extended by name, or None
     files: list[WorkflowFile] = field(default_factory=list)
     _seen: set[Path] = field(default_factory=set)
 
@@ -98,9 +85,6 @@ class ExtendsReader:
         """Read a workflow and, before it, the files that it extends.
 
         Args:
-            text: the YAML.
-            shown_as: its name in messages.
-            base: folder that its relative paths start from.
             chain: the files that extend each other up to this one, which is last; empty if the text is not a file.
         """
         root = parse_yaml(text, shown_as, self.problems)

@@ -32,7 +32,6 @@ def apply_overrides(
     Args:
         stages: the merged entries.
         overrides: `STAGE.PARAM=VALUE`, `STAGE.PARAM.KEY=VALUE`, `STAGE=null` or `plugins=FILE`, with values in YAML.
-        problems: receives the errors.
         images: folder that replaces the path of the stage `images`; None to keep it.
     """
     plugins: list[Located] = []

@@ -13,12 +13,7 @@ from pano_mvs.core.memory import bytes_from_size
 
 
 class Thresholds(BaseModel):
-    """The thresholds of a metric; outside them the run stops.
-
-    Attributes:
-        min: the minimum, or None.
-        max: the maximum, or None.
-    """
+    """The thresholds of a metric; outside them the run stops."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -15,7 +15,6 @@ from pano_mvs.engine.workflows.extends import FORMAT_VERSION
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 
-_WIDTH = 1000  # no line breaks inside values
 _FIRST_KEYS = ("use", "in")
 
 
@@ -24,10 +23,6 @@ def resolved_yaml(workflow: Workflow, graph: Graph) -> str:
 
     All settings of each stage have values, paths are absolute, and `in:` names what feeds each port. Other reserved
     keys, such as `gate`, are included where they differ from their defaults.
-
-    Args:
-        workflow: the workflow, with the overrides applied.
-        graph: how its stages are connected.
     """
     root: dict[str, Any] = {"pano_mvs": FORMAT_VERSION, "name": workflow.name}
     if workflow.plugins:
@@ -35,7 +30,7 @@ def resolved_yaml(workflow: Workflow, graph: Graph) -> str:
     root["stages"] = {name: _entry(entry, graph) for name, entry in workflow.stages.items()}
     stream = StringIO()
     yaml = YAML()
-    yaml.width = _WIDTH
+    yaml.width = 1000  # no line breaks inside values
     yaml.indent(mapping=2, sequence=4, offset=2)
     yaml.Representer = _Representer
     yaml.dump(_commented(root), stream)
@@ -77,7 +72,6 @@ class _Representer(RoundTripRepresenter):
     """Writes None as `null` rather than as nothing."""
 
     def represent_none(self, _data: None) -> Any:
-        """Return the node of None."""
         return self.represent_scalar("tag:yaml.org,2002:null", "null")
 
 

@@ -23,7 +23,6 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
     """Return the schema of workflow files.
 
     Args:
-        registry: the known stages.
         inherited: the stages of the workflows that a file extends. Their entries in the file may omit `use`, and get
             the settings of the stage that they use.
     """

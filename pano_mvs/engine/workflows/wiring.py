@@ -15,35 +15,23 @@ from pano_mvs.scene import Axis
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A connection from a stage to a port of another one.
-
-    Attributes:
-        producer: name of the stage that feeds it.
-        exploded: whether it carries the items of the producer's collection instead of the collection.
-    """
+    """A connection from a stage to a port of another one."""
 
     port: Port
-    producer: str
-    exploded: bool
+    producer: str  # name of the stage that feeds it
+    exploded: bool  # whether it carries the items of the producer's collection instead of the collection
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """The connected stages of a workflow.
+    """The connected stages of a workflow."""
 
-    Attributes:
-        order: stage names, producers first, otherwise as in the file.
-        edges: stage name to port name to the connection.
-        axes: stage name to the axis of its units.
-        only: stage name to its units, for stages that are limited to some of them.
-        is_part: whether some stages or units of the workflow are left out.
-    """
-
-    order: tuple[str, ...]
-    edges: Mapping[str, Mapping[str, Edge]]
-    axes: Mapping[str, Axis]
+    order: tuple[str, ...]  # stage names, producers first, otherwise as in the file
+    edges: Mapping[str, Mapping[str, Edge]]  # stage name to port name to the connection
+    axes: Mapping[str, Axis]  # stage name to the axis of its units
+    # stage name to its units, for stages that are limited to some of them
     only: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    is_part: bool = False
+    is_part: bool = False  # whether some stages or units of the workflow are left out
 
     def limited_to(self, ends: Collection[str], only: Mapping[str, frozenset[str]]) -> Graph:
         """Return the graph of the stages `ends` and the stages that they need."""
@@ -59,7 +47,6 @@ def wire(workflow: Workflow, *, unknown: Collection[str] = ()) -> Graph:
     """Connect every port as `in:` says, or else to the nearest earlier stage that produces its kind.
 
     Args:
-        workflow: its stages.
         unknown: names of further stages of which nothing is known, because they have errors. What they may produce or
             need is not reported.
 

@@ -26,43 +26,26 @@ from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class StageEntry:
-    """One stage of a workflow, validated.
-
-    Attributes:
-        name: its name in this workflow.
-        spec: the stage it uses.
-        params: its settings.
-        policy: the reserved keys.
-        place: `file:line:column` of its name.
-        places: port or setting to `file:line:column`.
-    """
+    """One stage of a workflow, validated."""
 
     name: str
     spec: StageSpec
     params: Params
     policy: Policy
-    place: str
-    places: dict[str, str] = field(default_factory=dict)
+    place: str  # `file:line:column` of its name
+    places: dict[str, str] = field(default_factory=dict)  # port or setting to `file:line:column`
 
 
 @dataclass(frozen=True, slots=True)
 class Workflow:
-    """A validated workflow.
+    """A validated workflow."""
 
-    Attributes:
-        name: for the output folder and the report.
-        path: the file, or None.
-        text: the YAML, followed by that of the files that it extends.
-        stages: in the order of the file.
-        overrides: the `--set` and `--images` options that were applied.
-        plugins: its plugin files, with the digests of their code.
-    """
-
-    name: str
+    name: str  # for the output folder and the report
     path: Path | None
-    text: str
-    stages: dict[str, StageEntry]
-    overrides: tuple[str, ...] = ()
+    text: str  # the YAML, followed by that of the files that it extends
+    stages: dict[str, StageEntry]  # in the order of the file
+    overrides: tuple[str, ...] = ()  # the `--set` and `--images` options that were applied
+    # its plugin files, with the digests of their code
     plugins: Mapping[Path, str] = field(default_factory=dict)
 
     @property
@@ -84,9 +67,6 @@ def load_workflow(
     Args:
         path: the YAML file; relative paths in it start from its folder.
         registry: the known stages; the plugin files of the workflow are added to it.
-        overrides: `STAGE.PARAM=VALUE`, with values in YAML.
-        images: folder that replaces the path of the stage `images`; None to keep it.
-        presets: folder of the workflows that can be extended by name.
 
     Raises:
         InputError: if the file cannot be read.
@@ -258,10 +238,6 @@ def report_invalid(
     """Add a line for each setting that does not fit a model.
 
     Args:
-        error: of the validation.
-        node: the mapping with the settings.
-        problems: receives the lines.
-        known: the settings that exist.
         subject: what the settings belong to, at the beginning of each line.
     """
     for problem in error.errors(include_url=False):
@@ -287,7 +263,6 @@ def _name_of(shown_as: str) -> str:
 
 
 def _all_texts(files: Sequence[WorkflowFile]) -> str:
-    """Return the text of a workflow, followed by those of the files that it extends."""
     *below, own = files
     return own.text + "".join(f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in below)
 

@@ -17,7 +17,6 @@ from pano_mvs.core.file_names import is_printable
 MAX_DEPTH = 40
 MAX_VALUES = 100_000
 MAX_PROBLEMS = 100
-_MAX_DIGITS = 400
 _SHOWN_CHARACTERS = 40
 _CORE = "tag:yaml.org,2002:"
 _KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float", "merge", "value")}
@@ -25,25 +24,15 @@ _KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float"
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A YAML value and its location.
+    """A YAML value and its location."""
 
-    Attributes:
-        value: a scalar, a dict of str to Located, or a list of Located.
-        line: 1-based line of the value.
-        column: 1-based column of the value.
-        key_line: 1-based line of its key, if it is an entry of a mapping.
-        key_column: likewise.
-        origin: shown instead of the location, for values from the command line.
-        file: name of the text in messages.
-    """
-
-    value: Any
-    line: int
-    column: int
-    key_line: int = 0
-    key_column: int = 0
-    origin: str = ""
-    file: str = ""
+    value: Any  # a scalar, a dict of str to Located, or a list of Located
+    line: int  # 1-based line of the value
+    column: int  # 1-based column of the value
+    key_line: int = 0  # 1-based line of its key, if it is an entry of a mapping
+    key_column: int = 0  # likewise
+    origin: str = ""  # shown instead of the location, for values from the command line
+    file: str = ""  # name of the text in messages
 
     @property
     def place(self) -> str:
@@ -101,7 +90,6 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
     """Return the document in a YAML 1.2 text.
 
     Args:
-        text: the YAML.
         name: name of the text in messages, such as its path.
         problems: receives errors that leave the rest readable, such as a key that occurs twice; None raises them.
 
@@ -240,7 +228,7 @@ class _Builder:
         return None
 
     def _number(self, node: ScalarNode, text: str, tag: str) -> int | float | None:
-        digits = text.replace("_", "") if len(text) <= _MAX_DIGITS else ""
+        digits = text.replace("_", "") if len(text) <= 400 else ""
         try:
             if tag == "int":
                 return int(digits, 0) if digits[:2] in ("0x", "0o") else int(digits)

@@ -21,19 +21,12 @@ DEFAULT_THRESHOLDS = 0.05, 0.02
 
 @dataclass(frozen=True, slots=True)
 class CloudScore:
-    """Scores of a cloud at one tolerance.
+    """Scores of a cloud at one tolerance."""
 
-    Attributes:
-        threshold: the tolerance t, in the truth's unit.
-        accuracy: share of the cloud's points within t of the true surface.
-        completeness: share, by area, of the surface to be covered that is within t of the cloud.
-        f_score: harmonic mean of the two (Knapitsch et al., "Tanks and Temples", 2017, section 5).
-    """
-
-    threshold: float
-    accuracy: float
-    completeness: float
-    f_score: float
+    threshold: float  # the tolerance t, in the truth's unit
+    accuracy: float  # share of the cloud's points within t of the true surface
+    completeness: float  # share, by area, of the surface to be covered that is within t of the cloud
+    f_score: float  # harmonic mean of the two (Knapitsch et al., "Tanks and Temples", 2017, section 5)
 
     def as_dict(self) -> dict[str, float]:
         """Return all figures by name."""
@@ -42,14 +35,11 @@ class CloudScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudDistances:
-    """Distances between a cloud and the true surface; infinite beyond the limit of the search.
+    """Distances between a cloud and the true surface; infinite beyond the limit of the search."""
 
-    Attributes:
-        of_points: (N,) float32, from each point of the cloud to the nearest sample of the whole true surface.
-        of_surface: (M,) float32, from each sample of the surface to be covered to the nearest point.
-    """
-
+    # (N,) float32, from each point of the cloud to the nearest sample of the whole true surface
     of_points: NDArray[np.float32]
+    # (M,) float32, from each sample of the surface to be covered to the nearest point
     of_surface: NDArray[np.float32]
 
     def quantiles(self, surface: TrueSurface, shares: Sequence[float] = (0.5, 0.9)) -> dict[str, tuple[float, ...]]:

@@ -48,10 +48,6 @@ from pano_mvs.scene import PointCloud
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
 
 CLOUD_FILE, MODEL_FOLDER = "cloud.ply", "colmap/sparse/0"
-# Distances are measured up to this multiple of the largest tolerance, for quantiles and files.
-_FARTHEST = 20.0
-# Points of a reference cloud that must be covered; all of its points count for the cloud's own accuracy.
-_MAX_SAMPLES = 4_000_000
 
 CloudInput = Path | PointCloud | NDArray[np.floating]
 """A PLY file or the output folder of a run, a record, or points (N, 3)."""
@@ -59,25 +55,16 @@ CloudInput = Path | PointCloud | NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class CloudTruth:
-    """What a cloud is compared with.
+    """What a cloud is compared with."""
 
-    Attributes:
-        pieces: returns the whole true surface at each call, in pieces (K, 3) of which one is in memory at a time.
-        surface: the part that should be covered.
-        used: the views that show it, by name; none of a reference cloud.
-        views: number of views with truth.
-        unit: unit of lengths, for display.
-        cameras: (M, 3) centres of the cameras that were used, in the truth's world.
-        up: (3,) unit vector away from the ground, as far as the cameras agree.
-    """
-
+    # returns the whole true surface at each call, in pieces (K, 3) of which one is in memory at a time
     pieces: Callable[[], Iterable[Points]]
-    surface: TrueSurface
-    used: dict[str, TrueView]
-    views: int
-    unit: str
-    cameras: NDArray[np.float64]
-    up: NDArray[np.float64]
+    surface: TrueSurface  # the part that should be covered
+    used: dict[str, TrueView]  # the views that show it, by name; none of a reference cloud
+    views: int  # number of views with truth
+    unit: str  # unit of lengths, for display
+    cameras: NDArray[np.float64]  # (M, 3) centres of the cameras that were used, in the truth's world
+    up: NDArray[np.float64]  # (3,) unit vector away from the ground, as far as the cameras agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +193,7 @@ def evaluate_cloud(
         truth_from_cloud, used = _alignment(model, known)
         points = MovedPoints(points, truth_from_cloud)
     compared = _compared(target, used, known, voxel_size=limits[0], unit=length_unit(metric=is_metric))
-    farthest = _FARTHEST * limits[-1]
+    farthest = 20.0 * limits[-1]  # for quantiles and files
     distances = cloud_distances(points, compared.pieces(), compared.surface, limit=farthest)
     return CloudEvaluation(
         source=source_name(source),
@@ -263,7 +250,8 @@ def _compared(
     up = np.array(WORLD_UP) if common_up is None else common_up  # for the images of the errors
     if not isinstance(truth, Path) or not is_folder(truth):
         reference = _open(truth)
-        some, _ = reference.some(max(1, -(-reference.count // _MAX_SAMPLES)))
+        # Only some points of a reference cloud must be covered; all of them count for the cloud's own accuracy.
+        some, _ = reference.some(max(1, -(-reference.count // 4_000_000)))
         surface = surface_of_cloud(some, voxel_size=voxel_size)
         return CloudTruth(reference.chunks, surface, {}, 0, length_unit(metric=False), cameras, up)
     files = find_true_ranges(truth)

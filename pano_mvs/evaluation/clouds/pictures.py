@@ -19,7 +19,6 @@ from pano_mvs.io.ply import RGB, ply_header
 _VERTEX = np.dtype([*((name, "<f4") for name in "xyz"), *((name, "u1") for name in RGB), ("distance", "<f4")])
 # From correct to wrong, distinguishable for colour-blind readers.
 _NEAREST, _FARTHEST, _BEYOND = np.array([38, 130, 142]), np.array([240, 190, 60]), (190, 30, 45)
-_NOT_COUNTED = (205, 205, 205)
 
 
 def distance_colors(distances: NDArray[np.float32], limits: Sequence[float]) -> NDArray[np.uint8]:
@@ -31,7 +30,7 @@ def distance_colors(distances: NDArray[np.float32], limits: Sequence[float]) -> 
     table = np.vstack([(1 - shares) * _NEAREST + shares * _FARTHEST, _BEYOND]).astype(np.uint8)
     level = np.searchsorted(np.asarray(limits, np.float32), distances.clip(0, np.float32(3e38)))
     colors = table[level.clip(0, len(limits))]
-    colors[np.isnan(distances)] = _NOT_COUNTED
+    colors[np.isnan(distances)] = 205
     return np.asarray(colors)
 
 
@@ -46,7 +45,6 @@ def write_error_cloud(
     """Write points as binary little-endian PLY: x y z, red green blue, and their distance as a scalar (float).
 
     Args:
-        path: the file to write; its folder is made.
         points: the points in chunks (K, 3), N in all, one chunk in memory at a time.
         distances: (N,) of each; larger ones than `farthest` are written as `farthest`.
         limits: tolerances in rising order, for the colours (see `distance_colors`).

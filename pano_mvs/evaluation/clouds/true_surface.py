@@ -19,31 +19,20 @@ _MIN_COSINE = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueView:
-    """A view with true ranges.
+    """A view with true ranges."""
 
-    Attributes:
-        cam_from_world: its true pose.
-        range: (H, W) float32 true ranges in the truth's unit, NaN where there is no surface.
-    """
-
-    cam_from_world: Rigid3
-    range: NDArray[np.float32]
+    cam_from_world: Rigid3  # its true pose
+    range: NDArray[np.float32]  # (H, W) float32 true ranges in the truth's unit, NaN where there is no surface
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueSurface:
-    """Samples of a surface, each with the area that it represents.
+    """Samples of a surface, each with the area that it represents."""
 
-    Attributes:
-        points_in_world: (N, 3) float32.
-        area: (N,) float64, in squared units of the truth, or numbers of voxels.
-        view_idx: (N,) int64 the view from which each sample comes; 0 for a reference cloud.
-        pixel_idx: (N,) int64 its pixel there, row-major; the point's position in a reference cloud.
-    """
-
-    points_in_world: NDArray[np.float32]
-    area: NDArray[np.float64]
-    view_idx: NDArray[np.int64]
+    points_in_world: NDArray[np.float32]  # (N, 3) float32
+    area: NDArray[np.float64]  # (N,) float64, in squared units of the truth, or numbers of voxels
+    view_idx: NDArray[np.int64]  # (N,) int64 the view from which each sample comes; 0 for a reference cloud
+    # (N,) int64 its pixel there, row-major; the point's position in a reference cloud
     pixel_idx: NDArray[np.int64]
 
 

@@ -60,7 +60,6 @@ def write_error_picture(
     too far; black where there is no estimate, grey where no error is counted.
 
     Args:
-        path: the file to write; its folder is made.
         estimated: (H, W) ranges in the truth's unit, NaN where there is none.
         truth: (H, W) true ranges, NaN where unknown.
         image: (h, w, 3) uint8 RGB, the panorama; None leaves its place empty.

@@ -23,16 +23,11 @@ from pano_mvs.io.images.names import pair_image_names
 
 @dataclass(frozen=True)
 class FoundScale:
-    """The factor from the estimates' unit to the truth's.
+    """The factor from the estimates' unit to the truth's."""
 
-    Attributes:
-        value: the factor; with several groups of poses, that of the largest group.
-        reason: how it was found.
-        others: factor of each image of a further group; NaN if it cannot be determined.
-    """
-
-    value: float
-    reason: str
+    value: float  # the factor; with several groups of poses, that of the largest group
+    reason: str  # how it was found
+    # factor of each image of a further group; NaN if it cannot be determined
     others: Mapping[str, float] = field(default_factory=dict)
 
     def of_views(self, names: Iterable[str]) -> dict[str, float]:

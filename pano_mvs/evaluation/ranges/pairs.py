@@ -21,34 +21,22 @@ from pano_mvs.scene.masking import decode_mask, placed_mask
 
 @dataclass(frozen=True, eq=False)
 class ViewMaps:
-    """The maps of one view, all of the truth's size.
+    """The maps of one view, all of the truth's size."""
 
-    Attributes:
-        estimated: (H, W) float32 in scene units, NaN where there is no estimate.
-        truth: (H, W) float32 true range, NaN where unknown.
-        confidence: (H, W) uint8, or None.
-        counted: (H, W), False excludes a pixel; None counts all.
-        size_hw: (height, width) of the estimate before resampling.
-    """
-
-    estimated: NDArray[np.float32]
-    truth: NDArray[np.float32]
-    confidence: NDArray[np.uint8] | None
-    counted: NDArray[np.bool_] | None
-    size_hw: tuple[int, int]
+    estimated: NDArray[np.float32]  # (H, W) float32 in scene units, NaN where there is no estimate
+    truth: NDArray[np.float32]  # (H, W) float32 true range, NaN where unknown
+    confidence: NDArray[np.uint8] | None  # (H, W) uint8, or None
+    counted: NDArray[np.bool_] | None  # (H, W), False excludes a pixel; None counts all
+    size_hw: tuple[int, int]  # (height, width) of the estimate before resampling
 
 
 @dataclass(frozen=True)
 class ViewMasks:
-    """Masks that exclude pixels (where they are 0) from the scores.
+    """Masks that exclude pixels (where they are 0) from the scores."""
 
-    Attributes:
-        folder: a folder with a mask per image, `<image name>.png` or `<name without extension>.png`, or None.
-        common: one mask for all images, or None.
-    """
-
+    # a folder with a mask per image, `<image name>.png` or `<name without extension>.png`, or None
     folder: Path | None = None
-    common: Path | None = None
+    common: Path | None = None  # one mask for all images, or None
 
     def require_some(self, names: Sequence[str]) -> None:
         """Raise InputError unless the folder holds a mask of one of the views."""

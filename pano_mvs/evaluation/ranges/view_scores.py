@@ -91,19 +91,12 @@ Align = Literal["none", "median", "lsq"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredPixels:
-    """The pixels of one view with ground truth, in any order.
+    """The pixels of one view with ground truth, in any order."""
 
-    Attributes:
-        found: (N,) estimated ranges in the truth's unit, NaN where there is no estimate.
-        true: (N,) true ranges, positive and finite.
-        weight: (N,) solid angles in steradians.
-        confidence: (N,) the larger the more confident, or None.
-    """
-
-    found: FloatArray
-    true: FloatArray
-    weight: FloatArray
-    confidence: NDArray[np.integer] | None = None
+    found: FloatArray  # (N,) estimated ranges in the truth's unit, NaN where there is no estimate
+    true: FloatArray  # (N,) true ranges, positive and finite
+    weight: FloatArray  # (N,) solid angles in steradians
+    confidence: NDArray[np.integer] | None = None  # (N,) the larger the more confident, or None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -213,20 +206,14 @@ class Sparsification:
 
     Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
     order. Errors are |error| / truth, at most 1.
-
-    Attributes:
-        kept: (N,) share of the pixels with truth and estimate that is kept, growing to 1.
-        error: (N,) mean relative error of those.
-        oracle_error: (N,) mean relative error if the pixels were ordered by their true errors.
-        area: under the curve, the mean over all shares.
-        oracle_area: under the oracle's.
     """
 
-    kept: NDArray[np.float64]
-    error: NDArray[np.float64]
+    kept: NDArray[np.float64]  # (N,) share of the pixels with truth and estimate that is kept, growing to 1
+    error: NDArray[np.float64]  # (N,) mean relative error of those
+    # (N,) mean relative error if the pixels were ordered by their true errors
     oracle_error: NDArray[np.float64]
-    area: float
-    oracle_area: float
+    area: float  # under the curve, the mean over all shares
+    oracle_area: float  # under the oracle's
 
     @property
     def ause(self) -> float:
@@ -357,20 +344,14 @@ BASELINES = "best", "median", "mean"
 
 @dataclass(frozen=True, slots=True)
 class ViewScores:
-    """The scores of one range map, and of constants.
+    """The scores of one range map, and of constants."""
 
-    Attributes:
-        pixels: number of pixels with truth.
-        scale: factor by which the estimates were multiplied.
-        scores: name to value (see `score_view`).
-        constants: name of a baseline to its scores by the same names. "best" is the best constant for each score (see
-            `best_constant_errors`), "median" and "mean" are those of the view's true ranges, unweighted. Each is scored
-            over the same pixels as the range map.
-    """
-
-    pixels: int
-    scale: float
-    scores: Mapping[str, float]
+    pixels: int  # number of pixels with truth
+    scale: float  # factor by which the estimates were multiplied
+    scores: Mapping[str, float]  # name to value (see `score_view`)
+    # name of a baseline to its scores by the same names. "best" is the best constant for each score (see
+    # `best_constant_errors`), "median" and "mean" are those of the view's true ranges, unweighted. Each is scored over
+    # the same pixels as the range map.
     constants: Mapping[str, Mapping[str, float]]
 
 
@@ -404,7 +385,7 @@ def score_view(
     mask: NDArray[np.bool_] | None = None,
     settings: ScoreSettings | None = None,
 ) -> ViewScores:
-    """Return the scores of a range map.
+    """Return the scores of a range map; see `scored_pixels` for the maps and the scale.
 
     Each prefix of `PROTOCOLS` precedes mse, psnr_db, rmse, mae, abs_rel, the deltas and the bads of `range_errors`.
     completeness and w_completeness are the shares of pixels with an estimate; median_relative_error and
@@ -412,11 +393,6 @@ def score_view(
     sparsification_oracle_area and ause, by solid angle, and plain_ause with equal weights.
 
     Args:
-        estimated: (H, W) ranges in scene units; values that are not positive and finite count as missing.
-        truth: (H, W) true ranges; pixels with anything but a positive finite one are ignored.
-        confidence: (H, W), the larger the more confident.
-        scale: factor from scene units to the truth's unit.
-        mask: (H, W), False excludes a pixel.
         settings: how to score; by default those of `ScoreSettings`.
 
     Raises:

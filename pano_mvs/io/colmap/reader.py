@@ -44,9 +44,6 @@ _IMAGE = struct.Struct("<I7dI")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT3D = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
 _TRACK = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
-_MAX_SIDE = 1 << 24
-_MAX_QUAT_ERROR = 1e-3
-_MAX_ERROR_PX = 1e9
 _SPHERE_ID, _SPHERE_CAMERA = 11, struct.Struct("<IiQQ3d")
 
 
@@ -60,24 +57,15 @@ class ModelCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelImage:
-    """One registered image.
+    """One registered image."""
 
-    Attributes:
-        name: of the file, relative to the folder of the images.
-        quat_wxyz: rotation of cam_from_world as stored, (4,).
-        translation: of cam_from_world, (3,).
-        pixels: (n, 2), its key points.
-        point_ids: (n,), the point that each key point observes; negative without one.
-        where: the file and the image, for error messages.
-    """
-
-    name: str
-    quat_wxyz: NDArray[np.float64]
-    translation: NDArray[np.float64]
+    name: str  # of the file, relative to the folder of the images
+    quat_wxyz: NDArray[np.float64]  # rotation of cam_from_world as stored, (4,)
+    translation: NDArray[np.float64]  # of cam_from_world, (3,)
     camera_id: int
-    pixels: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-    where: str
+    pixels: NDArray[np.float64]  # (n, 2), its key points
+    point_ids: NDArray[np.int64]  # (n,), the point that each key point observes; negative without one
+    where: str  # the file and the image, for error messages
 
     def cam_from_world(self) -> Rigid3:
         """Return the pose.
@@ -94,23 +82,14 @@ class ModelImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelPoints3D:
-    """All points.
+    """All points."""
 
-    Attributes:
-        ids: (N,), increasing.
-        xyz: (N, 3).
-        rgb: (N, 3) uint8.
-        errors_px: (N,), mean reprojection errors; −1 if unknown.
-        track_lengths: (N,), number of observations.
-        track_image_ids: the images of all observations, ordered by point.
-    """
-
-    ids: NDArray[np.int64]
-    xyz: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    errors_px: NDArray[np.float64]
-    track_lengths: NDArray[np.int64]
-    track_image_ids: NDArray[np.int64]
+    ids: NDArray[np.int64]  # (N,), increasing
+    xyz: NDArray[np.float64]  # (N, 3)
+    rgb: NDArray[np.uint8]  # (N, 3) uint8
+    errors_px: NDArray[np.float64]  # (N,), mean reprojection errors; −1 if unknown
+    track_lengths: NDArray[np.int64]  # (N,), number of observations
+    track_image_ids: NDArray[np.int64]  # the images of all observations, ordered by point
 
 
 def read_colmap_model(folder: Path) -> Poses:
@@ -214,7 +193,7 @@ def _read_sphere_model(folder: Path) -> Poses:
 
 def _pose(image: ModelImage) -> Rigid3:
     pose = image.cam_from_world()
-    if np.abs(image.quat_wxyz).max() > 2 or abs(np.linalg.norm(image.quat_wxyz) - 1) > _MAX_QUAT_ERROR:
+    if np.abs(image.quat_wxyz).max() > 2 or abs(np.linalg.norm(image.quat_wxyz) - 1) > 1e-3:
         raise InputError(f"{image.where}: the length of its quaternion is not 1. Write the model again")
     return pose
 
@@ -249,7 +228,7 @@ def _errors_rad(points: ModelPoints3D, width_by_id: Mapping[int, int], path: Pat
     known = (points.errors_px > 0) & np.isfinite(points.errors_px) & (sums > 0)
     rad_per_px = 2 * np.pi * points.track_lengths[known] / sums[known]
     errors = np.zeros(len(points.ids))
-    errors[known] = np.minimum(points.errors_px[known], _MAX_ERROR_PX) * rad_per_px
+    errors[known] = np.minimum(points.errors_px[known], 1e9) * rad_per_px
     return errors.astype(np.float32)
 
 
@@ -271,7 +250,7 @@ def read_cameras(path: Path) -> dict[int, ModelCamera]:
             cameras[camera_id] = camera
             if camera.model != "EQUIRECTANGULAR":
                 break
-            if not 0 < min(camera.size_hw) <= max(camera.size_hw) <= _MAX_SIDE:
+            if not 0 < min(camera.size_hw) <= max(camera.size_hw) <= 1 << 24:
                 height, width = camera.size_hw
                 raise ValueError(f"camera {camera_id} has {width}×{height} px")
         return cameras

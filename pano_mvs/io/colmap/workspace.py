@@ -22,7 +22,6 @@ from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import write_png
 
 WORKSPACE = "colmap_dense"
-_SOURCES = 20  # as COLMAP's image_undistorter writes
 
 
 def face_image_name(face: str, item: str, suffix: str) -> str:
@@ -47,7 +46,6 @@ def write_face(
     """Write the four files of one face of one panorama, and return their paths by target in the output folder.
 
     Args:
-        face: the name of the face.
         suffix: suffix of the image, ".jpg" or ".png".
         image: (h, w, 3) uint8 RGB.
         mask: (h, w) bool, False is ignored.
@@ -85,7 +83,8 @@ def write_stereo_configs(scratch: Path, image_names: Iterable[str]) -> dict[str,
         f"{WORKSPACE}/stereo/fusion.cfg": scratch / "fusion.cfg",
     }
     match_file, fusion_file = targets.values()
-    match_file.write_text("".join(f"{name}\n__auto__, {_SOURCES}\n" for name in names), encoding="utf-8")
+    # As COLMAP's image_undistorter writes it.
+    match_file.write_text("".join(f"{name}\n__auto__, 20\n" for name in names), encoding="utf-8")
     fusion_file.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     return targets
 

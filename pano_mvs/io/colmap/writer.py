@@ -19,8 +19,6 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.photographs import Photographs
 
 ModelForm = Literal["bin", "txt", "both"]
-# COLMAP's OPENCV_FISHEYE cannot project points at 90° from the axis or beyond.
-MAX_ANGLE_DEG = 89.0
 
 
 def write_colmap_model(
@@ -37,7 +35,6 @@ def write_colmap_model(
     observations, in pixels of the given size. The same poses give the same bytes.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each image by name.
         photographs: ordinary photographs, in the same world; see `_add_photographs`.
@@ -70,15 +67,10 @@ def write_colmap_model(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutPanorama:
-    """The faces of one panorama.
+    """The faces of one panorama."""
 
-    Attributes:
-        views: the faces. Panoramas that share the same sequence object share a rig.
-        image_names: names of the faces' images in the same order, relative to the image folder.
-    """
-
-    views: Sequence[PinholeView]
-    image_names: Sequence[str]
+    views: Sequence[PinholeView]  # the faces. Panoramas that share the same sequence object share a rig
+    image_names: Sequence[str]  # names of the faces' images in the same order, relative to the image folder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +96,6 @@ def write_rig_model(
     face. Points that no face observes are omitted, because OpenMVS stops reading at the first of them.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: poses of the panoramas with points and tracks. Errors become pixels at a face's centre (f per radian).
         cuts: panorama name to its faces; panoramas without an entry are omitted.
         photographs: ordinary photographs, in the same world; see `_add_photographs`.
@@ -146,7 +137,6 @@ def write_lens_rig_model(
     axis of their lens are omitted, because COLMAP's model cannot project beyond 90°, and so are points without others.
 
     Args:
-        folder: the folder of the files, which is created if necessary.
         poses: poses of the panoramas, in metres, with points and tracks.
         pictures: panorama name to its pictures; panoramas without an entry are omitted.
         form: "bin", "txt" or "both".
@@ -317,7 +307,8 @@ def _pixels(
     """Return which bearings a lens observes, and their pixels in its picture, (n, 2)."""
     lens = rig.lenses[lens_idx]
     rays = rig.points_in_lens(bearings, lens_idx)
-    kept = np.flatnonzero((labels == lens_idx) & (lens.angle_from_axis(rays) < np.radians(MAX_ANGLE_DEG)))
+    # COLMAP's OPENCV_FISHEYE cannot project points at 90° from the axis or beyond.
+    kept = np.flatnonzero((labels == lens_idx) & (lens.angle_from_axis(rays) < np.radians(89.0)))
     return kept, lens.pixel_from_ray(rays[kept]).reshape(-1, 2)
 
 
@@ -340,7 +331,6 @@ class _ModelPoints:
     """Collect the observations of images in tracks, and add the points to a pycolmap model."""
 
     def __init__(self, poses: Poses) -> None:
-        """Create empty tracks."""
         import pycolmap
 
         self._poses = poses
@@ -398,7 +388,6 @@ def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int,
 
 
 def _rigid(rotation: FloatArray, translation: FloatArray) -> Any:
-    """Return a pycolmap.Rigid3d."""
     import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(rotation)), np.asarray(translation))

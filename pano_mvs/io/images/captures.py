@@ -29,25 +29,18 @@ _TURNED = (
 
 @dataclass(frozen=True)
 class PictureInfo:
-    """The size and the metadata of a panorama.
+    """The size and the metadata of a panorama."""
 
-    Attributes:
-        size_hw: (height, width) of the full sphere, width = 2 × height, at the resolution of the file. For a crop that
-            was resized, at the resolution of the original, in whose pixels its position is an integer.
-        file_size_hw: (height, width) of the image in the file.
-        crop_ltwh: (left, top, width, height) of the part of the sphere in the file, or None for all of it.
-        gpano: its GPano metadata, or None.
-        warnings: warnings about this image, without the file's name.
-        traits: warnings that have the same text for all images to which they apply.
-        position_lla: (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None.
-    """
-
+    # (height, width) of the full sphere, width = 2 × height, at the resolution of the file. For a crop that was
+    # resized, at the resolution of the original, in whose pixels its position is an integer.
     size_hw: tuple[int, int]
-    file_size_hw: tuple[int, int]
+    file_size_hw: tuple[int, int]  # (height, width) of the image in the file
+    # (left, top, width, height) of the part of the sphere in the file, or None for all of it
     crop_ltwh: tuple[int, int, int, int] | None
-    gpano: GPano | None
-    warnings: tuple[str, ...] = ()
-    traits: tuple[str, ...] = ()
+    gpano: GPano | None  # its GPano metadata, or None
+    warnings: tuple[str, ...] = ()  # warnings about this image, without the file's name
+    traits: tuple[str, ...] = ()  # warnings that have the same text for all images to which they apply
+    # (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None
     position_lla: tuple[float, float, float] | None = None
 
     @property
@@ -224,17 +217,11 @@ Layout = Literal["auto", "side_by_side", "folders", "suffixes"]
 
 @dataclass(frozen=True, slots=True)
 class RigPictures:
-    """The pictures of one capture of a rig.
+    """The pictures of one capture of a rig."""
 
-    Attributes:
-        name: path relative to the folder, without the lens and with the extension .png.
-        files: the file that contains both pictures side by side, or the file of each lens.
-        problem: why the capture is incomplete; empty if it is complete.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    problem: str = ""
+    name: str  # path relative to the folder, without the lens and with the extension .png
+    files: tuple[Path, ...]  # the file that contains both pictures side by side, or the file of each lens
+    problem: str = ""  # why the capture is incomplete; empty if it is complete
 
 
 def list_rig_pictures(
@@ -243,7 +230,6 @@ def list_rig_pictures(
     """Return the captures in a folder and its subfolders, in natural order.
 
     Args:
-        lens_names: names of the two lenses.
         layout: "side_by_side": each file shows both lenses, the first on the left; "folders": one of the folders in
             the path of a file has the name of its lens, as in front/000.jpg; "suffixes": file names end with a
             separator and the name of the lens, as in 000_front.jpg. "auto": folders if a folder has the name of a lens,

@@ -30,21 +30,15 @@ _MIN_CORRELATION = 0.85
 # Of 512 magnitudes: such copies agree by .98 and more, other panoramas by .89 and less (rooms, a city, a flat).
 _SAMPLES, _MIN_AGREEMENT = 512, 0.9
 _ROWS_AT_ONCE = 1024
-_KEPT_SPECTRA = 1024  # of 132 kB
 _REDUCED = {8: cv2.IMREAD_REDUCED_GRAYSCALE_8, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 2: cv2.IMREAD_REDUCED_GRAYSCALE_2}
 
 
 @dataclass(frozen=True)
 class Copy:
-    """What a picture is a copy of.
+    """What a picture is a copy of."""
 
-    Attributes:
-        original: name of the earlier picture.
-        turn_deg: how far the copy is turned to the left about the vertical, from 0 to 360.
-    """
-
-    original: str
-    turn_deg: float
+    original: str  # name of the earlier picture
+    turn_deg: float  # how far the copy is turned to the left about the vertical, from 0 to 360
 
 
 def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read: bool = True) -> dict[str, Copy]:
@@ -55,7 +49,6 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
 
     Args:
         paths: of the pictures, by name. Those that OpenCV does not read are compared with none.
-        max_pixels: limit of a picture.
         read: whether to read the pictures that no earlier command has read, which takes long; else they are not copies.
     """
     found = {name: _magnitudes(path, max_pixels, read=read) for name, path in paths.items()}
@@ -65,7 +58,7 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
     names, magnitudes = list(known), np.array(list(known.values()))
     copies: dict[str, Copy] = {}
 
-    @lru_cache(maxsize=_KEPT_SPECTRA)
+    @lru_cache(maxsize=1024)  # of 132 kB each
     def spectrum(name: str) -> NDArray[np.complex64] | None:
         picture = _reduced(paths[name], max_pixels)
         return None if picture is None else _spectrum(picture)
@@ -115,17 +108,14 @@ def _sampled_places() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _spectrum(picture: NDArray[np.uint8]) -> NDArray[np.complex64]:
-    return np.fft.rfft(_fine_structure(picture), axis=1).astype(np.complex64)
-
-
-def _fine_structure(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return a picture without its coarse structure, with norm 1; all zeros if no more than rounding is left of it."""
     margin = _SIZE_HW[1] // 16
     wrapped = np.pad(picture.astype(np.float32), ((0, 0), (margin, margin)), mode="wrap")
     fine = (wrapped - cv2.GaussianBlur(wrapped, (0, 0), _BLUR_PX))[:, margin:-margin]
     norm = float(np.linalg.norm(fine))
     is_plain = norm < 0.5 * np.sqrt(fine.size)
-    return np.asarray(np.zeros_like(fine) if is_plain else fine / norm, np.float32)
+    return np.fft.rfft(np.asarray(np.zeros_like(fine) if is_plain else fine / norm, np.float32), axis=1).astype(
+        np.complex64
+    )
 
 
 def _reduced(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:

@@ -36,28 +36,18 @@ from pano_mvs.scene.image_header import (
 
 _EXIF, _XMP, _EXTENDED_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
 _PNG_XMP = b"XML:com.adobe.xmp"
-_APP1 = 0xE1
-_TIFF_XMP = 700
 _MAX_DECOMPRESSED_BYTES = 16 << 20  # of all compressed packets of a file together
-_MAX_HEIF_EXIF_BYTES = 1 << 20
 _EXIF_IN_HEIF = re.compile(rb"Exif\0\0(?=II\*\0|MM\0\*)")
 
 
 @dataclass(frozen=True)
 class Container:
-    """The size and the metadata of an image file.
+    """The size and the metadata of an image file."""
 
-    Attributes:
-        size_hw: (height, width) as stored, or None if only decoding gives it.
-        exif: EXIF metadata, which begins with the byte order; empty if there is none.
-        xmp: XMP packets, possibly with bytes around them.
-        warning: which metadata was not read, and why; empty if all was read.
-    """
-
-    size_hw: tuple[int, int] | None = None
-    exif: bytes = b""
-    xmp: tuple[bytes, ...] = ()
-    warning: str = ""
+    size_hw: tuple[int, int] | None = None  # (height, width) as stored, or None if only decoding gives it
+    exif: bytes = b""  # EXIF metadata, which begins with the byte order; empty if there is none
+    xmp: tuple[bytes, ...] = ()  # XMP packets, possibly with bytes around them
+    warning: str = ""  # which metadata was not read, and why; empty if all was read
 
 
 def read_container(data: bytes) -> Container:
@@ -76,7 +66,7 @@ def _read_jpeg(data: bytes) -> Container:
     packets: list[bytes] = []
     extended: dict[bytes, dict[int, bytes]] = {}
     for marker, start, end in jpeg_segments(data):
-        if marker != _APP1:
+        if marker != 0xE1:  # APP1
             continue
         body = data[start:end]
         if body.startswith(_EXIF):
@@ -143,14 +133,14 @@ def _read_tiff(data: bytes) -> Container:
     tiff = open_tiff(data)
     if tiff is None:
         return Container()
-    packet = tiff.directory(tiff.first).get(_TIFF_XMP)
+    packet = tiff.directory(tiff.first).get(700)  # XMP
     return Container(stated_size(data), data, () if packet is None else (tiff.raw(packet),))
 
 
 def _read_heif(data: bytes) -> Container:
     """Read a HEIC or AVIF file, which stores EXIF uncompressed; its XMP is found by whoever searches the file."""
     found = _EXIF_IN_HEIF.search(data)
-    return Container(None, b"" if found is None else data[found.end() : found.end() + _MAX_HEIF_EXIF_BYTES])
+    return Container(None, b"" if found is None else data[found.end() : found.end() + 0x100000])
 
 
 _READERS: Mapping[ImageKind, Callable[[bytes], Container]] = {
@@ -243,28 +233,18 @@ def _sign(tiff: Tiff, entry: Entry | None, negative: bytes) -> int:
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
-_PACKET_BYTES = 1 << 20
-_MAX_WARNINGS = 3
 _MAX_SHOWN = 80  # characters of a field in a message
 
 
 @dataclass(frozen=True)
 class GPano:
-    """The GPano metadata of an image.
+    """The GPano metadata of an image."""
 
-    Attributes:
-        projection_type: "equirectangular" or, rarely, another, in lower case.
-        full_size_hw: (height, width) of the whole sphere in pixels, or None.
-        crop_ltwh: (left, top, width, height) of the part in the image, in the same pixels, or None.
-        heading_deg: compass heading of the image centre, or None.
-        pitch_deg: pitch of the camera, or None.
-        roll_deg: roll of the camera, or None.
-    """
-
-    projection_type: str = "equirectangular"
-    full_size_hw: tuple[int, int] | None = None
+    projection_type: str = "equirectangular"  # "equirectangular" or, rarely, another, in lower case
+    full_size_hw: tuple[int, int] | None = None  # (height, width) of the whole sphere in pixels, or None
+    # (left, top, width, height) of the part in the image, in the same pixels, or None
     crop_ltwh: tuple[int, int, int, int] | None = None
-    heading_deg: float | None = None
+    heading_deg: float | None = None  # compass heading of the image centre, or None
     pitch_deg: float | None = None
     roll_deg: float | None = None
 
@@ -302,7 +282,7 @@ def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None
             try:
                 fields = _fields(packet)
             except ValueError as error:
-                if len(warnings) < _MAX_WARNINGS:
+                if len(warnings) < 3:
                     warnings.append(f"its XMP metadata is malformed ({error}) and was ignored")
                 continue
             if fields:
@@ -323,7 +303,7 @@ def _between(source: bytes, start_mark: bytes, end_mark: bytes) -> Iterator[byte
         end = source.find(end_mark, start)
         if end < 0:
             return
-        if end - start <= _PACKET_BYTES:
+        if end - start <= 1 << 20:
             yield source[start : end + len(end_mark)]
         start = source.find(start_mark, end)
 
@@ -386,7 +366,6 @@ def add_level_gpano(path: Path, size_hw: tuple[int, int], *, heading_deg: float 
 
     Args:
         path: the file, as OpenCV writes it.
-        size_hw: (height, width) of the picture.
         heading_deg: compass heading of its middle; None is not stated.
         level: whether to state that pitch and roll are 0.
     """

@@ -15,12 +15,8 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 _WIDTH = 1280
 _BAR_HEIGHT, _MARGIN = 24, 16
 _INVALID_GREY = 128
-_QUALITY = 88
 _PAPER, _INK = (255, 255, 255), (60, 60, 60)
 _TEXT_SIZE, _TEXT_WEIGHT = 0.9, 2  # legible when the picture is shown at a third of its width
-# Colours of unconfirmed ranges are mixed with white to this share; filled ones have stripes of a period and a width.
-_DIMMED = 0.55
-_STRIPES_PX = 10, 4
 
 
 def write_preview(
@@ -36,7 +32,6 @@ def write_preview(
     Weak ranges are pale and filled ones striped, with a legend; see `mark_unconfirmed`.
 
     Args:
-        path: the file to write.
         image: (H, W, 3) uint8 RGB.
         range_map: (h, w) float32 range in scene units, NaN where invalid (shown grey).
         mask: (H, W), False where the picture is to be ignored (shown grey), or None.
@@ -56,7 +51,7 @@ def write_preview(
     if legend:
         stack.append(_legend(legend))
     bgr = cv2.cvtColor(np.vstack(stack), cv2.COLOR_RGB2BGR)
-    path.write_bytes(bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
+    path.write_bytes(bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 88])[1]))
 
 
 def range_limits(range_map: NDArray[np.float32]) -> tuple[float, float]:
@@ -93,9 +88,9 @@ def mark_unconfirmed(colors: NDArray[np.uint8], confidence: NDArray[np.uint8]) -
     """Return the colours of a range map with weak ranges pale and filled ones pale with stripes."""
     filled, weak = _unconfirmed(confidence)
     height, width = confidence.shape
-    period, thickness = _STRIPES_PX
+    period, thickness = 10, 4  # px
     stripes = (np.arange(height)[:, None] + np.arange(width)) % period < thickness
-    paper = np.where(weak | filled, _DIMMED, 0.0)
+    paper = np.where(weak | filled, 0.55, 0.0)  # the share of white in the colours of unconfirmed ranges
     paper[filled & stripes] = 1.0
     mixed = (1 - paper[..., None]) * colors + 255 * paper[..., None]
     return np.asarray(np.rint(mixed), np.uint8)

@@ -24,39 +24,26 @@ FACES = "frblud"
 NAMES = {"front": "f", "right": "r", "back": "b", "left": "l", "up": "u", "top": "u", "down": "d", "bottom": "d"}
 """Faces of a cube by their names in files of others."""
 
-_MAX_BYTES = 8 << 20
 _MAX_LEVELS = 24  # of 512 px tiles, this is more than 10^9 px along an edge
 
 
 class Grid(NamedTuple):
-    """A cube in one resolution.
+    """A cube in one resolution."""
 
-    Attributes:
-        side: number of tiles along an edge of a face.
-        url: returns the path of a tile, by face, row and column, which count from 0.
-    """
-
-    side: int
+    side: int  # number of tiles along an edge of a face
+    # returns the path of a tile, by face, row and column, which count from 0
     url: Callable[[str, int, int], str]
 
 
 @dataclass(frozen=True)
 class StatedScene:
-    """A scene of a configuration.
+    """A scene of a configuration."""
 
-    Attributes:
-        key: its identifier, to which links refer.
-        title: its name for people; may be empty.
-        links: keys of the scenes to which it leads.
-        grids: resolutions of its cube, the finest first.
-        panorama: path of an equirectangular image, or "".
-    """
-
-    key: str
-    title: str
-    links: tuple[str, ...]
-    grids: tuple[Grid, ...] = ()
-    panorama: str = ""
+    key: str  # its identifier, to which links refer
+    title: str  # its name for people; may be empty
+    links: tuple[str, ...]  # keys of the scenes to which it leads
+    grids: tuple[Grid, ...] = ()  # resolutions of its cube, the finest first
+    panorama: str = ""  # path of an equirectangular image, or ""
 
 
 def stated_scenes(file: Path) -> list[StatedScene]:
@@ -67,7 +54,7 @@ def stated_scenes(file: Path) -> list[StatedScene]:
         ValueError: if it seems to be a configuration, but cannot be parsed.
     """
     suffix = file.suffix.lower()
-    if suffix not in {".js", ".json", ".xml", ".html", ".htm"} or file.stat().st_size > _MAX_BYTES:
+    if suffix not in {".js", ".json", ".xml", ".html", ".htm"} or file.stat().st_size > 8 << 20:
         return []
     data = file.read_bytes()
     try:

@@ -21,7 +21,6 @@ from pano_mvs.io.images.tour_configurations import FACES, NAMES, Grid, StatedSce
 
 Tiles: TypeAlias = dict[tuple[str, int, int], Path]
 
-_MAX_CONFIGURATIONS = 200
 _FACE = "|".join([*NAMES, *FACES])
 _SKYBOX = dict(zip("012345", "ufrbld", strict=True))
 # Scene, level, face, row and column in the path of a tile without its extension.
@@ -40,21 +39,16 @@ _SIX_FILES = (
 
 @dataclass(frozen=True)
 class TourScene:
-    """One scene.
+    """One scene."""
 
-    Attributes:
-        name: its title in the tour's configuration; without one, the name of its folder or the common part of its
-            files, below the folder that all scenes share.
-        tiles: file of each tile of the finest complete resolution, by face, row and column, which count from 0; empty
-            for an equirectangular image.
-        links: names of the scenes to which it leads.
-        panorama: its equirectangular image, or None for a cube.
-    """
-
+    # its title in the tour's configuration; without one, the name of its folder or the common part of its files, below
+    # the folder that all scenes share
     name: str
+    # file of each tile of the finest complete resolution, by face, row and column, which count from 0; empty for an
+    # equirectangular image
     tiles: Mapping[tuple[str, int, int], Path]
-    links: tuple[str, ...] = ()
-    panorama: Path | None = None
+    links: tuple[str, ...] = ()  # names of the scenes to which it leads
+    panorama: Path | None = None  # its equirectangular image, or None for a cube
 
 
 def list_scenes(folder: Path, notes: list[str]) -> list[TourScene]:
@@ -209,7 +203,7 @@ def _likely_configurations(capture: _Capture) -> list[Path]:
     """Return the files that may be configurations, those nearest to the folder first."""
     files = [path for path in capture.files if path.suffix.lower() in {".js", ".json", ".xml", ".html", ".htm"}]
     files.sort(key=lambda path: (len(path.parts), natural_key(path.relative_to(capture.folder).as_posix())))
-    return files[:_MAX_CONFIGURATIONS]
+    return files[:200]
 
 
 def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Tiles, Path | None]:

@@ -24,26 +24,18 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace 
 
 _UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
-_MAX_HEADER_BYTES = 64 << 20
 _SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """The header of a video.
+    """The header of a video."""
 
-    Attributes:
-        size_hw: (height, width) of a frame as stored.
-        frames: number of frames.
-        frames_per_s: average frame rate.
-        is_turned: whether the header asks players to rotate the frames.
-        stereo: how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
-    """
-
-    size_hw: tuple[int, int]
+    size_hw: tuple[int, int]  # (height, width) of a frame as stored
     frames: int
-    frames_per_s: float
-    is_turned: bool
+    frames_per_s: float  # average frame rate
+    is_turned: bool  # whether the header asks players to rotate the frames
+    # how a frame shows both eyes. Then `size_hw` is that of the picture of one eye.
     stereo: StereoLayout = "none"
 
 
@@ -122,7 +114,7 @@ def _movie_header(path: Path) -> bytes:
             size, kind = int.from_bytes(head[:4], "big"), head[4:8]
             size = int.from_bytes(head[8:], "big") if size == 1 else size
             if kind == b"moov":
-                return head + file.read(min(size, _MAX_HEADER_BYTES))
+                return head + file.read(min(size, 64 << 20))
             if not 8 <= size <= length:  # it ends with the file, or is damaged
                 break
             file.seek(size - 16, os.SEEK_CUR)
@@ -143,9 +135,7 @@ def frames_between(
     Iteration ends at a frame that cannot be decoded.
 
     Args:
-        path: the video.
         begin_s: the first time, from the start of the video.
-        end_s: the last time.
         min_step_s: minimum time between two frames; frames in between are left out. 0 yields all.
         threads: number of threads of the decoder, each of which may hold a frame in memory.
         stereo: how a frame shows both eyes, of which one is returned.

@@ -13,11 +13,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, nearest_rotation
 
-# OpenGL's camera frame is x right, y up, z backwards.
-_CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-_MAX_LENGTH = 1e12
-_ROTATION_TOLERANCE = 1e-3
-
 
 @dataclass(frozen=True)
 class PosedView:
@@ -110,7 +105,9 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
-        file_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], f"{where} ({name})")
+        # OpenGL's camera frame is x right, y up, z backwards.
+        rotation = matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        file_from_cam = rigid_from_arrays(rotation, matrix[:3, 3], f"{where} ({name})")
         poses.append((name, file_from_cam.inverse() @ file_from_world))
     require_distinct([name for name, _ in poses], path)
     return dict(poses)
@@ -124,10 +121,10 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
     """
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
-    if np.abs(translation).max() > _MAX_LENGTH:
+    if np.abs(translation).max() > 1e12:
         raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is not a valid position")
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > _ROTATION_TOLERANCE:
+    if error > 1e-3:
         raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
     if np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: the rotation is a reflection (its determinant is −1): the axes are left-handed")

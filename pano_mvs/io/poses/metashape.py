@@ -96,7 +96,6 @@ def write_metashape(
     """Write poses of one group as cameras of a spherical sensor, in local coordinates.
 
     Args:
-        path: the file to write.
         poses: poses of one group. The chunk has their world.
         sizes_hw: (height, width) of each image.
         file_from_world: (3, 3) rotation of the component, which turns the chunk into the world that Metashape shows.

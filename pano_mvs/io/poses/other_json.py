@@ -157,7 +157,6 @@ def _pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
 
 
 _EQUIRECTANGULAR = "equirectangular"
-_UNDEFINED = ("-1", str((1 << 32) - 1))  # indices in the files of Meshroom and AliceVision
 
 
 def is_alicevision(data: Any) -> bool:
@@ -182,7 +181,7 @@ def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         if not isinstance(file, str) or not PurePosixPath(file.replace("\\", "/")).name:
             raise InputError(f"{where}: key 'path' must be the path of the image, got {file!r}")
         kind = cameras.get(view.get("intrinsicId"), {}).get("type")
-        in_rig = str(view.get("rigId", "-1")) not in _UNDEFINED
+        in_rig = str(view.get("rigId", "-1")) not in {"-1", str((1 << 32) - 1)}  # in newer and older files
         if kind != _EQUIRECTANGULAR or in_rig:
             camera = "part of a rig" if in_rig else kind
             raise InputError(f"{where} ({file}): its camera is {camera}, expected one equirectangular camera")

@@ -19,8 +19,7 @@ from pano_mvs.session.planning import reference_times
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import Session
 
-MIN_SIZE = 7
-"""Smallest number of images of a block."""
+MIN_SIZE = 7  # smallest number of images of a block
 
 
 def default_overlap(size: int) -> int:
@@ -30,15 +29,11 @@ def default_overlap(size: int) -> int:
 
 @dataclass(frozen=True)
 class BlockDecision:
-    """Whether a run is divided into blocks.
+    """Whether a run is divided into blocks."""
 
-    Attributes:
-        division: how; None to run all images at once.
-        reason: how and why in one line, also if the capture should be divided and cannot be; "" if all images at once
-            need no explanation.
-    """
-
-    division: Division | None = None
+    division: Division | None = None  # how; None to run all images at once
+    # how and why in one line, also if the capture should be divided and cannot be; "" if all images at once need no
+    # explanation
     reason: str = ""
 
 
@@ -48,11 +43,8 @@ def decision_of(
     """Return the division that the options of `run` state, or without a size the one that `decide_blocks` finds.
 
     Args:
-        execution: how units are computed.
         size: maximum number of images of a block; 0 for no blocks; None to decide.
         overlap: images that consecutive blocks share; 0 for the default.
-        loop: whether the path ends where it began.
-        poses: rough poses.
 
     Raises:
         UsageError: if the options do not fit together.
@@ -75,9 +67,6 @@ def decide_blocks(session: Session, execution: Execution) -> BlockDecision:
     The memory of this machine, or that of a job of a queueing system, is compared with what the units for the whole
     capture are expected to need. Blocks are as large as memory permits. Nothing is divided for workers of a dask
     scheduler, whose memory is not known.
-
-    Args:
-        execution: how units are computed.
 
     Raises:
         InputError: if the file with the settings of the jobs cannot be read.

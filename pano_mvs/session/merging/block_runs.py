@@ -30,31 +30,20 @@ from pano_mvs.session.summarise import chain_of
 
 @dataclass(frozen=True)
 class ImageBlock:
-    """The images of one block.
+    """The images of one block."""
 
-    Attributes:
-        folder: the folder of links.
-        names: of the images, relative to it and to the capture.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
+    folder: Path  # the folder of links
+    names: tuple[str, ...]  # of the images, relative to it and to the capture
 
 
 @dataclass(frozen=True)
 class Division:
-    """How a capture is divided.
+    """How a capture is divided."""
 
-    Attributes:
-        size: maximum number of images along the path in a block.
-        overlap: number of images that consecutive blocks have in common.
-        loop: whether the path ends where it began.
-        poses: rough poses in any format that `read_poses` reads, to find where the path returns; None without.
-    """
-
-    size: int
-    overlap: int
-    loop: bool = False
+    size: int  # maximum number of images along the path in a block
+    overlap: int  # number of images that consecutive blocks have in common
+    loop: bool = False  # whether the path ends where it began
+    # rough poses in any format that `read_poses` reads, to find where the path returns; None without
     poses: Path | None = None
 
 
@@ -64,7 +53,6 @@ def split_images(images: Path, to: Path, division: Division) -> list[ImageBlock]
     Args:
         images: the folder of the capture, in natural order.
         to: folder to write to; new or empty.
-        division: how to divide it.
 
     Raises:
         UsageError: if a setting or a folder cannot be used.
@@ -83,7 +71,6 @@ def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] =
 
     Args:
         images: the folder of the capture, in natural order.
-        division: how to divide it.
         ignored: files and folders in it that do not belong to the capture, such as masks.
 
     Raises:
@@ -152,20 +139,12 @@ _SOURCE = "source.folder"
 
 @dataclass(frozen=True)
 class BlockRun:
-    """A block that is to be run.
+    """A block that is to be run."""
 
-    Attributes:
-        session: the workflow over its images.
-        names: of its images, in the order of the capture.
-        folder: of all blocks; the block's output folder is in it.
-        number: of the block, from 1.
-        blocks: number of all blocks.
-    """
-
-    session: Session
-    names: tuple[str, ...]
-    folder: Path
-    number: int
+    session: Session  # the workflow over its images
+    names: tuple[str, ...]  # of its images, in the order of the capture
+    folder: Path  # of all blocks; the block's output folder is in it
+    number: int  # of the block, from 1
     blocks: int
 
     @property
@@ -244,8 +223,6 @@ def block_runs(
 
     Args:
         session: over the whole capture.
-        blocks: the images of each.
-        folder: of all blocks.
         within: folder in it in which the links and the results are.
 
     Raises:

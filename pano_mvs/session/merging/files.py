@@ -36,16 +36,11 @@ from pano_mvs.scene.upright import world_up, z_up_from_world
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One block, with its largest group of cameras.
-
-    Attributes:
-        run: its output.
-        left_out: names of the cameras in other groups.
-    """
+    """One block, with its largest group of cameras."""
 
     run: RunOutput
     poses: Poses
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # names of the cameras in other groups
 
     @property
     def name(self) -> str:
@@ -146,19 +141,13 @@ def _as_stated(poses: Poses, stated: PosesSummary) -> Poses:
 
 @dataclass(frozen=True, eq=False)
 class MergeFiles:
-    """Writes a merged capture.
-
-    Attributes:
-        out: the output folder.
-        world_from_block: the similarity of each.
-        merged: the merged cameras.
-        written: files that depend on the images and the stages of the blocks, relative to the folder.
-    """
+    """Writes a merged capture."""
 
     out: Path
     blocks: Sequence[Block]
-    world_from_block: Sequence[Similarity3]
+    world_from_block: Sequence[Similarity3]  # the similarity of each
     merged: MergedBlocks
+    # files that depend on the images and the stages of the blocks, relative to the folder
     written: set[str] = field(default_factory=set)
 
     def write_model(self, *, has_cloud: bool) -> None:

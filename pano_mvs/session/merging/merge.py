@@ -55,19 +55,12 @@ _MERGED_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class MergeResult:
-    """What a merge found and wrote.
-
-    Attributes:
-        summary: what run.json holds.
-        blocks: the blocks, as given.
-        alignment: their similarities and their agreement.
-        merged: the cameras, and to which block each belongs.
-    """
+    """What a merge found and wrote."""
 
     summary: RunSummary
-    blocks: tuple[Block, ...]
-    alignment: BlockAlignment
-    merged: MergedBlocks
+    blocks: tuple[Block, ...]  # the blocks, as given
+    alignment: BlockAlignment  # their similarities and their agreement
+    merged: MergedBlocks  # the cameras, and to which block each belongs
 
 
 def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) -> MergeResult:
@@ -79,7 +72,6 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
     are not connected, or disagree.
 
     Args:
-        outs: output folders of runs.
         to: folder to write to: new, empty, or the result of an earlier merge.
         cache: folder of the cache that all runs used; None for those that their run.json name.
 
@@ -263,7 +255,6 @@ def _links(blocks: Sequence[Block]) -> tuple[PairLink, ...]:
 # As shares of the distance between neighbouring cameras, and in degrees: medians over the common cameras of two blocks.
 DOUBTFUL_OFFSET, REFUSED_OFFSET = 0.05, 0.25
 DOUBTFUL_TURN_DEG, REFUSED_TURN_DEG = 0.5, 3.0
-_DOUBTFUL_CAMERA = 0.5  # of the distance between neighbouring cameras
 
 
 def require_connected(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
@@ -332,7 +323,7 @@ def camera_doubts(blocks: Sequence[Block], alignment: BlockAlignment) -> dict[st
     doubts: dict[str, str] = {}
     for link in alignment.links:
         for name, offset in zip(link.names, link.offsets.tolist(), strict=True):
-            if offset > _DOUBTFUL_CAMERA * link.spacing:
+            if offset > 0.5 * link.spacing:  # the distance between neighbouring cameras
                 doubts[name] = (
                     f"{blocks[link.first].name} and {blocks[link.second].name} place it "
                     f"{offset / link.spacing:.2g} times the distance between neighbouring cameras apart"

@@ -29,12 +29,8 @@ from pano_mvs.scene.upright import world_up, z_up_from_world
 
 Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 
-_SAMPLED_POINTS = 500_000
 _EDGE_QUANTILE = 0.003
 _MARGIN = 0.03
-_MIN_POINTS = 100
-# In terms of the height of the room.
-_LENGTH_SHARE, _GAP_SHARE, _SNAP_SHARE = 0.15, 0.12, 0.08
 _MAX_SIDE_PX = 4096
 
 
@@ -80,7 +76,7 @@ def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParam
     for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
         which = f"group {number}: " if poses.other_worlds else ""
         kept = int((group.view_counts >= params.min_views).sum())
-        if kept < _MIN_POINTS:
+        if kept < 100:
             ctx.note(f"{which}no floor plan: {kept} points of the cloud are seen from {params.min_views} views")
             continue
         folder = f"floor_plan_{number}" if number else "floor_plan"
@@ -134,7 +130,7 @@ class _GroupPlan:
 
     def _sample(self) -> tuple[FloatArray, FloatArray]:
         """Return points and normals of an even sample of the cloud."""
-        step = max(1, len(self.cloud) // _SAMPLED_POINTS)
+        step = max(1, len(self.cloud) // 500_000)
         parts = [(points[::step], normals[::step]) for points, normals, _ in self._chunks()]
         return np.concatenate([points for points, _ in parts]), np.concatenate([normals for _, normals in parts])
 
@@ -162,9 +158,9 @@ class _GroupPlan:
         walls = wall_lines(
             grid.wall_cells(),
             min_share=self.params.min_wall_share,
-            min_length=_LENGTH_SHARE * storey.height,
-            max_gap=_GAP_SHARE * storey.height,
-            snap=_SNAP_SHARE * storey.height,
+            min_length=0.15 * storey.height,
+            max_gap=0.12 * storey.height,
+            snap=0.08 * storey.height,
         )
         places = self.centers[:, :2].tolist()
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}

@@ -46,13 +46,10 @@ from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
 
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_MUCH = 0.01
 
 
 @params_from(panorama_faces)
 class _CutParams(Params):
-    """How panoramas are cut into faces."""
-
     variants: tuple[Variant, ...] = Field(
         default=("equirectangular", "faces"), min_length=1, description="whole panoramas, pinhole faces, or both"
     )
@@ -83,26 +80,18 @@ class SeedParams(Params):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """What is known about a panorama besides its colours; only `valid` is always known.
+    """What is known about a panorama besides its colours; only `valid` is always known."""
 
-    Attributes:
-        valid: (H, W) bool, False is masked.
-        ranges: (H, W) float32, NaN unknown.
-        normals_in_cam: (H, W, 3) float32, NaN unknown.
-        confidence: (H, W) uint8, 0 unknown.
-    """
-
-    valid: NDArray[np.bool_]
-    ranges: NDArray[np.float32] | None = None
-    normals_in_cam: NDArray[np.float32] | None = None
-    confidence: NDArray[np.uint8] | None = None
+    valid: NDArray[np.bool_]  # (H, W) bool, False is masked
+    ranges: NDArray[np.float32] | None = None  # (H, W) float32, NaN unknown
+    normals_in_cam: NDArray[np.float32] | None = None  # (H, W, 3) float32, NaN unknown
+    confidence: NDArray[np.uint8] | None = None  # (H, W) uint8, 0 unknown
 
 
 class FrameFiles:
     """The files of one panorama below a folder of the output."""
 
     def __init__(self, root: str, params: FramesParams, ctx: Context) -> None:
-        """Start without files."""
         self.root = root
         self.params = params
         self.ctx = ctx
@@ -121,7 +110,7 @@ class FrameFiles:
                 self._add_face(face, picture, layers)
         share = self.beyond / self.depths if self.depths else 0.0
         self.ctx.metric("beyond_depth", share)
-        if share > _MUCH:
+        if share > 0.01:
             unit = self.params.depth_unit
             self.ctx.note(
                 f"some depths exceed the {65535 * unit:g} scene units that 16 bits hold in steps of {unit:g}, and are "
@@ -243,9 +232,7 @@ def write_transforms(
 
     Args:
         root: folder of the variants in the output folder.
-        group: poses and frames.
         cloud: of the group; None: the sparse points of its poses.
-        ctx: of the stage.
         file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
     """
     files: dict[str, Path] = {}
@@ -293,9 +280,7 @@ def write_photographs(
     Args:
         root: folder of the variants in the output folder.
         group: poses and frames of the panoramas in whose world the photographs are.
-        photographs: the photographs; their files are copied unchanged.
         seed: whether there are initial points.
-        ctx: of the stage.
         file_from_world: as in `write_transforms`.
     """
     faces = group.listed().get("faces", [])

@@ -130,13 +130,6 @@ def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest:
 
 NAME = "mesh_textured"
 
-# Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
-_DEEPEST = 9
-
-# Measured: of each texel and of each pixel of a panorama while the texture is painted, of the mesh before it is
-# simplified, and of the solver.
-_BYTES_PER_TEXEL, _BYTES_PER_PIXEL, _MESH_BYTES, _SOLVER_BYTES = 60, 120, 400_000_000, 1_000_000_000
-
 
 class TexturedParams(MeshParams):
     """Settings of export.mesh_textured."""
@@ -174,8 +167,10 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
     for name in images:
         height, width = images[name].size_hw
         pixels = max(pixels, height * width)
-    painting = params.texture_px**2 * _BYTES_PER_TEXEL + pixels * _BYTES_PER_PIXEL + _MESH_BYTES
-    return max(_SOLVER_BYTES, painting)
+    # Measured: of each texel and of each pixel of a panorama while the texture is painted, of the mesh before it is
+    # simplified, and of the solver.
+    painting = params.texture_px**2 * 60 + pixels * 120 + 400_000_000
+    return max(1_000_000_000, painting)
 
 
 @stage(
@@ -213,7 +208,10 @@ def mesh_textured(
         if not number:
             ctx.metric("triangles", len(made.faces))
             ctx.metric("texture_px", max(made.atlas.size_hw))
-            ctx.metric("seen", _seen_share(made))
+            corners = made.atlas.uv_px
+            first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+            area = float(np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum()) / 2
+            ctx.metric("seen", min(1.0, float(made.seen.sum()) / max(area, 1.0)))
     return Files(files)
 
 
@@ -226,7 +224,8 @@ def textured_mesh(
     ctx: Context,
 ) -> TexturedMesh:
     """Return the textured surface of the cloud of one group of panoramas."""
-    solved, _ = solved_mesh(cloud, params, folder, deepest=_DEEPEST)
+    # Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
+    solved, _ = solved_mesh(cloud, params, folder, deepest=9)
     names = [name for name in views[0].names if name in views[1]]
 
     def load(idx: int) -> PaintView:
@@ -301,11 +300,3 @@ def _write(
         write_mtl(files[target(".mtl")], texture_file=texture)
         files[texture].write_bytes(picture)
     return files
-
-
-def _seen_share(mesh: TexturedMesh) -> float:
-    """Return the share of the triangles' area that a panorama sees."""
-    corners = mesh.atlas.uv_px
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = float(np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).sum()) / 2
-    return min(1.0, float(mesh.seen.sum()) / max(area, 1.0))

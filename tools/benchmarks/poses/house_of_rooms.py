@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.rod import Rod
 from tools.benchmarks.poses.painted import Paint, Painted, bounded, write_views
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, Colors
+from pano_mvs.testing.paint import Colors
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Surface, Vector
 from tests.synthetic.bounded import Bounded
+from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE
 from tools.benchmarks.poses.painted import Paint, bounded, write_views
 
 STEP = 0.6

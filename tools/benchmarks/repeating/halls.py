@@ -6,7 +6,7 @@ from typing import Literal, Unpack
 
 import numpy as np
 
-from pano_mvs.testing.paint import OAK, WHITE
+from tests.synthetic.paints import OAK, WHITE
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.repeating.drawings import Drawing
 from tools.benchmarks.repeating.fittings import Site, Wall

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import WHITE
 from pano_mvs.testing.surfaces import Vector
+from tests.synthetic.paints import WHITE
 from tools.benchmarks.repeating.drawings import Drawing, Image, pyramid
 
 _ROW = 1024

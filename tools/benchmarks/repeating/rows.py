@@ -8,7 +8,7 @@ from typing import Unpack
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
+from tests.synthetic.paints import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.repeating.fittings import Site, Wall
 from tools.benchmarks.repeating.visits import (
