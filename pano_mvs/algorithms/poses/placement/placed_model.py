@@ -147,7 +147,6 @@ class PlacedModel:
             partners,
             geometries=self.pairs.geometries,
             cameras=self.cameras,
-            bearings=self.pairs.bearings,
             ranges=self._ranges,
             estimator=self.pairs.estimator,
             kappa=self.pairs.kappa,

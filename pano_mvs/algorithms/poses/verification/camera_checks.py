@@ -105,11 +105,13 @@ def correct_cameras(
                 moved = True
         if not moved:
             break
-    while True:
+    else:
         _judge(model, confirmation, found)
+    while True:
         _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
         if not _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
             return found
+        _judge(model, confirmation, found)
 
 
 def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
