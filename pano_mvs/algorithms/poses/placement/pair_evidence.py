@@ -65,13 +65,13 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
     most = max(len(view), 1)
     for rank, geometry in enumerate((view, *view.alternatives)):
         p, q = bearings_first[geometry.matches_idx[:, 0]], bearings_second[geometry.matches_idx[:, 1]]
-        unit_ranges, parallax = _unit_ranges(Rigid3(geometry.rotation, geometry.direction), p, q)
+        ranges, parallax = unit_ranges(Rigid3(geometry.rotation, geometry.direction), p, q)
         found.append(
             Geometry(
                 view=geometry,
                 weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
                 direction_std_deg=view.direction_std_deg if rank == 0 else _ALTERNATIVE_STD_DEG,
-                unit_ranges=unit_ranges,
+                unit_ranges=ranges,
                 parallax_rad=parallax,
             )
         )
@@ -224,7 +224,7 @@ def significant_length(
         known_ranges: (M,) ranges of the points from the first image, NaN where unknown.
         rng: shuffles the ranges.
     """
-    (unit, _), parallax = _unit_ranges(second_from_first, p, q)
+    (unit, _), parallax = unit_ranges(second_from_first, p, q)
     usable = np.isfinite(known_ranges / unit)
     known, unit, parallax = known_ranges[usable], unit[usable], parallax[usable]
     if len(known) < 2:
@@ -245,7 +245,7 @@ def significant_length(
     return length, min(alarms)
 
 
-def _unit_ranges(second_from_first: Rigid3, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def unit_ranges(second_from_first: Rigid3, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the ranges of matches from both images, (2, M), NaN unless they meet in front of both, and parallaxes."""
     ranges = np.stack(ranges_from_bearings(p, q, second_from_first))
     parallax = angle_between(p @ second_from_first.rotation.T, q)
