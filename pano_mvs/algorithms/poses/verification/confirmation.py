@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,19 +39,8 @@ _CLASSES = len(_PARALLAX_EDGES_DEG)
 _PRIOR = 0.05
 
 
-class _Consistency(TypedDict):
-    max_relative_error: float
-    max_angle_rad: float
-    min_support: float
-    min_motion_rad: float
-
-
-_CONSISTENCY: _Consistency = {
-    "max_relative_error": 0.05,
-    "max_angle_rad": 2 * np.pi / WIDTH_PX,
-    "min_support": 0.5,
-    "min_motion_rad": 0.1 * np.pi / WIDTH_PX,
-}
+# When other maps confirm a pixel; the last one is in pixels.
+_MAX_RELATIVE_ERROR, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 0.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +146,7 @@ class Confirmation:
             seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
             maps.append(self._swept(source, others[source], seen_by, cameras=everybody))
             poses.append(others[source])
-        confirmed = textured & consistent_pixels(own, pose, maps, source_poses=poses, **_CONSISTENCY)[0]
+        confirmed = textured & _confirmed(own, pose, maps, source_poses=poses)
         classes = _parallax_classes(own.range, pose, poses)
         return Evidence(
             *(
@@ -182,7 +170,7 @@ class Confirmation:
                 self._swept(one, cameras[one], [source], cameras=cameras)
                 for one, source in ((image, partner), (partner, image))
             )
-        confirmed, _ = consistent_pixels(own, cameras[image], [other], source_poses=[cameras[partner]], **_CONSISTENCY)
+        confirmed = _confirmed(own, cameras[image], [other], source_poses=[cameras[partner]])
         confirmed &= self.small(image).mask
         return np.where(confirmed, own.range, np.nan).astype(np.float64)
 
@@ -218,6 +206,23 @@ class Confirmation:
             reference_mask=small.mask,
             source_masks=[self.small(idx).mask for idx in sources],
         )
+
+
+def _confirmed(
+    own: RangeMap, pose: Rigid3, maps: Sequence[RangeMap], *, source_poses: Sequence[Rigid3]
+) -> NDArray[np.bool_]:
+    """Return the pixels of a small map that the maps of its sources confirm."""
+    px_rad = 2 * np.pi / own.range.shape[1]
+    return consistent_pixels(
+        own,
+        pose,
+        maps,
+        source_poses=source_poses,
+        max_relative_error=_MAX_RELATIVE_ERROR,
+        max_angle_rad=px_rad,
+        min_support=_MIN_SUPPORT,
+        min_motion_rad=_MIN_MOTION_PX * px_rad,
+    )[0]
 
 
 def _nearly(pose: Rigid3, scale: float, other: Rigid3, *, other_scale: float) -> bool:
