@@ -106,7 +106,7 @@ def _corrected(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -
     """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
     checks = correct_cameras(grown.model, confirmation)
     if checks.moved:
-        settle(grown.model, adjust=adjust, confirmation=confirmation)
+        settle(grown.model, adjust=adjust)
     return replace(grown, refused=grown.refused | checks.removed, checks=checks)
 
 
@@ -189,7 +189,7 @@ def _grown(
             model.remove(image)
             left.add(image)
             reasons[image] = reason
-    settle(model, adjust=adjust, confirmation=confirmation)
+    settle(model, adjust=adjust)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
@@ -278,45 +278,12 @@ def _accepted(
     return None
 
 
-def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | None) -> None:
-    """Adjust a grown model, choose geometries again, and move cameras whose pairs now agree better elsewhere."""
-    for _ in range(3):
+def settle(model: PlacedModel, *, adjust: bool) -> None:
+    """Choose the geometries of a grown model again, and adjust it with them."""
+    for _ in range(2 if adjust else 1):
         if adjust:
             model.adjust()
         model.choose_again()
-        if not _moved_cameras(model, confirmation):
-            break
-    if adjust:
-        model.adjust()
-        model.choose_again()
-
-
-def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> bool:
-    """Move every camera for which another placement explains clearly more; return whether any camera was moved."""
-    moved = False
-    if len(model.cameras) < 3:
-        return False
-    for image in sorted(model.cameras):
-        evidence = model.evidence(image)
-        mine = [rank for edge, rank in model.chosen.items() if image in edge]
-        score = sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items() if image in edge)
-        if not mine or score > 0.8 * evidence.total:
-            continue
-        _, found = model.place(image)
-        if found and found[0].score > 1.2 * score:
-            pose, support, known = model.polished(image, evidence, found[0])
-            if support >= points_needed(known) and _better_by_images(model, image, pose, confirmation=confirmation):
-                model.add(image, pose)
-                moved = True
-    return moved
-
-
-def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, *, confirmation: Confirmation | None) -> bool:
-    """Return whether the images do not contradict moving a camera."""
-    if confirmation is None:
-        return True
-    here = confirmation.share(image, model.cameras[image], model.cameras)
-    return not confirmation.share(image, pose, model.cameras) < here
 
 
 def _why_nothing(model: PlacedModel, image: int) -> str:
