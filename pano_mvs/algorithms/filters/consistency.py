@@ -184,15 +184,18 @@ def checked_with_agreement(
     if len(sources) != len(source_poses):
         raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
-    comparison = compare_with_sources(
-        reference.range,
+    consistent, comparison = consistent_pixels(
+        reference,
+        reference_pose,
         sources,
-        [pose @ reference_pose.inverse() for pose in source_poses],
+        source_poses=source_poses,
         max_relative_error=max_relative_error,
-        max_angle=max(max_reprojection_px / px_per_rad, np.radians(max_reprojection_deg)),
+        max_angle_rad=max(max_reprojection_px / px_per_rad, np.radians(max_reprojection_deg)),
+        min_support=min_support,
+        min_motion_rad=min_motion_px / px_per_rad,
+        min_views=min_views,
     )
     motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
-    consistent = (comparison.agreeing >= min_views) & (comparison.support >= min_support) & (motion >= min_motion_px)
     step = _step_around(reference.range)
     grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
     grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
@@ -206,7 +209,7 @@ def checked_with_agreement(
         removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     uncertainty = confirmed_uncertainty(
-        consistent & seen,
+        consistent,
         ranges,
         support=comparison.support,
         squared_error=comparison.squared_error * px_per_rad**2,
@@ -218,6 +221,34 @@ def checked_with_agreement(
     return RangeMap(ranges, confidence, reference.normals_in_cam, uncertainty, reference.sky), _agreement(
         comparison, seen
     )
+
+
+def consistent_pixels(
+    reference: RangeMap,
+    reference_pose: Rigid3,
+    sources: Sequence[RangeMap],
+    *,
+    source_poses: Sequence[Rigid3],
+    max_relative_error: float,
+    max_angle_rad: float,
+    min_support: float,
+    min_motion_rad: float,
+    min_views: int = 1,
+) -> tuple[NDArray[np.bool_], Comparison]:
+    """Return the pixels (H, W) that were seen and that the sources confirm, and how each pixel compares.
+
+    The arguments are those of `checked_with_agreement`, with limits as angles.
+    """
+    comparison = compare_with_sources(
+        reference.range,
+        sources,
+        [pose @ reference_pose.inverse() for pose in source_poses],
+        max_relative_error=max_relative_error,
+        max_angle=max_angle_rad,
+    )
+    moved = max_relative_error * np.sqrt(comparison.motion) >= min_motion_rad
+    seen = (reference.confidence >= WEAK_CONFIDENCE[0]) & ~np.isnan(reference.range)
+    return seen & moved & (comparison.agreeing >= min_views) & (comparison.support >= min_support), comparison
 
 
 def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:

@@ -8,15 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
-from pano_mvs.algorithms.poses.placement.placed_model import (
-    MIN_POINTS,
-    MIN_SHARE,
-    MIN_SHARE_OF_AGREEING,
-    Pairs,
-    PlacedModel,
-    enough_points,
-)
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
+from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.aliases import find_aliases
 from pano_mvs.algorithms.poses.verification.camera_checks import (
@@ -26,7 +21,6 @@ from pano_mvs.algorithms.poses.verification.camera_checks import (
     correct_cameras,
 )
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
-from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 
 _FULL_PARALLAX_DEG = 10.0
@@ -112,7 +106,7 @@ def _corrected(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -
     """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
     checks = correct_cameras(grown.model, confirmation)
     if checks.moved:
-        settle(grown.model, adjust=adjust, confirmation=confirmation)
+        settle(grown.model, adjust=adjust)
     return replace(grown, refused=grown.refused | checks.removed, checks=checks)
 
 
@@ -195,7 +189,7 @@ def _grown(
             model.remove(image)
             left.add(image)
             reasons[image] = reason
-    settle(model, adjust=adjust, confirmation=confirmation)
+    settle(model, adjust=adjust)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
@@ -224,7 +218,7 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
     _, support, known = without.polished(image, evidence, Placement(pose, agrees, 0.0))
     agreeing = len(set(evidence.partner[agrees].tolist()))
-    if enough_points(support, known, agreeing=agreeing):
+    if support >= points_needed(known, agreeing=agreeing):
         return ""
     return _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
 
@@ -278,51 +272,18 @@ def _accepted(
     """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
     pose, support, known = model.polished(image, evidence, placement)
     agreeing = len(set(evidence.partner[placement.explained].tolist()))
-    if enough_points(support, known, agreeing=agreeing):
+    if support >= points_needed(known, agreeing=agreeing):
         return pose
     reasons[image] = _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
     return None
 
 
-def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | None) -> None:
-    """Adjust a grown model, choose geometries again, and move cameras whose pairs now agree better elsewhere."""
-    for _ in range(3):
+def settle(model: PlacedModel, *, adjust: bool) -> None:
+    """Choose the geometries of a grown model again, and adjust it with them."""
+    for _ in range(2 if adjust else 1):
         if adjust:
             model.adjust()
         model.choose_again()
-        if not _moved_cameras(model, confirmation):
-            break
-    if adjust:
-        model.adjust()
-        model.choose_again()
-
-
-def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> bool:
-    """Move every camera for which another placement explains clearly more; return whether any camera was moved."""
-    moved = False
-    if len(model.cameras) < 3:
-        return False
-    for image in sorted(model.cameras):
-        evidence = model.evidence(image)
-        mine = [rank for edge, rank in model.chosen.items() if image in edge]
-        score = sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items() if image in edge)
-        if not mine or score > 0.8 * evidence.total:
-            continue
-        _, found = model.place(image)
-        if found and found[0].score > 1.2 * score:
-            pose, support, known = model.polished(image, evidence, found[0])
-            if enough_points(support, known) and _better_by_images(model, image, pose, confirmation=confirmation):
-                model.add(image, pose)
-                moved = True
-    return moved
-
-
-def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, *, confirmation: Confirmation | None) -> bool:
-    """Return whether the images do not contradict moving a camera."""
-    if confirmation is None:
-        return True
-    here = confirmation.share(image, model.cameras[image], model.cameras)
-    return not confirmation.share(image, pose, model.cameras) < here
 
 
 def _why_nothing(model: PlacedModel, image: int) -> str:
@@ -333,17 +294,7 @@ def _why_nothing(model: PlacedModel, image: int) -> str:
 
 def _why_refused(pairs: Pairs, image: int, support: int, *, known: int, agreeing: int) -> str:
     if known >= MIN_POINTS:
-        share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
-        needed = max(MIN_POINTS, int(np.ceil(share * known)))
-        return (
-            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where "
-            f"they should be; {needed} are needed. Possible causes: repeated structure, moving objects, stitching "
-            "errors, or an image that is not a panorama"
-        )
+        return why_few_seen(support, known, agreeing=agreeing)
     partner = pairs.partners[image][0]
     count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return (
-        f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
-        f"needed. Its best partner is {pairs.names[partner]!r} with {count} {plural(count, 'match', 'matches')}. "
-        "Take panoramas in between"
-    )
+    return why_few_known(known, partner=pairs.names[partner], matches=count)

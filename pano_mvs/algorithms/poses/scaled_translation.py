@@ -104,7 +104,7 @@ def _grown_and_joined(
     found: list[GrownModel] = []
     for model, numbers in join_models([*(one.model for one in grown), *alone]) if grown else []:
         if len(numbers) > 1:
-            settle(model, adjust=adjust, confirmation=confirmation)
+            settle(model, adjust=adjust)
             found.append(GrownModel(model, {}, check_cameras(model, confirmation)))
         elif numbers[0] < len(grown):
             found.append(grown[numbers[0]])

@@ -11,20 +11,23 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks
-from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
+from pano_mvs.algorithms.poses.placement.pair_evidence import MIN_RATIOS, unit_ranges
+from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.resection import (
+    FIRST_GUESS_RAD,
+    MAX_ERROR_RAD,
+    MIN_POINTS,
+    points_needed,
+    refined_on_points,
+    resection_errors,
+)
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, relative_pose
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import TwoView
 
-_MAX_ERROR_RAD = float(np.deg2rad(0.5))
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-_FIRST_GUESS_RAD = float(np.deg2rad(2.0))
-_MIN_RATIOS = 6
-_MIN_POINTS = 15
-_MIN_SHARE = 0.4
 _MAX_PARTNERS = 8
 _ADJUST_STEPS = 20
 # Further steps are not needed: the finished model is refined anyway.
@@ -114,7 +117,7 @@ class GrowingModel:
             np.einsum("nji,nj->ni", rotations[tracks.image_idx[seen]], tracks.bearings[seen]),
             compact[tracks.track_idx[seen]].astype(np.int32),
             count=int(chosen.sum()),
-            max_error_rad=_MAX_ERROR_RAD,
+            max_error_rad=MAX_ERROR_RAD,
             min_angle_rad=_MIN_ANGLE_RAD,
         )
         self._points[chosen] = found.points_in_world
@@ -139,7 +142,7 @@ class GrowingModel:
         bundle = adjust_bundle(
             bundle,
             loss="cauchy",
-            scale_rad=_MAX_ERROR_RAD / 4,
+            scale_rad=MAX_ERROR_RAD / 4,
             max_iterations=_ADJUST_STEPS,
             tolerance=_ADJUST_TOLERANCE,
             fixed_camera=images.index(next(iter(self.cameras))),
@@ -178,7 +181,7 @@ class GrowingModel:
     def attach(self, image: int) -> Attachment:
         """Estimate the pose of an image from its pairs with registered images, and decide whether it is reliable."""
         points, bearings = self.known_points(image)
-        if len(points) < _MIN_POINTS:
+        if len(points) < MIN_POINTS:
             return Attachment(Rigid3.identity(), 0, len(points), self._too_few(image, len(points)))
         guesses = [guess for partner in self._partners(image) if (guess := self._chained(image, partner))]
         if not guesses:
@@ -188,20 +191,10 @@ class GrowingModel:
                 len(points),
                 "no pair with a registered image shares enough points with a third image to determine the distance",
             )
-        pose = max(guesses, key=lambda g: int((resection_errors(g, points, bearings) < _FIRST_GUESS_RAD).sum()))
-        pose = _polished(pose, points, bearings)
-        support = int((resection_errors(pose, points, bearings) < _MAX_ERROR_RAD).sum())
-        if support < max(_MIN_POINTS, _MIN_SHARE * len(points)):
-            return Attachment(
-                pose,
-                support,
-                len(points),
-                f"only {support} of {len(points)} points known from other images {plural(support, 'is', 'are')} seen "
-                f"where they should be; {max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} are needed. "
-                "Possible causes: repeated structure, moving objects, stitching errors, or an image that is not a "
-                "panorama",
-            )
-        return Attachment(pose, support, len(points))
+        pose = max(guesses, key=lambda g: int((resection_errors(g, points, bearings) < FIRST_GUESS_RAD).sum()))
+        pose, support = refined_on_points(pose, points, bearings)
+        enough = support >= points_needed(len(points))
+        return Attachment(pose, support, len(points), "" if enough else why_few_seen(support, len(points)))
 
     def _partners(self, image: int) -> list[int]:
         """Return the registered partners of an image, sorted by number of verified matches."""
@@ -222,25 +215,20 @@ class GrowingModel:
         )
         p = self.tracks.bearings[self._track_of_image[partner][theirs]]
         q = self.tracks.bearings[self._track_of_image[image][mine]]
-        unit_range, other_range = ranges_from_bearings(p, q, image_from_partner)
-        known_range = np.linalg.norm(self._points[seen] - self.cameras[partner].center, axis=1)
-        parallax = angle_between(p @ image_from_partner.rotation.T, q)
-        with np.errstate(invalid="ignore"):
-            usable = (unit_range > 0) & (other_range > 0) & np.isfinite(known_range) & (parallax > _MIN_ANGLE_RAD)
-        if usable.sum() < _MIN_RATIOS:
+        (unit_range, _), parallax = unit_ranges(image_from_partner, p, q)
+        ratios = np.linalg.norm(self._points[seen] - self.cameras[partner].center, axis=1) / unit_range
+        usable = np.isfinite(ratios)
+        if usable.sum() < MIN_RATIOS:
             return None
-        ratios = known_range[usable] / unit_range[usable]
-        length = estimate_scale(ratios, np.sin(parallax[usable]) ** 2, estimator=self.estimator, kappa=self.kappa)
+        length = estimate_scale(
+            ratios[usable], np.sin(parallax[usable]) ** 2, estimator=self.estimator, kappa=self.kappa
+        )
         scaled = Rigid3(image_from_partner.rotation, length * image_from_partner.translation)
         return scaled @ self.cameras[partner]
 
     def _too_few(self, image: int, known: int) -> str:
         count, partner = max((-negative, partner) for negative, partner in self._pairs[image])
-        return (
-            f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {_MIN_POINTS} are "
-            f"needed. Its best partner is {self.tracks.names[partner]!r} with {count} "
-            f"{plural(count, 'match', 'matches')}. Take panoramas in between"
-        )
+        return why_few_known(known, partner=self.tracks.names[partner], matches=count)
 
     def _arrays(self) -> tuple[FloatArray, FloatArray]:
         rotations = np.tile(np.eye(3), (len(self.tracks.names), 1, 1))
@@ -248,9 +236,3 @@ class GrowingModel:
         for image, camera in self.cameras.items():
             rotations[image], centers[image] = camera.rotation, camera.center
         return rotations, centers
-
-
-def _polished(pose: Rigid3, points: FloatArray, bearings: FloatArray) -> Rigid3:
-    for scale_rad in (_FIRST_GUESS_RAD / 2, _MAX_ERROR_RAD / 2, _MAX_ERROR_RAD / 4):
-        pose = refine_resection(pose, points, bearings, scale_rad=scale_rad)
-    return pose

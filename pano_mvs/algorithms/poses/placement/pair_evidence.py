@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +37,20 @@ class Geometry:
         weight: grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false
             geometry, and with their share of the matches of the pair's best geometry.
         direction_std_deg: standard deviation of its direction.
-        parallax_deg: median angle between the rays of its matches after de-rotation.
+        unit_ranges: (2, M) ranges of its matches from either image, in units of its translation, NaN where not usable.
+        parallax_rad: (M,) angle between the rays of each match after de-rotation.
     """
 
     view: TwoView
     weight: float
     direction_std_deg: float
-    parallax_deg: float
+    unit_ranges: FloatArray
+    parallax_rad: FloatArray
+
+    @cached_property
+    def parallax_deg(self) -> float:
+        """The median parallax; 0 without matches."""
+        return float(np.rad2deg(np.median(self.parallax_rad))) if len(self.parallax_rad) else 0.0
 
 
 def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: FloatArray) -> tuple[Geometry, ...]:
@@ -57,12 +65,14 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
     most = max(len(view), 1)
     for rank, geometry in enumerate((view, *view.alternatives)):
         p, q = bearings_first[geometry.matches_idx[:, 0]], bearings_second[geometry.matches_idx[:, 1]]
+        ranges, parallax = unit_ranges(Rigid3(geometry.rotation, geometry.direction), p, q)
         found.append(
             Geometry(
                 view=geometry,
                 weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
                 direction_std_deg=view.direction_std_deg if rank == 0 else _ALTERNATIVE_STD_DEG,
-                parallax_deg=float(np.rad2deg(np.median(angle_between(p @ geometry.rotation.T, q)))) if len(p) else 0.0,
+                unit_ranges=ranges,
+                parallax_rad=parallax,
             )
         )
     return tuple(sorted(found, key=lambda geometry: -geometry.weight))
@@ -116,7 +126,6 @@ def gather_pair_evidence(
     *,
     geometries: Mapping[Edge, tuple[Geometry, ...]],
     cameras: Mapping[int, Rigid3],
-    bearings: Sequence[FloatArray],
     ranges: Sequence[FloatArray],
     estimator: ScaleEstimator,
     kappa: float,
@@ -128,7 +137,6 @@ def gather_pair_evidence(
         partners: registered images that share a pair with it.
         geometries: of all pairs (i, j), i < j.
         cameras: cam_from_world of registered images.
-        bearings: (N, 3) unit rays of every image's key points.
         ranges: (N,) known range of every image's key points in scene units, NaN where unknown.
         estimator: see `estimate_scale`.
         kappa: see `estimate_scale`.
@@ -139,10 +147,9 @@ def gather_pair_evidence(
         for rank, geometry in enumerate(geometries[min(image, partner), max(image, partner)]):
             from_partner, matches = oriented(geometry.view, partner, image)
             length = _length(
-                from_partner,
-                bearings[partner][matches[:, 0]],
-                bearings[image][matches[:, 1]],
-                known_ranges=ranges[partner][matches[:, 0]],
+                ranges[partner][matches[:, 0]],
+                geometry.unit_ranges[int(partner > image)],
+                geometry.parallax_rad,
                 estimator=estimator,
                 kappa=kappa,
             )
@@ -184,20 +191,20 @@ def oriented(view: TwoView, first: int, second: int) -> tuple[Rigid3, NDArray[np
 
 
 def _length(
-    second_from_first: Rigid3,
-    p: FloatArray,
-    q: FloatArray,
-    *,
     known_ranges: FloatArray,
+    unit_ranges: FloatArray,
+    parallax: FloatArray,
+    *,
     estimator: ScaleEstimator,
     kappa: float,
 ) -> float:
     """Return the length of the translation that puts points at their known ranges; NaN if it is not determined."""
-    known, unit, parallax = _known_and_unit_ranges(second_from_first, p, q, known_ranges=known_ranges)
-    if len(known) < MIN_RATIOS:
+    ratios = known_ranges / unit_ranges
+    known = np.isfinite(ratios)
+    ratios = ratios[known]
+    if len(ratios) < MIN_RATIOS:
         return np.nan
-    ratios = known / unit
-    length = estimate_scale(ratios, np.sin(parallax) ** 2, estimator=estimator, kappa=kappa)
+    length = estimate_scale(ratios, np.sin(parallax[known]) ** 2, estimator=estimator, kappa=kappa)
     agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
     return length if agreeing >= max(MIN_RATIOS, MIN_AGREEING * len(ratios)) else np.nan
 
@@ -217,7 +224,9 @@ def significant_length(
         known_ranges: (M,) ranges of the points from the first image, NaN where unknown.
         rng: shuffles the ranges.
     """
-    known, unit, parallax = _known_and_unit_ranges(second_from_first, p, q, known_ranges=known_ranges)
+    (unit, _), parallax = unit_ranges(second_from_first, p, q)
+    usable = np.isfinite(known_ranges / unit)
+    known, unit, parallax = known_ranges[usable], unit[usable], parallax[usable]
     if len(known) < 2:
         return np.nan, np.inf
     length = estimate_scale(known / unit, np.sin(parallax) ** 2, estimator="cauchy", kappa=0.0)
@@ -236,12 +245,10 @@ def significant_length(
     return length, min(alarms)
 
 
-def _known_and_unit_ranges(
-    second_from_first: Rigid3, p: FloatArray, q: FloatArray, *, known_ranges: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the known ranges of the usable matches, those in units of the translation, and the parallaxes, (K,)."""
-    unit_range, other_range = ranges_from_bearings(p, q, second_from_first)
+def unit_ranges(second_from_first: Rigid3, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the ranges of matches from both images, (2, M), NaN unless they meet in front of both, and parallaxes."""
+    ranges = np.stack(ranges_from_bearings(p, q, second_from_first))
     parallax = angle_between(p @ second_from_first.rotation.T, q)
     with np.errstate(invalid="ignore"):
-        usable = (unit_range > 0) & (other_range > 0) & np.isfinite(known_ranges) & (parallax > _MIN_ANGLE_RAD)
-    return known_ranges[usable], unit_range[usable], parallax[usable]
+        usable = (ranges > 0).all(axis=0) & (parallax > _MIN_ANGLE_RAD)
+    return np.where(usable, ranges, np.nan), parallax

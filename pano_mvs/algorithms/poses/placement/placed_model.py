@@ -18,7 +18,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
     oriented,
 )
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
-from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
+from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, refined_on_points
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
 from pano_mvs.algorithms.two_view.verification import verify_pose
@@ -26,11 +26,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
-_MAX_ERROR_RAD = float(np.deg2rad(0.5))
-_FIRST_GUESS_RAD = float(np.deg2rad(2.0))
 _MIN_ANGLE_RAD = float(np.deg2rad(1.5))
-MIN_POINTS = 15
-MIN_SHARE, MIN_SHARE_OF_AGREEING = 0.4, 0.2
 _MAX_PARTNERS = 16
 
 
@@ -147,7 +143,6 @@ class PlacedModel:
             partners,
             geometries=self.pairs.geometries,
             cameras=self.cameras,
-            bearings=self.pairs.bearings,
             ranges=self._ranges,
             estimator=self.pairs.estimator,
             kappa=self.pairs.kappa,
@@ -227,9 +222,7 @@ class PlacedModel:
         pose = placement.cam_from_world
         if len(points) < MIN_POINTS:
             return pose, 0, len(points)
-        for scale_rad in (_FIRST_GUESS_RAD / 2, _MAX_ERROR_RAD / 2, _MAX_ERROR_RAD / 4):
-            pose = refine_resection(pose, points, rays, scale_rad=scale_rad)
-        return pose, int((resection_errors(pose, points, rays) < _MAX_ERROR_RAD).sum()), len(points)
+        return *refined_on_points(pose, points, rays), len(points)
 
     def adjust(self, *, cameras: bool = True) -> None:
         """Refine all cameras except the first together with the points, and compute all ranges again.
@@ -334,7 +327,7 @@ class PlacedModel:
         parallax = angle_between(p @ relative.rotation.T, q)
         with np.errstate(invalid="ignore"):
             usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > _MIN_ANGLE_RAD)
-        usable &= view.residuals_rad < _MAX_ERROR_RAD
+        usable &= view.residuals_rad < MAX_ERROR_RAD
         for image, keypoints, found in ((first, mine, ranges[0]), (second, theirs, ranges[1])):
             better = usable & (parallax > self._parallax[image][keypoints])
             self._ranges[image][keypoints[better]] = found[better]
@@ -347,18 +340,6 @@ def explained_partners(evidence: PairEvidence, explained: NDArray[np.bool_]) -> 
     for idx in np.flatnonzero(explained):
         found.setdefault(int(evidence.partner[idx]), int(evidence.rank[idx]))
     return found
-
-
-def enough_points(support: int, known: int, *, agreeing: int = 1) -> bool:
-    """Return whether a camera is reliable that sees `support` of `known` points where they should be.
-
-    Args:
-        support: number of points that it sees where they should be.
-        known: number of known points that it matches.
-        agreeing: number of pairs that agree with its pose. Two or more pairs are independent evidence, so that
-            imprecise matches, as in the paper, do not lead to rejection.
-    """
-    return support >= max(MIN_POINTS, (MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING) * known)
 
 
 def _edge(a: int, b: int) -> Edge:

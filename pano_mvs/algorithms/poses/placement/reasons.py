@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed
+from pano_mvs.core.text import plural
 from pano_mvs.scene import TwoView
 
 
@@ -22,3 +24,21 @@ def why_no_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> str:
         return ""
     partner = pair[1] if pair[0] == name else pair[0]
     return f"it has no reliable pair; its best partner is {partner!r}: {two_views[pair].reason}"
+
+
+def why_few_seen(support: int, known: int, *, agreeing: int = 1) -> str:
+    """Return why a camera is not reliable that sees too few known points where they should be."""
+    return (
+        f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
+        f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, moving "
+        "objects, stitching errors, or an image that is not a panorama"
+    )
+
+
+def why_few_known(known: int, *, partner: str, matches: int) -> str:
+    """Return why an image cannot be placed that matches too few known points; its best pair is with `partner`."""
+    return (
+        f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
+        f"needed. Its best partner is {partner!r} with {matches} {plural(matches, 'match', 'matches')}. "
+        "Take panoramas in between"
+    )

@@ -8,10 +8,39 @@ from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
 
+MAX_ERROR_RAD = float(np.deg2rad(0.5))
+"""Largest error of a point that an image sees where it should."""
+
+FIRST_GUESS_RAD = float(np.deg2rad(2.0))
+"""The same at a pose that is not yet refined."""
+
+MIN_POINTS = 15
+_MIN_SHARE, _MIN_SHARE_OF_AGREEING = 0.4, 0.2
+
 
 def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:
     """Return the angles in radians between the observed rays and the rays to their points, (M,)."""
     return angle_between(cam_from_world.apply(points_in_world), bearings)
+
+
+def refined_on_points(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> tuple[Rigid3, int]:
+    """Return a pose refined with limits that narrow, and the number of points that it sees where they should be."""
+    pose = cam_from_world
+    for scale_rad in (FIRST_GUESS_RAD / 2, MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
+        pose = refine_resection(pose, points_in_world, bearings, scale_rad=scale_rad)
+    return pose, int((resection_errors(pose, points_in_world, bearings) < MAX_ERROR_RAD).sum())
+
+
+def points_needed(known: int, *, agreeing: int = 1) -> int:
+    """Return how many of `known` points a reliable camera sees where they should be.
+
+    Args:
+        known: number of known points that it matches.
+        agreeing: number of pairs that agree with its pose. Two or more pairs are independent evidence, so that
+            imprecise matches, as in the paper, do not lead to rejection.
+    """
+    share = _MIN_SHARE if agreeing < 2 else _MIN_SHARE_OF_AGREEING
+    return max(MIN_POINTS, int(np.ceil(share * known)))
 
 
 def refine_resection(

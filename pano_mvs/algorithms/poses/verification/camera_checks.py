@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, enough_points
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.poses.placement.resection import points_needed
 from pano_mvs.algorithms.poses.verification.aliases import Alias, find_aliases, labellings, moved_cameras
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
@@ -105,11 +106,13 @@ def correct_cameras(
                 moved = True
         if not moved:
             break
-    while True:
+    else:
         _judge(model, confirmation, found)
+    while True:
         _believe(model, found, joints=measured_joints(model, confirmation), miss_cost=miss_cost, ambiguity=ambiguity)
         if not _leave_out_worst(model, found, fixed=fixed, miss_cost=miss_cost):
             return found
+        _judge(model, confirmation, found)
 
 
 def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
@@ -325,7 +328,7 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
         if place.score < _MIN_SCORE * places[0].score:
             continue
         pose, support, known = without.polished(image, pair_evidence, place)
-        if enough_points(support, known):
+        if support >= points_needed(known):
             poses.append(pose)
     return poses
 

@@ -6,20 +6,18 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.consistency import consistent_pixels
 from pano_mvs.algorithms.panoramas import reduced_mask, reduced_panorama
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import textured_pixels
 from pano_mvs.algorithms.sweep.settings import SURFACE_SETTINGS
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, geodesic_angle, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 """A panorama (H, W, 3) uint8 RGB with its mask (H, W); False is ignored."""
@@ -41,19 +39,8 @@ _CLASSES = len(_PARALLAX_EDGES_DEG)
 _PRIOR = 0.05
 
 
-class _Consistency(TypedDict):
-    max_relative_error: float
-    max_reprojection_px: float
-    min_support: float
-    min_motion_px: float
-
-
-_CONSISTENCY: _Consistency = {
-    "max_relative_error": 0.05,
-    "max_reprojection_px": 1.0,
-    "min_support": 0.5,
-    "min_motion_px": 0.05,
-}
+# When other maps confirm a pixel; the last one is in pixels.
+_MAX_RELATIVE_ERROR, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 0.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +146,7 @@ class Confirmation:
             seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
             maps.append(self._swept(source, others[source], seen_by, cameras=everybody))
             poses.append(others[source])
-        checked = check_consistency(own, pose, maps, source_poses=poses, **_CONSISTENCY)
-        confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured
+        confirmed = textured & _confirmed(own, pose, maps, source_poses=poses)
         classes = _parallax_classes(own.range, pose, poses)
         return Evidence(
             *(
@@ -184,8 +170,8 @@ class Confirmation:
                 self._swept(one, cameras[one], [source], cameras=cameras)
                 for one, source in ((image, partner), (partner, image))
             )
-        checked = check_consistency(own, cameras[image], [other], source_poses=[cameras[partner]], **_CONSISTENCY)
-        confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & self.small(image).mask
+        confirmed = _confirmed(own, cameras[image], [other], source_poses=[cameras[partner]])
+        confirmed &= self.small(image).mask
         return np.where(confirmed, own.range, np.nan).astype(np.float64)
 
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], *, cameras: Mapping[int, Rigid3]) -> RangeMap:
@@ -222,6 +208,23 @@ class Confirmation:
         )
 
 
+def _confirmed(
+    own: RangeMap, pose: Rigid3, maps: Sequence[RangeMap], *, source_poses: Sequence[Rigid3]
+) -> NDArray[np.bool_]:
+    """Return the pixels of a small map that the maps of its sources confirm."""
+    px_rad = 2 * np.pi / own.range.shape[1]
+    return consistent_pixels(
+        own,
+        pose,
+        maps,
+        source_poses=source_poses,
+        max_relative_error=_MAX_RELATIVE_ERROR,
+        max_angle_rad=px_rad,
+        min_support=_MIN_SUPPORT,
+        min_motion_rad=_MIN_MOTION_PX * px_rad,
+    )[0]
+
+
 def _nearly(pose: Rigid3, scale: float, other: Rigid3, *, other_scale: float) -> bool:
     """Return whether two relative poses, each in its own unit, are equivalent for a sweep at 256 columns."""
     moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
@@ -247,11 +250,12 @@ def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequen
     Angles below 2° are ignored, since they carry little information. Pixels without such a source are in the last
     class.
     """
-    points = ray_grid(ranges.shape) * np.where(np.isnan(ranges), 1.0, ranges)[..., None]
-    smallest = np.full(ranges.shape, np.inf)
+    rays, smallest = ray_grid(ranges.shape), np.full(ranges.shape, np.inf)
     for source in sources:
         offset = (source @ pose.inverse()).center
-        angles = np.rad2deg(angle_between(points, points - offset))
+        along = rays @ offset
+        across = np.sqrt(np.maximum(offset @ offset - along**2, 0.0))
+        angles = np.rad2deg(np.arctan2(across, ranges - along))
         smallest = np.where((angles > _PARALLAX_EDGES_DEG[0]) & (angles < smallest), angles, smallest)
     smallest[np.isnan(ranges)] = np.inf
     classes: NDArray[np.intp] = np.searchsorted(_PARALLAX_EDGES_DEG[1:], smallest)

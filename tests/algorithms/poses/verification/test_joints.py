@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
+from pano_mvs.algorithms.poses.placement.pair_evidence import geometries_of
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.algorithms.poses.verification.joints import linked_parts, measured_joints
@@ -38,8 +38,8 @@ def two_parts(between: Mapping[Edge, int], *, second: Mapping[int, Rigid3] | Non
         # No key point has a match in its own part and one in the other, so nothing links the parts.
         first = 0 if count == INSIDE else INSIDE + 60 * (2 * a + b)
         matches = np.stack([np.arange(first, first + count) % KEYPOINTS] * 2, axis=1).astype(np.int32)
-        geometry = Geometry(view_of(cameras[b] @ cameras[a].inverse(), matches), 1.0, 0.1, 10.0)
-        geometries[a, b] = (geometry,)
+        view = view_of(cameras[b] @ cameras[a].inverse(), matches)
+        geometries[a, b] = geometries_of(view, *(features[f"{idx}.png"].bearings for idx in (a, b)))
     return PlacedModel(Pairs(features, geometries), cameras, dict.fromkeys(geometries, 0))
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
+from pano_mvs.algorithms.poses.placement.pair_evidence import geometries_of
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.joints import Joint
@@ -31,7 +31,8 @@ def placed(pairs: Mapping[Edge, tuple[float, ...]], *, agreeing: bool, exponent:
     for (a, b), weights in pairs.items():
         relative = CAMERAS[b] @ CAMERAS[a].inverse()
         view = replace(view_of(relative if agreeing else away @ relative, matches), log10_false_alarms=exponent)
-        geometries[a, b] = tuple(Geometry(view, weight, 0.1, 10.0) for weight in weights)
+        rays = features_from_bearings(RAYS).bearings
+        geometries[a, b] = tuple(replace(geometries_of(view, rays, rays)[0], weight=weight) for weight in weights)
         compared[a, b] = view
     found = Pairs({f"{idx}.png": features_from_bearings(RAYS) for idx in CAMERAS}, geometries, compared=compared)
     return PlacedModel(found, dict(CAMERAS), dict.fromkeys(geometries, 0) if agreeing else {})
