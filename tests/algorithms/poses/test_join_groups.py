@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.poses.joining import join_groups
 from pano_mvs.algorithms.poses.joining.alignment import Alignment
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, errors_and_residuals, match_errors, vector_of
-from pano_mvs.algorithms.poses.joining.floors import scale_of_floors
+from pano_mvs.algorithms.poses.joining.floors import height_above_floor
 from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
@@ -81,13 +80,22 @@ def room_features(
 
 
 def with_points_of_pairs(
-    features: dict[str, Features], poses: dict[str, Rigid3], pairs: Iterable[tuple[str, ...]], *, count: int
+    features: dict[str, Features],
+    poses: dict[str, Rigid3],
+    pairs: Iterable[tuple[str, str]],
+    *,
+    count: int,
+    floor: int = 0,
 ) -> dict[str, Features]:
-    """Return features with `count` more points near the door for each of some sets of cameras, seen by no other one."""
+    """Return features with `count` more points for each of some pairs, which no other camera sees.
+
+    They are near the door, but for `floor` of them.
+    """
     rng = np.random.default_rng(5)
     found = dict(features)
     for pair in pairs:
         points = np.concatenate([_door_points(rng, x, count // 2) for x in (-3.0, 3.0)])
+        points[:floor] = rng.uniform((-1.5, 1.3, -0.6), (1.5, 1.3, 0.6), (floor, 3))
         descriptors = rng.integers(0, 120, (count, 64)).astype(np.float32)
         for name in pair:
             rays = poses[name].apply(points)
@@ -330,14 +338,6 @@ def test_errors_are_those_of_plain_geometry() -> None:
     np.testing.assert_allclose(np.abs(residuals[alone, 6]), errors[alone])
 
 
-def _one_pair_and_few_points(truth: dict[str, Rigid3]) -> dict[str, Features]:
-    """One pair of two rooms has many matches; the other camera of the first room sees a few of its points."""
-    features = room_features(truth, door=0, own=600)
-    return with_points_of_pairs(
-        with_points_of_pairs(features, truth, [("a1", "b1")], count=80), truth, [("a1", "a2", "b1")], count=12
-    )
-
-
 def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: float) -> list[PlacedModel]:
     """Both rooms with true poses and ranges, the second one in another unit."""
     found = []
@@ -356,43 +356,43 @@ def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: fl
     return found
 
 
-def test_a_pair_and_the_floors_join_two_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("floor", "groups"), [(30, 1), (0, 2)])
+def test_a_pair_that_sees_the_floor_joins_two_rooms(floor: int, groups: int) -> None:
+    """It has no point with a known range."""
     truth = room_poses()
-    features = _one_pair_and_few_points(truth)
+    features = with_points_of_pairs(
+        room_features(truth, door=0, own=600), truth, [("a1", "b1")], count=110, floor=floor
+    )
     poses = _solved(features)
     assert len(poses.names) == 4
-    assert len(poses.worlds) == 1
-    lengths = {
-        pair: [float(np.linalg.norm(one[pair[0]].center - one[pair[1]].center)) for one in (truth, _placed(poses))]
-        for pair in (("a1", "a2"), ("b1", "b2"), ("a1", "b1"))
-    }
-    scale = lengths["a1", "a2"][1] / lengths["a1", "a2"][0]
-    for true, found in lengths.values():
-        assert found == pytest.approx(scale * true, rel=0.08)
-    monkeypatch.setattr(join_groups, "scale_of_floors", lambda first, second: None)
-    assert len(_solved(features).worlds) == 2
+    assert len(poses.worlds) == groups
+    if groups == 1:
+        placed = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+        ratios = [
+            float(
+                np.linalg.norm(placed[a].center - placed[b].center) / np.linalg.norm(truth[a].center - truth[b].center)
+            )
+            for a, b in (("a1", "a2"), ("b1", "b2"), ("a1", "b1"))
+        ]
+        assert max(ratios) < 1.1 * min(ratios)
 
 
-def _placed(poses: Poses) -> dict[str, Rigid3]:
-    return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
-
-
-def test_the_floors_give_the_ratio_of_the_units() -> None:
+def test_heights_above_the_floor_give_the_ratio_of_the_units() -> None:
     truth = room_poses()
-    first, second = _models(room_features(truth, door=0, own=600), truth, unit=3.0)
-    scale = scale_of_floors(first, second)
-    assert scale is not None
-    assert scale == pytest.approx(1 / 3, rel=0.05)
+    first, second = (
+        height_above_floor(model) for model in _models(room_features(truth, door=0, own=600), truth, unit=3.0)
+    )
+    assert first == pytest.approx(1.3, rel=0.05)
+    assert second == pytest.approx(3 * first, rel=0.05)
 
 
-def test_cameras_that_are_turned_or_at_different_heights_give_none() -> None:
+def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
     turned = room_poses(turned=True)
-    assert scale_of_floors(*_models(room_features(turned, door=0, own=600), turned, unit=1.0)) is None
+    assert height_above_floor(_models(room_features(turned, door=0, own=600), turned, unit=1.0)[0]) == 0
     truth = room_poses()
     raised = {
         name: replace(pose, translation=pose.translation - pose.rotation @ np.array([0.0, 0.4 * (name == "a2"), 0.0]))
         for name, pose in truth.items()
     }
-    assert scale_of_floors(*_models(room_features(raised, door=0, own=600), raised, unit=1.0)) is None
-    few = room_features(truth, door=0, own=60)
-    assert scale_of_floors(*_models(few, truth, unit=1.0)) is None
+    assert height_above_floor(_models(room_features(raised, door=0, own=600), raised, unit=1.0)[0]) == 0
+    assert height_above_floor(_models(room_features(truth, door=0, own=6), truth, unit=1.0)[0]) == 0

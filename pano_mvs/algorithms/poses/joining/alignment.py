@@ -3,20 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, alignment_cost, errors_and_residuals, parts_of
 from pano_mvs.algorithms.poses.joining.evidence import deviations, log10_false_alignments
+from pano_mvs.algorithms.poses.joining.floors import LENGTH_STD
 from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis, least_costly, pair_proposals
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 
 _FINALISTS = 10
 _MAX_EVALUATIONS = 12
 _MIN_REFINED = 8
+
+
+@dataclass(frozen=True, eq=False)
+class KnownLengths:
+    """What is known of lengths between two models without matches.
+
+    Attributes:
+        scale: of first_from_second; None if unknown.
+        centers: (K, 2, 3) camera centres of pairs with a known length, each in its own model.
+        lengths: (K,) distances between them in the unit of the first model.
+    """
+
+    scale: float | None = None
+    centers: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    lengths: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def between(
+        cls,
+        first: PlacedModel,
+        second: PlacedModel,
+        lengths: Mapping[tuple[int, int], float],
+        *,
+        scale: float | None,
+    ) -> KnownLengths:
+        """Return the lengths of pairs of an image of either model."""
+        centers = [[first.cameras[i].center, second.cameras[j].center] for i, j in lengths]
+        return cls(scale, np.array(centers).reshape(-1, 2, 3), np.array(list(lengths.values())))
+
+    def deviations(self, similarity: FloatArray) -> FloatArray:
+        """Return how far the lengths of an alignment are from the known ones, (K,), in standard deviations."""
+        rotation, shift, scale = parts_of(similarity)
+        placed = scale * self.centers[:, 1] @ rotation.T + shift
+        found = np.linalg.norm(placed - self.centers[:, 0], axis=1)
+        return np.asarray(np.log(np.maximum(found, 1e-12) / self.lengths) / LENGTH_STD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +87,7 @@ def align_models(
     threshold_rad: float,
     has_scale: bool,
     hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]],
-    scale: float | None = None,
+    known: KnownLengths | None = None,
 ) -> Alignment | None:
     """Return the similarity of two models on which most of their matches agree; None if there is none.
 
@@ -63,13 +100,14 @@ def align_models(
         threshold_rad: maximum error of an inlier.
         has_scale: whether the second model has a scale of its own, i.e. more than one camera.
         hypotheses: relative poses of pairs of images.
-        scale: of first_from_second, if it is known from elsewhere.
+        known: what is known of the lengths from elsewhere.
     """
-    proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad, scale=scale)
+    known = known or KnownLengths()
+    proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad, scale=known.scale)
     if not proposals:
         return None
     finalists = [
-        _refined(start, matches, threshold_rad=threshold_rad, has_scale=has_scale and scale is None)
+        _refined(start, matches, known, threshold_rad=threshold_rad, has_scale=has_scale and known.scale is None)
         for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)
     ]
     costs = [alignment_cost(similarity, matches, threshold_rad=threshold_rad) for similarity, _ in finalists]
@@ -77,7 +115,7 @@ def align_models(
 
 
 def _refined(
-    similarity: FloatArray, matches: CrossMatches, *, threshold_rad: float, has_scale: bool
+    similarity: FloatArray, matches: CrossMatches, known: KnownLengths, *, threshold_rad: float, has_scale: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Return the similarity refined on the matches near it, and the derivatives of its residuals."""
     jacobian = np.zeros((0, 7))
@@ -86,13 +124,13 @@ def _refined(
         if near.sum() < _MIN_REFINED:
             break
         similarity, jacobian = _least_squares(
-            similarity, matches[np.flatnonzero(near)], scale_rad=0.5 * threshold_rad, size=7 if has_scale else 6
+            similarity, matches[np.flatnonzero(near)], known, scale_rad=0.5 * threshold_rad, size=7 if has_scale else 6
         )
     return similarity, jacobian
 
 
 def _least_squares(
-    start: FloatArray, matches: CrossMatches, *, scale_rad: float, size: int
+    start: FloatArray, matches: CrossMatches, known: KnownLengths, *, scale_rad: float, size: int
 ) -> tuple[FloatArray, FloatArray]:
     """Minimise the Cauchy loss of all residuals over turn, shift and, if `size` is 7, scale."""
     from scipy.optimize import least_squares  # slow to import
@@ -100,7 +138,9 @@ def _least_squares(
     middle = matches.centers[:, 1].mean(axis=0)
 
     def residuals(step: FloatArray) -> FloatArray:
-        return errors_and_residuals(_stepped(start, step, middle), matches)[1].ravel()
+        similarity = _stepped(start, step, middle)
+        own = errors_and_residuals(similarity, matches)[1].ravel()
+        return np.concatenate([own, scale_rad * known.deviations(similarity)]) if len(known.lengths) else own
 
     solved = least_squares(residuals, np.zeros(size), loss="cauchy", f_scale=scale_rad, max_nfev=_MAX_EVALUATIONS)
     return _stepped(start, solved.x, middle), np.asarray(solved.jac)

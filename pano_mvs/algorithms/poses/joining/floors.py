@@ -1,42 +1,67 @@
-"""The ratio of the units of two models from their floors: people take the panoramas of a capture at one height."""
+"""Lengths from floors: people take the panoramas of a capture at one height, which is thus known in any unit."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import Rigid3, ranges_from_bearings
 
 _MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
 # Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
 _MAX_SPREAD = 0.05
-_MIN_POINTS = 30
+_MIN_POINTS = 12
+LENGTH_STD = 0.06
+"""Relative standard deviation of a length by the floor that a pair sees. 45 pairs of a real tour: 1.30 to 1.58 m."""
 
 
-def scale_of_floors(first: PlacedModel, second: PlacedModel) -> float | None:
-    """Return how long the unit of the second model is in that of the first, if cameras stand equally high in both.
+def height_above_floor(model: PlacedModel) -> float:
+    """Return the height of the cameras of a model above its floor, in its unit; 0 if it is not known.
 
-    None where a model has no clear floor, or its cameras are not upright at one height above it.
+    It is not known without a clear floor, and where the cameras are not upright at one height above it.
     """
-    heights = [_height(model) for model in (first, second)]
-    return heights[0] / heights[1] if heights[0] and heights[1] else None
-
-
-def _height(model: PlacedModel) -> float:
-    """Return the height of the cameras of a model above its floor, in its unit; 0 if it is not known."""
-    features = list(model.pairs.features.values())
-    ups = np.array([camera.rotation.T @ features[image].ups[0] for image, camera in model.cameras.items()])
-    up = ups.mean(axis=0)
-    up /= max(float(np.linalg.norm(up)), 1e-12)
-    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > _MAX_TILT_RAD:
-        return 0.0
-    centers = np.array([camera.center for camera in model.cameras.values()])
     points = []
     for image, camera in model.cameras.items():
         ranges = model.known_ranges(image)
         known = np.isfinite(ranges)
         points.append(camera.center + ranges[known, None] * (model.pairs.bearings[image][known] @ camera.rotation))
-    floor = floor_below(np.concatenate(points), centers, up)
-    if floor.points < _MIN_POINTS or np.std(centers @ up) > _MAX_SPREAD * floor.depth:
+    return _height(np.concatenate(points), list(model.cameras.values()), [_up(model, image) for image in model.cameras])
+
+
+def length_by_floor(
+    model: PlacedModel, pair: tuple[int, int], second_from_first: Rigid3, p: FloatArray, q: FloatArray, *, height: float
+) -> float:
+    """Return the length of a pair's translation that puts its cameras at a height above the floor; NaN if unknown.
+
+    Args:
+        model: of the capture; only its key points are used.
+        pair: positions of the two images.
+        second_from_first: relative pose, |t| = 1.
+        p: (M, 3) unit rays of its matches in the first image.
+        q: (M, 3) in the second image.
+        height: of all cameras above the floor.
+    """
+    ranges, others = ranges_from_bearings(p, q, second_from_first)
+    known = (ranges > 0) & (others > 0)
+    cameras = [Rigid3.identity(), second_from_first]
+    own = _height(ranges[known, None] * p[known], cameras, [_up(model, image) for image in pair])
+    return height / own if own else np.nan
+
+
+def _up(model: PlacedModel, image: int) -> FloatArray:
+    return np.array(model.pairs.features[model.pairs.names[image]].ups[0])
+
+
+def _height(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[FloatArray]) -> float:
+    ups = np.array([camera.rotation.T @ up for camera, up in zip(cameras, ups_in_cam, strict=True)])
+    up = ups.mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > _MAX_TILT_RAD:
         return 0.0
-    return floor.depth
+    centers = np.array([camera.center for camera in cameras])
+    floor = floor_below(points, centers, up)
+    return floor.depth if floor.points >= _MIN_POINTS and np.std(centers @ up) <= _MAX_SPREAD * floor.depth else 0.0

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.joining.alignment import Alignment, align_models
+from pano_mvs.algorithms.poses.joining.alignment import Alignment, KnownLengths, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors, stacked
-from pano_mvs.algorithms.poses.joining.floors import scale_of_floors
+from pano_mvs.algorithms.poses.joining.floors import LENGTH_STD, height_above_floor, length_by_floor
 from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
 from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
@@ -25,7 +25,6 @@ _THRESHOLD_RAD = float(np.deg2rad(0.4))
 _MAX_LOG10_FALSE_ALARMS = -10.0
 _MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
-_MIN_OF_LENGTH = 6  # known points that determine the length of a translation if the scale is known
 _MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
 _OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # evidence for the best alignment, such as matches, that a rival does not explain
 _PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
@@ -89,35 +88,40 @@ def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[in
 def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
     """Return the alignment of two models by the matches between them; None if these do not determine it.
 
-    Where pairs determine everything but the lengths, the floors of both models determine the scale.
+    Where pairs determine everything but the lengths, the heights of the cameras above the floor do.
     """
     views = _views_between(first, second)
     matches = cross_matches(
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
-    hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
-    found = _of_scale(first, second, matches, views, hypotheses)
-    if found is None and len(second.cameras) > 1 and (scale := scale_of_floors(first, second)):
-        found = _of_scale(first, second, matches, views, hypotheses, scale=scale)
+    found = _by_matches(first, second, matches, views)
+    if found is None and len(second.cameras) > 1 and any(views.values()):
+        heights = height_above_floor(first), height_above_floor(second)
+        found = _by_matches(first, second, matches, views, heights=heights) if all(heights) else None
     return found
 
 
-def _of_scale(
+def _by_matches(
     first: PlacedModel,
     second: PlacedModel,
     matches: CrossMatches,
     views: Mapping[Edge, TwoView],
-    hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
     *,
-    scale: float | None = None,
+    heights: tuple[float, float] | None = None,
 ) -> Alignment | None:
-    """Return the certain alignment of two models, with the given scale if it is known."""
-    has_scale = len(second.cameras) > 1
-    best = _aligned(matches, hypotheses, has_scale=has_scale, scale=scale)
+    """Return the certain alignment of two models, with equal heights above the floor if these are given."""
+    scale = heights[0] / heights[1] if heights else None
+    lengths = _lengths_by_floor(first, views, height=heights[0]) if heights else {}
+    hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
+    if scale:
+        for pair, length in lengths.items():
+            hypotheses[pair] = [replace(one, lengths=(length, length / scale)) for one in hypotheses[pair]]
+    known = KnownLengths.between(first, second, lengths, scale=scale)
+    best = _aligned(matches, hypotheses, known, has_scale=len(second.cameras) > 1)
     if best is None:
         return None
     evidence = _evidence_of_pairs(best, first, second, views=views)
-    if scale and best.witnesses >= _MIN_OF_LENGTH:
+    if scale and _has_known_length(best, first, second, views=views, lengths=lengths):
         evidence = evidence._replace(has_length=True)
     if (
         not _is_significant(best, evidence, learned=any(one.learned for one in first.pairs.features.values()))
@@ -128,11 +132,42 @@ def _of_scale(
         return None
     # Where structure repeats, an alignment with another, similar place has matches of its own.
     rest = matches[np.flatnonzero(~best.inliers)]
-    other = _aligned(rest, hypotheses, has_scale=has_scale, scale=scale)
+    other = _aligned(rest, hypotheses, known, has_scale=len(second.cameras) > 1)
     if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
         return best
     others = _evidence_of_pairs(other, first, second, views=views)
     return None if _is_rival(best, other, matches, evidence=(evidence, others)) else best
+
+
+def _lengths_by_floor(first: PlacedModel, views: Mapping[Edge, TwoView], *, height: float) -> dict[Edge, float]:
+    """Return the lengths of verified pairs of two models that see the floor, in the unit of the first one."""
+    lengths = {}
+    for (i, j), view in views.items():
+        if view:
+            pose, matches = oriented(view, i, j)
+            p, q = (first.pairs.bearings[image][idx] for image, idx in zip((i, j), matches.T, strict=True))
+            length = length_by_floor(first, (i, j), pose, p, q, height=height)
+            if np.isfinite(length):
+                lengths[i, j] = length
+    return lengths
+
+
+def _has_known_length(
+    alignment: Alignment,
+    first: PlacedModel,
+    second: PlacedModel,
+    *,
+    views: Mapping[Edge, TwoView],
+    lengths: Mapping[Edge, float],
+) -> bool:
+    """Return whether an alignment has the pose and the length of a verified pair that sees the floor."""
+    joined = joined_model(first, second, alignment.first_from_second)
+    for (i, j), length in lengths.items():
+        relative = joined.cameras[j] @ joined.cameras[i].inverse()
+        off = abs(np.log(np.linalg.norm(relative.translation) / length))
+        if off < 3 * LENGTH_STD and _is_same(oriented(views[i, j], i, j)[0], relative):
+            return True
+    return False
 
 
 def _is_significant(alignment: Alignment, evidence: _PairEvidence, *, learned: bool) -> bool:
@@ -263,13 +298,13 @@ def _lengths(
 def _aligned(
     matches: CrossMatches,
     hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
+    known: KnownLengths,
     *,
     has_scale: bool,
-    scale: float | None,
 ) -> Alignment | None:
-    if not matches.known.any():
+    if not matches.known.any() and not len(known.lengths):
         return None
-    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, scale=scale, hypotheses=hypotheses)
+    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses, known=known)
 
 
 def _is_rival(
