@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, NamedTuple
+from dataclasses import replace
+from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -156,9 +157,8 @@ def joined(first: Features, learned: Features) -> Features:
     if first.metric != "l2" or first.descriptors.shape[1] != learned.descriptors.shape[1]:
         raise UsageError("learned key points can only be added to those of features.sift_tangent")
     names = ("bearings", "descriptors", "sizes_rad", "scores", "colors_rgb")
-    arrays = {name: np.concatenate([getattr(first, name), getattr(learned, name)]) for name in names}
-    own = {"learned": len(learned), "ups": learned.ups, "per_up": learned.per_up}
-    return Features(**arrays, **own, metric="l2", size_hw=first.size_hw)
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(learned, name)]) for name in names}
+    return replace(learned, **arrays, size_hw=first.size_hw)
 
 
 def maxima_of_scores(score: Array, threshold: float) -> tuple[FloatArray, Array]:

@@ -14,6 +14,7 @@ from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
 from pano_mvs.algorithms.poses.frame.vertical import find_vertical
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, find_segments, orthogonal_directions
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotate_panorama
+from pano_mvs.scene.image_file import decode_image
 from tests.algorithms.poses.frame.test_vertical import with_points
 from tests.algorithms.poses.synthetic_capture import random_rotation
 
@@ -27,7 +28,7 @@ def turned(seed: int) -> dict[str, tuple[NDArray[np.float64], NDArray[np.uint8]]
     capture = {}
     for path in sorted(IMAGES.glob("*.png")):
         rotation = random_rotation(rng)
-        picture = cv2.resize(cv2.imread(str(path))[..., ::-1], (1024, 512), interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(decode_image(path), (1024, 512), interpolation=cv2.INTER_AREA)
         capture[path.name] = rotation, rotate_panorama(picture, rotation)
     return capture
 
