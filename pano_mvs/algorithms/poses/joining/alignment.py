@@ -88,8 +88,8 @@ def align_models(
     has_scale: bool,
     hypotheses: Mapping[tuple[int, int], Sequence[PairHypothesis]],
     known: KnownLengths | None = None,
-) -> Alignment | None:
-    """Return the similarity of two models on which most of their matches agree; None if there is none.
+) -> list[Alignment]:
+    """Return the similarities of two models on which most of their matches agree, best first.
 
     Each relative pose of an image of either model suggests a similarity. Its lengths are those of its matches, or those
     with which most matches agree. The best are refined on all matches together: those with a known point by the angles
@@ -104,14 +104,13 @@ def align_models(
     """
     known = known or KnownLengths()
     proposals = pair_proposals(matches, hypotheses, threshold_rad=threshold_rad, scale=known.scale)
-    if not proposals:
-        return None
     finalists = [
         _refined(start, matches, known, threshold_rad=threshold_rad, has_scale=has_scale and known.scale is None)
         for start in least_costly(proposals, matches, threshold_rad=threshold_rad, count=_FINALISTS)
     ]
     costs = [alignment_cost(similarity, matches, threshold_rad=threshold_rad) for similarity, _ in finalists]
-    return _judged(*finalists[int(np.argmin(costs))], matches, threshold_rad=threshold_rad)
+    order = np.argsort(costs, kind="stable")
+    return [_judged(*finalists[idx], matches, threshold_rad=threshold_rad) for idx in order]
 
 
 def _refined(

@@ -117,26 +117,47 @@ def _by_matches(
         for pair, length in lengths.items():
             hypotheses[pair] = [replace(one, lengths=(length, length / scale)) for one in hypotheses[pair]]
     known = KnownLengths.between(first, second, lengths, scale=scale)
-    best = _aligned(matches, hypotheses, known, has_scale=len(second.cameras) > 1)
-    if best is None:
+    learned = any(one.learned for one in first.pairs.features.values())
+    has_scale = len(second.cameras) > 1
+    # Of the alignments with which many matches agree, the most significant one; the others may rival it.
+    judged: list[tuple[Alignment, _PairEvidence]] = []
+    for one in _distinct(_aligned(matches, hypotheses, known, has_scale=has_scale), first, second):
+        if (
+            one.rotation_std_deg > _MAX_TURN_STD_DEG
+            or one.offset_std_deg > _MAX_OFFSET_STD_DEG
+            or one.scale_std > _MAX_SCALE_STD
+        ):
+            continue
+        evidence = _evidence_of_pairs(one, first, second, views=views)
+        if scale and _has_known_length(one, first, second, views=views, lengths=lengths):
+            evidence = evidence._replace(has_length=True)
+        if _is_significant(one, evidence, learned=learned):
+            judged.append((one, evidence))
+    if not judged:
         return None
-    evidence = _evidence_of_pairs(best, first, second, views=views)
-    if scale and _has_known_length(best, first, second, views=views, lengths=lengths):
-        evidence = evidence._replace(has_length=True)
-    if (
-        not _is_significant(best, evidence, learned=any(one.learned for one in first.pairs.features.values()))
-        or best.rotation_std_deg > _MAX_TURN_STD_DEG
-        or best.offset_std_deg > _MAX_OFFSET_STD_DEG
-        or best.scale_std > _MAX_SCALE_STD
-    ):
-        return None
+    best, evidence = max(judged, key=lambda found: _strength(*found))
     # Where structure repeats, an alignment with another, similar place has matches of its own.
-    rest = matches[np.flatnonzero(~best.inliers)]
-    other = _aligned(rest, hypotheses, known, has_scale=len(second.cameras) > 1)
-    if other is None or not are_apart((best.first_from_second, other.first_from_second), first, second):
-        return best
-    others = _evidence_of_pairs(other, first, second, views=views)
-    return None if _is_rival(best, other, matches, evidence=(evidence, others)) else best
+    rest = _aligned(matches[np.flatnonzero(~best.inliers)], hypotheses, known, has_scale=has_scale)
+    rivals = [(other, _evidence_of_pairs(other, first, second, views=views)) for other in rest[:1]]
+    for other, against in (*judged, *rivals):
+        if are_apart((best.first_from_second, other.first_from_second), first, second) and _is_rival(
+            best, other, matches, evidence=(evidence, against)
+        ):
+            return None
+    return best
+
+
+def _distinct(alignments: Sequence[Alignment], first: PlacedModel, second: PlacedModel) -> list[Alignment]:
+    """Return alignments that put the second model at different places, in their order."""
+    kept: list[Alignment] = []
+    for one in alignments:
+        if all(are_apart((one.first_from_second, other.first_from_second), first, second) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _strength(alignment: Alignment, evidence: _PairEvidence) -> float:
+    return max(alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS, evidence.agreeing)
 
 
 def _lengths_by_floor(first: PlacedModel, views: Mapping[Edge, TwoView], *, height: float) -> dict[Edge, float]:
@@ -301,9 +322,9 @@ def _aligned(
     known: KnownLengths,
     *,
     has_scale: bool,
-) -> Alignment | None:
+) -> list[Alignment]:
     if not matches.known.any() and not len(known.lengths):
-        return None
+        return []
     return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses, known=known)
 
 
