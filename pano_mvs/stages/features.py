@@ -111,7 +111,7 @@ def aliked(
 
     The network finds the same points on white walls, glass and in other light, where SIFT finds few. The camera is
     levelled by the lines in the panorama. Without any, its own up direction counts. Brightness and texture show if it
-    was turned by more than 20°; where they do not tell which way, the network sees it with each likely direction up.
+    was turned by more than 20°; where they do not show which way, the network sees it with each likely direction up.
     The result begins with the key points of an earlier stage of features, if there is one. After matches.weak, images
     that need no learned key points keep theirs.
     """

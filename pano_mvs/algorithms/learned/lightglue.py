@@ -182,7 +182,7 @@ class Side:
 
 def _alike(first: Side, second: Side, most: int) -> list[tuple[int, int]]:
     """Return the pairs of views with the most descriptors that are each other's nearest."""
-    # With views for several directions that may be up, a share of the key points tells as much.
+    # With views for several directions that may be up, a share of the key points is enough.
     one, other = (side.descriptors[:: side.ups] for side in (first, second))
     nearest = match_l2(one, other, ratio=1)
     seen = [~np.isnan(side.places[:, side.ups * nearest[:, n], 0]) for n, side in enumerate((first, second))]

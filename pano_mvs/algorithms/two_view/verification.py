@@ -171,7 +171,7 @@ def verify_pose(
 
 
 def pose_near(
-    first: Features, second: Features, matches_idx: NDArray[np.int32], pose: Rigid3, *, threshold_deg: float = 0.2
+    first: Features, second: Features, matches_idx: NDArray[np.int32], *, pose: Rigid3, threshold_deg: float = 0.2
 ) -> tuple[Rigid3, float, float] | None:
     """Return the relative pose near another that most matches agree with, and how significant it is by itself.
 

@@ -356,12 +356,12 @@ def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: fl
     return found
 
 
-@pytest.mark.parametrize(("floor", "groups"), [(30, 1), (0, 2)])
+@pytest.mark.parametrize(("floor", "groups"), [(60, 1), (0, 2)])
 def test_a_pair_that_sees_the_floor_joins_two_rooms(floor: int, groups: int) -> None:
     """It has no point with a known range."""
     truth = room_poses()
     features = with_points_of_pairs(
-        room_features(truth, door=0, own=600), truth, [("a1", "b1")], count=110, floor=floor
+        room_features(truth, door=0, own=600), truth, [("a1", "b1")], count=140, floor=floor
     )
     poses = _solved(features)
     assert len(poses.names) == 4
@@ -395,4 +395,4 @@ def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
         for name, pose in truth.items()
     }
     assert height_above_floor(_models(room_features(raised, door=0, own=600), raised, unit=1.0)[0]) == 0
-    assert height_above_floor(_models(room_features(truth, door=0, own=6), truth, unit=1.0)[0]) == 0
+    assert height_above_floor(_models(room_features(truth, door=0, own=30), truth, unit=1.0)[0]) == 0

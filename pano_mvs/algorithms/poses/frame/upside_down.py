@@ -37,7 +37,7 @@ _SCALES = np.array([0.33, 1.27, 1.38])
 _WEIGHTS = np.array([3.5, -3.8, -3.0])
 LEVEL_DEG = 20.0
 """Tilt up to which a panorama counts as level."""
-# Of single panoramas: the share that is level, and that of these whose vertical is none of the axes (1 of 47 measured).
+# Of single panoramas: the share that is level, and of these the share whose axes do not include the vertical (1 of 47).
 _LEVEL, _OUTSIDE = 0.9, 0.03
 _LEAST = 0.1
 PRIOR_LOG_ODDS = float(np.log(0.01 / 0.99))
@@ -59,8 +59,8 @@ def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[F
     """Return what may be the zenith (3,) in the camera frame of a single panorama, the most probable direction first.
 
     The lines in the picture determine three axes. If one is within 20° of the camera's own up direction, it is the
-    vertical with a probability of 90 %; if not, that direction counts as one more axis. Brightness and texture tell the
-    ends of the axes apart. Those that are less probable than 10 % are left out.
+    vertical with a probability of 90 %; if not, that direction counts as one more axis. Brightness and texture
+    distinguish the ends of the axes. Those that are less probable than 10 % are left out.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.

@@ -153,7 +153,7 @@ def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertic
     """Return the direction near the cameras' mean up direction to which most line segments in the pictures point.
 
     One camera suffices: its own up direction is where the search begins. Cameras that were turned in all directions
-    have no common one; then brightness, texture and the floor tell which of three axes of the lines is vertical.
+    have no common one; then brightness, texture and the floor show which of three axes of the lines is vertical.
     """
     prior = vertical_from_cameras(poses) if len(poses.names) > 1 else _of_one_camera(poses)
     rotations = dict(zip(poses.names, poses.rotations, strict=True))
@@ -179,7 +179,7 @@ def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: 
     # An unlevelled world is level by chance only, so what is more likely than not is enough.
     if not lines or chance < 0.5:
         return _unknown(
-            "the cameras were turned in all directions, and brightness, texture and points do not tell which is up "
+            "the cameras were turned in all directions, and brightness, texture and points do not show which way is up "
             f"(probability {chance:.2f})"
         )
     evidence = (

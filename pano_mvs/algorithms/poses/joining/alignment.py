@@ -110,7 +110,8 @@ def align_models(
     ]
     costs = [alignment_cost(similarity, matches, threshold_rad=threshold_rad) for similarity, _ in finalists]
     order = np.argsort(costs, kind="stable")
-    return [_judged(*finalists[idx], matches, threshold_rad=threshold_rad) for idx in order]
+    ranked = [finalists[idx] for idx in order]
+    return [_judged(similarity, jacobian, matches, threshold_rad=threshold_rad) for similarity, jacobian in ranked]
 
 
 def _refined(

@@ -94,10 +94,10 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | N
     matches = cross_matches(
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
-    found = _by_matches(first, second, matches, views)
+    found = _by_matches(first, second, matches, views=views)
     if found is None and len(second.cameras) > 1 and any(views.values()):
         heights = height_above_floor(first), height_above_floor(second)
-        found = _by_matches(first, second, matches, views, heights=heights) if all(heights) else None
+        found = _by_matches(first, second, matches, views=views, heights=heights) if all(heights) else None
     return found
 
 
@@ -105,8 +105,8 @@ def _by_matches(
     first: PlacedModel,
     second: PlacedModel,
     matches: CrossMatches,
-    views: Mapping[Edge, TwoView],
     *,
+    views: Mapping[Edge, TwoView],
     heights: tuple[float, float] | None = None,
 ) -> Alignment | None:
     """Return the certain alignment of two models, with equal heights above the floor if these are given."""
@@ -166,8 +166,8 @@ def _lengths_by_floor(first: PlacedModel, views: Mapping[Edge, TwoView], *, heig
     for (i, j), view in views.items():
         if view:
             pose, matches = oriented(view, i, j)
-            p, q = (first.pairs.bearings[image][idx] for image, idx in zip((i, j), matches.T, strict=True))
-            length = length_by_floor(first, (i, j), pose, p, q, height=height)
+            rays = first.pairs.bearings[i][matches[:, 0]], first.pairs.bearings[j][matches[:, 1]]
+            length = length_by_floor(first, (i, j), pose, rays=rays, height=height)
             if np.isfinite(length):
                 lengths[i, j] = length
     return lengths
@@ -243,7 +243,7 @@ def _evidence_of_pairs(
                 has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
                 continue
         # The best pose of weak matches is a matter of chance; they may agree with the alignment nearly as well.
-        near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], relative)
+        near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], pose=relative)
         here = min(near[1], 0.0) if near and _is_same(near[0], relative) else 0.0
         if near and here < 0:
             agreeing += here / near[2]

@@ -72,7 +72,7 @@ def _with_lengths(
     rotation, direction = hypothesis.second_from_first.rotation.T, hypothesis.second_from_first.center
     lengths = np.array(hypothesis.lengths)
     costs = [
-        _costs_of_lengths(side, rotation, direction, centers, matches, threshold_rad=threshold_rad)
+        _costs_of_lengths(side, hypothesis.second_from_first, matches, centers=centers, threshold_rad=threshold_rad)
         if np.isnan(lengths[side])
         else None
         for side in (0, 1)
@@ -93,15 +93,10 @@ def _with_lengths(
 
 
 def _costs_of_lengths(
-    side: int,
-    rotation: FloatArray,
-    direction: FloatArray,
-    centers: FloatArray,
-    matches: CrossMatches,
-    *,
-    threshold_rad: float,
+    side: int, second_from_first: Rigid3, matches: CrossMatches, *, centers: FloatArray, threshold_rad: float
 ) -> FloatArray:
     """Return the costs of the matches whose point is known in one model, for each of `_LENGTHS` in its unit."""
+    rotation, direction = second_from_first.rotation.T, second_from_first.center
     # Only matches of the one camera: the rest of its model is at distances that depend on both lengths.
     of_camera = np.abs(matches.centers[:, 1 - side] - centers[1 - side]).max(axis=1) < 1e-9
     known = matches[np.flatnonzero(of_camera & np.isfinite(matches.ranges[:, side]))]
