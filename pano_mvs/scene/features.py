@@ -74,8 +74,10 @@ class Features(Record):
         require_array(self, "sizes_rad", dtype=np.float32, shape=(count,))
         require_array(self, "scores", dtype=np.float32, shape=(count,))
         require_array(self, "colors_rgb", dtype=np.uint8, shape=(count, 3))
-        counted = not self.per_up or (len(self.per_up), sum(self.per_up)) == (len(self.ups), self.learned)
-        require(counted, self, "per_up must state for each of ups how many key points are learned")
+        require(len(self.ups) > 0, self, "ups must contain a direction")
+        counts = self.per_up or (self.learned,)
+        counted = (len(counts), sum(counts)) == (len(self.ups), self.learned) and min(counts) >= 0
+        require(counted or not self.learned, self, "per_up must state for each of ups how many key points are learned")
 
 
 @dataclass(frozen=True, eq=False)

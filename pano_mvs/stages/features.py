@@ -110,8 +110,8 @@ def aliked(
     """Key points of the network ALIKED on level views around the horizon, for matches.lightglue.
 
     The network finds the same points on white walls, glass and in other light, where SIFT finds few. The camera is
-    levelled by the lines in the panorama. Without any, its own up direction counts. Brightness and texture show if it
-    was turned by more than 20°; where they do not show which way, the network sees it with each likely direction up.
+    levelled by the lines in the panorama. Without any, its own up direction counts. Where these and brightness and
+    texture leave open which way a turned camera was held, the network sees it with each likely direction up.
     The result begins with the key points of an earlier stage of features, if there is one. After matches.weak, images
     that need no learned key points keep theirs.
     """
@@ -121,7 +121,7 @@ def aliked(
     ups = ups_of_picture(picture, mask)
     if len(ups) > 1 or -ups[0][1] < np.cos(np.radians(LEVEL_DEG)):
         ctx.note(
-            "{count} panoramas seem to be turned or upside down, by lines, brightness and texture, so networks see "
+            "{count} panoramas may be turned or upside down, by their lines, brightness and texture, so networks see "
             "them in each likely orientation"
         )
     learned = extract_aliked(picture, mask, ups=ups, networks=params.networks, **arguments_from(extract_aliked, params))

@@ -67,9 +67,12 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
 
 
 def _turned_over(level_group: Poses) -> list[str]:
-    """Return the images that are upside down in a level world; none if all are."""
-    over = level_group.rotations[:, 1, 1] < -0.8  # the cosine between up of a camera and of the world
-    return [] if over.all() else [name for name, is_over in zip(level_group.names, over, strict=True) if is_over]
+    """Return the images that are upside down in a level world; none unless most others are upright."""
+    cosine = level_group.rotations[:, 1, 1]  # between up of a camera and of the world
+    over = cosine < -0.8
+    if over.all() or np.median(cosine[~over]) < 0.8:
+        return []
+    return [name for name, is_over in zip(level_group.names, over, strict=True) if is_over]
 
 
 def _on_orientation(vertical: Vertical) -> str:

@@ -184,7 +184,7 @@ def pose_near(
 
     Returns:
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
-        itself. None if hardly any match agrees, or the pose is the null motion.
+        itself. None if hardly any match agrees, or those that do leave the direction open.
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
     pair = _Pair(
@@ -207,7 +207,12 @@ def pose_near(
         near = refine_relative_pose(near, p[agree], q[agree], scale_rad=0.5 * widen * pair.threshold_rad)
     minimal = SOLVERS["five_point"]
     evidence = pair.evidence(near, sample=minimal.sample, models=minimal.models)
-    return (near, evidence.log10_false_alarms, evidence.most) if np.isfinite(evidence.log10_false_alarms) else None
+    if not np.isfinite(evidence.log10_false_alarms):
+        return None
+    view, parallax = pair.view(evidence)
+    if _why_no_parallax(parallax, pair.threshold_rad) or _why_open(view.direction_std_deg):
+        return None
+    return near, evidence.log10_false_alarms, evidence.most
 
 
 def max_log10_false_alarms(p: FloatArray, q: FloatArray, *, learned: bool) -> float:

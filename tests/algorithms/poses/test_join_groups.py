@@ -19,6 +19,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.algorithms.two_view.verification import pose_near
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
@@ -396,3 +397,28 @@ def test_cameras_that_are_turned_or_at_different_heights_have_none() -> None:
     }
     assert height_above_floor(_models(room_features(raised, door=0, own=600), raised, unit=1.0)[0]) == 0
     assert height_above_floor(_models(room_features(truth, door=0, own=30), truth, unit=1.0)[0]) == 0
+
+
+def test_no_model_is_lost_where_joined_ones_share_no_pair() -> None:
+    """Two pairs of rooms, between which no images were compared."""
+    truth = room_poses()
+    near = room_features(truth, door=8, false=60)
+    features = {**{f"x{name}": one for name, one in near.items()}, **{f"y{name}": one for name, one in near.items()}}
+    views = {(side + a, side + b): view for side in "xy" for (a, b), view in matched(near).items()}
+    poses = solve_scaled_translation(features, views, rng=np.random.default_rng(0))
+    assert sorted(poses.names) == sorted(features)
+    assert len(poses.worlds) == 2
+
+
+def test_a_pair_from_one_place_has_no_vote() -> None:
+    """A rotation explains all its matches, so they agree with any direction."""
+    rng = np.random.default_rng(3)
+    rays = rng.normal(size=(120, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    turn = rotation_from_rotvec(np.array([0.0, 0.5, 0.0]))
+    first, second = (
+        replace(next(iter(room_features(room_poses(), door=0, own=120).values())), bearings=one)
+        for one in (rays, rays @ turn.T)
+    )
+    matches = np.repeat(np.arange(120, dtype=np.int32)[:, None], 2, axis=1)
+    assert pose_near(first, second, matches, pose=Rigid3(turn, np.array([1.0, 0.0, 0.0]))) is None

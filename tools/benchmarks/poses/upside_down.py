@@ -29,7 +29,7 @@ def differences(images: Path, out: Path, cache: Path) -> FloatArray:
     assert poses is not None
     group = split_groups(poses)[0]
     pictures = {name: partial(_picture, images / name) for name in group.names}
-    return differences_below(group, pictures, np.array([0.0, -1.0, 0.0]))
+    return differences_below(group, pictures, np.array([[0.0, -1.0, 0.0]]))[0]
 
 
 def fitted(captures: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -40,6 +40,7 @@ LEVEL_DEG = 20.0
 # Of single panoramas: the share that is level, and of these the share whose axes do not include the vertical (1 of 47).
 _LEVEL, _OUTSIDE = 0.9, 0.03
 _LEAST = 0.1
+_MIN_VALID = 0.1  # share of the compared directions that must not be masked
 PRIOR_LOG_ODDS = float(np.log(0.01 / 0.99))
 """One capture in a hundred is taken to be upside down."""
 
@@ -52,7 +53,7 @@ def upside_down_probability(poses: Poses, pictures: Mapping[str, Picture], up: F
         pictures: image name to a function that loads its panorama; one is in memory at a time.
         up: (3,) unit vector, the up direction in the world according to the cameras.
     """
-    return 1 / (1 + float(np.exp(-_log_odds(differences_below(poses, pictures, up)))))
+    return 1 / (1 + float(np.exp(-_log_odds(differences_below(poses, pictures, up[None])[0]))))
 
 
 def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[FloatArray]:
@@ -74,7 +75,8 @@ def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[F
     ends = np.concatenate([[own, -own], turned, -turned])
     prior = np.full(len(ends), (1 - _LEVEL) / max(1, 2 * len(turned)))
     prior[:2] = _LEVEL * (_OUTSIDE if len(turned) == 3 else 1) * np.array([1, np.exp(PRIOR_LOG_ODDS)])
-    chances = _chances(np.array([_in_picture(image, end) for end in ends]), prior)
+    small = _reduced(image, valid)
+    chances = _chances(np.array([_in_picture(*small, end) for end in ends]), prior)
     return [ends[idx] for idx in np.argsort(-chances, kind="stable") if chances[idx] >= _LEAST]
 
 
@@ -87,7 +89,7 @@ def most_probable_up(poses: Poses, pictures: Mapping[str, Picture], axes: FloatA
         axes: (K, 3) unit vectors, one of which is vertical.
     """
     ends = np.concatenate([axes, -axes])
-    chances = _chances(np.array([differences_below(poses, pictures, end) for end in ends]), np.ones(len(ends)))
+    chances = _chances(differences_below(poses, pictures, ends), np.ones(len(ends)))
     best = int(np.argmax(chances))
     return ends[best], float(chances[best])
 
@@ -100,23 +102,29 @@ def _chances(differences: FloatArray, prior: FloatArray) -> FloatArray:
     return np.asarray(chances / chances.sum())
 
 
-def differences_below(poses: Poses, pictures: Mapping[str, Picture], up: FloatArray) -> FloatArray:
-    """Return how much brighter, richer in texture, and more like a floor a place is below the cameras than above, (3,).
+def differences_below(poses: Poses, pictures: Mapping[str, Picture], ups: FloatArray) -> FloatArray:
+    """Return how much brighter, richer in texture and more like a floor a place is below the cameras than above.
 
-    The first two are differences of mean logarithms over the directions 55–80° below and above the horizon of at most
-    24 evenly chosen panoramas, 0 without pictures; the third of the number of points in the sharpest level surface.
+    The result is (K, 3). The first two are differences of mean logarithms over the directions 55–80° below and above
+    the horizon of at most 24 evenly chosen panoramas, 0 without pictures; the third of the number of points in the
+    sharpest level surface.
 
     Args:
         poses: as in `upside_down_probability`, as the other two.
         pictures: image name to a function that loads its panorama.
-        up: (3,) unit vector.
+        ups: (K, 3) unit vectors that may be up.
     """
     names = [idx for idx, name in enumerate(poses.names) if name in pictures]
     chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), _MAX_PICTURES)).astype(int))
-    seen = [_in_picture(pictures[poses.names[names[idx]]]()[0], poses.rotations[names[idx]] @ up) for idx in chosen]
-    floor, ceiling = (floor_below(poses.points_in_world, poses.centers, towards) for towards in (up, -up))
-    pictured = np.mean(seen, axis=0) if seen else np.zeros(2)
-    return np.array([*pictured, np.log1p(floor.points) - np.log1p(ceiling.points)])
+    seen = []
+    for idx in chosen:
+        small = _reduced(*pictures[poses.names[names[idx]]]())
+        seen.append([_in_picture(*small, poses.rotations[names[idx]] @ up) for up in ups])
+    pictured = np.mean(seen, axis=0) if seen else np.zeros((len(ups), 2))
+    floors = [
+        [floor_below(poses.points_in_world, poses.centers, towards).points for towards in (up, -up)] for up in ups
+    ]
+    return np.column_stack([pictured, np.log1p(floors) @ [1.0, -1.0]])
 
 
 def _log_odds(differences: FloatArray) -> float:
@@ -125,10 +133,18 @@ def _log_odds(differences: FloatArray) -> float:
     return float(np.tanh(differences / _SCALES[:count]) @ _WEIGHTS[:count]) + PRIOR_LOG_ODDS
 
 
-def _in_picture(image: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
-    """Return the differences of brightness and texture, (2,)."""
+def _reduced(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return a panorama and its valid pixels (255, others less) at the size at which directions are compared."""
     small = cv2.resize(image, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
-    level = rotate_panorama(small, rotation_from_two_vectors(up_in_cam, _UP))
+    mask = cv2.resize(valid.astype(np.uint8) * 255, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8), np.asarray(mask, np.uint8)
+
+
+def _in_picture(small: NDArray[np.uint8], mask: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
+    """Return the differences of brightness and texture, (2,); 0 where too little is valid both below and above."""
+    turn = rotation_from_two_vectors(up_in_cam, _UP)
+    level = rotate_panorama(small, turn)
+    is_valid = rotate_panorama(mask, turn) > 254
     # Logarithms of noise in black and of grain in plain surfaces say nothing.
     brightness = np.log(level.mean(axis=2) / 255 + 0.05)
     cosine = np.hypot(*np.moveaxis(ray_grid(_SIZE_HW)[..., ::2], -1, 0))
@@ -136,4 +152,7 @@ def _in_picture(image: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
     texture = np.log(np.hypot(across, 2 * np.gradient(brightness, axis=0)) + 0.01)
     weights = cosine * ((cosine < np.cos(np.radians(_BAND_DEG[0]))) & (cosine > np.cos(np.radians(_BAND_DEG[1]))))
     weights[_SIZE_HW[0] // 2 :] = 0
-    return np.array([((part[::-1] - part) * weights).sum() / weights.sum() for part in (brightness, texture)])
+    own = weights * (is_valid & is_valid[::-1])
+    if own.sum() < _MIN_VALID * weights.sum():
+        return np.zeros(2)
+    return np.array([((part[::-1] - part) * own).sum() / own.sum() for part in (brightness, texture)])

@@ -105,7 +105,7 @@ def find_vertical(
                 vertical if evidence != "auto" or vertical.source == "sensors" else _upright(vertical, poses, pictures)
             )
         reasons.append(vertical.reason)
-    return _unknown("; ".join(reasons))
+    return _unknown("; ".join(dict.fromkeys(reasons)))
 
 
 def _upright(vertical: Vertical, poses: Poses, pictures: Mapping[str, Picture] | None) -> Vertical:
@@ -158,7 +158,7 @@ def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertic
     prior = vertical_from_cameras(poses) if len(poses.names) > 1 else _of_one_camera(poses)
     rotations = dict(zip(poses.names, poses.rotations, strict=True))
     if not prior:
-        return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if rotations else prior
+        return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if pictures else prior
     lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
     if not lines:
         return _unknown(lines.reason)

@@ -67,7 +67,7 @@ class Alignment:
         log10_false_alarms: expected number of equally good alignments among random matches.
         rotation_std_deg: standard deviation of the rotation about its least certain axis.
         offset_std_deg: that of the cameras of the second model, as an angle at the nearest camera of the first one.
-        scale_std: relative standard deviation of the scale; 0 if the second model has one camera.
+        scale_std: relative standard deviation of the scale; 0 if the second model has one camera, or it was known.
         threshold_rad: maximum error of an inlier.
     """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -41,13 +42,14 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
     points, and the matches of all its images count together, verified or not: a match with a known point fixes two
     angles instead of one, and seven numbers align two models with dozens of pairs (see `align_models`). Models are
     joined if the matches determine the alignment, if these are far more than chance, and if no other alignment is
-    nearly as good. The most certain alignment is the first.
+    nearly as good. The one with the most significant matches is the first.
 
     Args:
         models: of the same pairs, without common images; the world of the largest part is kept.
     """
     left: dict[int, Part] = {number: (model, (number,)) for number, model in enumerate(models)}
     tried: dict[tuple[int, int], Alignment | None] = {}
+    numbers = count(len(models))
     while True:
         for pair in _promising({number: model for number, (model, _) in left.items()}):
             if pair not in tried:
@@ -59,7 +61,7 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
         (first, one), (second, other) = (left.pop(number) for number in best)
         joined = joined_model(first, second, usable[best].first_from_second)
         joined.verify_again()
-        left[len(models) + len(tried)] = joined, tuple(sorted((*one, *other)))
+        left[next(numbers)] = joined, tuple(sorted((*one, *other)))
 
 
 def _promising(models: Mapping[int, PlacedModel]) -> Iterator[tuple[int, int]]:
@@ -115,7 +117,8 @@ def _by_matches(
     hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
     if scale:
         for pair, length in lengths.items():
-            hypotheses[pair] = [replace(one, lengths=(length, length / scale)) for one in hypotheses[pair]]
+            own, *others = hypotheses[pair]
+            hypotheses[pair] = [replace(own, lengths=(length, length / scale)), *others]
     known = KnownLengths.between(first, second, lengths, scale=scale)
     learned = any(one.learned for one in first.pairs.features.values())
     has_scale = len(second.cameras) > 1
@@ -195,8 +198,8 @@ def _is_significant(alignment: Alignment, evidence: _PairEvidence, *, learned: b
     """Return whether an alignment is more than chance, by the matches with known points or by pairs.
 
     Pairs that agree with it are taken as independent, so that several weak ones together may be as significant as one
-    must be. Rotation and direction of one pair leave the lengths open: other pairs that agree determine them,
-    or by the ranges of the matches that are known. Either evidence must outweigh the pairs that do not agree.
+    must be. Rotation and direction of one pair leave the lengths open: other pairs that agree determine them, or the
+    known ranges of its matches, or the floor. Either evidence must outweigh the pairs that do not agree.
     Learned matches count only with such pairs, because false ones agree with one another.
     """
     by_matches = alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS
@@ -212,7 +215,7 @@ class _PairEvidence(NamedTuple):
     Attributes:
         agreeing: sum of the significance of those that agree, relative to that which verifies a pair.
         disagreeing: the same of those that do not agree.
-        has_length: whether the matches of one that agrees determine its length, or others that agree do.
+        has_length: whether the matches of one that agrees determine its length, the floor does, or others that agree.
     """
 
     agreeing: float
@@ -227,6 +230,8 @@ def _evidence_of_pairs(
     joined = joined_model(first, second, alignment.first_from_second)
     agreeing, disagreeing, has_length, alarms = 0.0, 0.0, False, list[float]()
     for (i, j), view in views.items():
+        if view.geometry == "rotation":
+            continue
         features = [first.pairs.features[first.pairs.names[image]] for image in (i, j)]
         relative = joined.cameras[j] @ joined.cameras[i].inverse()
         own, limit = 0.0, MAX_LOG10_FALSE_ALARMS

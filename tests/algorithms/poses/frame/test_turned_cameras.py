@@ -69,3 +69,12 @@ def test_a_capture_of_turned_cameras_has_a_vertical(seed: int) -> None:
     assert np.rad2deg(angle_between(vertical.up_in_world, world @ UP)) < 0.5
     assert "turned in all directions" in vertical.evidence
     assert not find_vertical(poses)
+
+
+def test_a_masked_cap_does_not_decide_which_way_is_up() -> None:
+    """A logo below the tripod, brighter than any ceiling."""
+    picture = cv2.resize(decode_image(IMAGES / "000.png"), (512, 256), interpolation=cv2.INTER_AREA)
+    below = (np.arange(256) + 0.5) / 256 * 180 > 90 + 54
+    picture = np.where(below[:, None, None], np.uint8(255), picture)
+    ups = ups_of_picture(picture, np.broadcast_to(~below[:, None], picture.shape[:2]))
+    assert ups[0] @ UP > 0.99
