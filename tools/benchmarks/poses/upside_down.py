@@ -29,7 +29,8 @@ def differences(images: Path, out: Path, cache: Path) -> FloatArray:
     assert poses is not None
     group = split_groups(poses)[0]
     pictures = {name: partial(_picture, images / name) for name in group.names}
-    return differences_below(group, pictures, np.array([[0.0, -1.0, 0.0]]))[0]
+    (found,) = differences_below(group, pictures, np.array([[0.0, -1.0, 0.0]]))
+    return np.asarray(found)
 
 
 def fitted(captures: FloatArray) -> tuple[FloatArray, FloatArray]:
