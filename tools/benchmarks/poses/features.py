@@ -19,14 +19,13 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features
 from pano_mvs.testing.room import default_room, render
 
-RUNS = 5
 WIDTHS = (1024, 1280, 2048)
 KEYPOINTS = 10_000
 LIMIT_S = 1.5  # SPHORB at 640 × 1280, warm, one core
 EXTRACTORS: dict[str, Callable[..., Features]] = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 
 
-def main() -> None:
+def main(runs: int = 5) -> None:
     """Print seconds and key points for each size and extractor."""
     cv2.setNumThreads(1)
     for width in WIDTHS:
@@ -34,7 +33,7 @@ def main() -> None:
         mask = np.ones(image.shape[:2], np.bool_)
         for name, extract in EXTRACTORS.items():
             seconds = []
-            for _ in range(RUNS + 1):
+            for _ in range(runs + 1):
                 start = time.perf_counter()
                 count = len(extract(image, mask, max_keypoints=KEYPOINTS))
                 seconds.append(time.perf_counter() - start)
