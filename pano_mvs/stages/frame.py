@@ -41,7 +41,8 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
     The origin is the first registered camera; the unit of length does not change. The frame states the evidence and its
     uncertainty. If the vertical cannot be determined, or not well enough, the poses do not change and the report states
     why. Each group of poses is levelled on its own. A group that was taken upside down is turned around, unless
-    `evidence` names a source of the vertical.
+    `evidence` names a source of the vertical. Where cameras were turned in all directions, lines in the pictures give
+    three axes, and brightness, texture and points show which one is vertical.
     """
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
