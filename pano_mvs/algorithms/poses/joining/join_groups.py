@@ -97,7 +97,7 @@ def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | N
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
     found = _by_matches(first, second, matches, views=views)
-    if found is None and len(second.cameras) > 1 and any(views.values()):
+    if found is None and _is_learned(first) and len(second.cameras) > 1 and any(views.values()):
         heights = height_above_floor(first), height_above_floor(second)
         found = _by_matches(first, second, matches, views=views, heights=heights) if all(heights) else None
     return found
@@ -120,11 +120,12 @@ def _by_matches(
             own, *others = hypotheses[pair]
             hypotheses[pair] = [replace(own, lengths=(length, length / scale)), *others]
     known = KnownLengths.between(first, second, lengths, scale=scale)
-    learned = any(one.learned for one in first.pairs.features.values())
+    learned = _is_learned(first)
     has_scale = len(second.cameras) > 1
-    # Of the alignments with which many matches agree, the most significant one; the others may rival it.
+    # Of the alignments with which many learned matches agree, the most significant one; the others may rival it.
+    found = _aligned(matches, hypotheses, known, has_scale=has_scale)
     judged: list[tuple[Alignment, _PairEvidence]] = []
-    for one in _distinct(_aligned(matches, hypotheses, known, has_scale=has_scale), first, second):
+    for one in _distinct(found, first, second) if learned else found[:1]:
         if (
             one.rotation_std_deg > _MAX_TURN_STD_DEG
             or one.offset_std_deg > _MAX_OFFSET_STD_DEG
@@ -148,6 +149,11 @@ def _by_matches(
         ):
             return None
     return best
+
+
+def _is_learned(model: PlacedModel) -> bool:
+    """Return whether a network has found key points of the capture."""
+    return any(one.learned for one in model.pairs.features.values())
 
 
 def _distinct(alignments: Sequence[Alignment], first: PlacedModel, second: PlacedModel) -> list[Alignment]:
@@ -247,7 +253,11 @@ def _evidence_of_pairs(
                 alarms.append(own)
                 has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
                 continue
-        # The best pose of weak matches is a matter of chance; they may agree with the alignment nearly as well.
+        if not all(one.learned for one in features):
+            disagreeing += own / limit
+            continue
+        # The best pose of weak matches is a matter of chance; they may agree with the alignment nearly as well. Those
+        # of SIFT are not weak but repeat: in a colonnade, they agree with several alignments.
         near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], pose=relative)
         here = min(near[1], 0.0) if near and _is_same(near[0], relative) else 0.0
         if near and here < 0:
