@@ -205,8 +205,7 @@ def pose_near(
         if agree.sum() < _MIN_NEAR:
             return None
         near = refine_relative_pose(near, p[agree], q[agree], scale_rad=0.5 * widen * pair.threshold_rad)
-    minimal = SOLVERS["five_point"]
-    evidence = pair.evidence(near, sample=minimal.sample, models=minimal.models)
+    evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
     if not np.isfinite(evidence.log10_false_alarms):
         return None
     view, parallax = pair.view(evidence)
