@@ -65,7 +65,7 @@ def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[F
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
-        valid: (H, W) bool; masked (False) pixels have no lines.
+        valid: (H, W) bool; masked (False) pixels do not count.
     """
     segments = find_segments({"": lambda: (image, valid)}, {"": np.eye(3)})
     lines = up_from_lines(segments.nearly_vertical(_UP, groups=SIDES), _UP)
