@@ -82,12 +82,8 @@ def weak(features: All[Features], matches: All[TwoView], params: WeakParams, ctx
 
 @stage("matches.merge")
 def merge(matches: All[TwoView], added: All[TwoView] | None) -> TwoViews:
-    """Return the pairs of two stages; of a pair in both, the added geometry, unless only the other one is verified.
-
-    Learned matches must be far more significant, so a pair may be verified by its other matches alone.
-    """
-    kept = {pair: view for pair, view in (added or {}).items() if view or not matches.get(pair)}
-    return TwoViews({**matches, **kept})
+    """Return the pairs of two stages; of a pair in both, the added geometry, even if it is not verified."""
+    return TwoViews({**matches, **(added or {})})
 
 
 def _report_pair(two_view: TwoView, candidates: int, ctx: Context) -> None:

@@ -33,6 +33,7 @@ from pano_mvs.api import (
     Panorama,
     Params,
     Poses,
+    TwoView,
     UsageError,
     arguments_from,
     params_from,
@@ -159,9 +160,12 @@ class LearnedPairsParams(Params):
 
 
 @stage("pairs.learned", memory="600MB")
-def learned(features: All[Features], params: LearnedPairsParams, ctx: Context) -> Pairs:
-    """Match each image that has key points of features.aliked with those whose learned key points are most similar."""
-    pairs = learned_pairs(features, **arguments_from(learned_pairs, params))
+def learned(features: All[Features], matches: All[TwoView] | None, params: LearnedPairsParams, ctx: Context) -> Pairs:
+    """Match each image that has key points of features.aliked with those whose learned key points are most similar.
+
+    Pairs of such images that an earlier matcher has verified are matched again, too.
+    """
+    pairs = learned_pairs(features, matches, **arguments_from(learned_pairs, params))
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
+from pano_mvs.algorithms.two_view.learned_pairs import marks_of, max_log10_of_learned
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose
@@ -24,7 +26,7 @@ from pano_mvs.algorithms.two_view.upright import upright_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
+from pano_mvs.geometry import Rigid3, angle_between
 from pano_mvs.scene import Features, TwoView
 
 MIN_MATCHES = 16
@@ -36,10 +38,6 @@ _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
 _UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
 _NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
-MAX_LOG10_LEARNED = -50.0
-"""For learned matches: about where a pair is as likely right as wrong (see docs/learned.md, False pairs)."""
-_ALIKE_DEG = 5.0
-"""Learned matches that a rotation alone brings as close must be more significant (see docs/learned.md, False pairs)."""
 
 
 @checks_settings
@@ -67,11 +65,9 @@ def verify_pair(
     pose, both images are tried as upright ones, as tripods and sensors keep them: a heading and two matches then
     determine a relative pose, so that far fewer true matches are more than chance (see `upright_poses`).
 
-    A network matches by the arrangement of key points as well, so that its false matches, such as those of equal doors
-    and windows, agree with one another far more often than shuffled ones, mostly on a pose that keeps an upright camera
-    upright. If both images have learned key points, a pose must therefore be far more significant, and upright poses
-    are not sought. It must be still more significant if a rotation alone nearly explains its inliers: what looks alike
-    in two places, such as two rows of lockers, mostly matches as if it were seen from one place.
+    If a network has found key points in both images, false matches agree with one another far more often than shuffled
+    ones. How significant a pose must be then depends on what else speaks for it, such as a floor (see `learned_pairs`),
+    and upright poses are not sought.
 
     Args:
         first: key points of the first image.
@@ -90,9 +86,9 @@ def verify_pair(
         falsy and state their reason. All matches are kept, and a pair of geometry "none" keeps the hypotheses that were
         tried: together with other pairs, they may be more than chance.
     """
-    p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
     learned = bool(first.learned and second.learned)
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers, learned)
+    pair = _Pair(first, second, matches_idx, rng, float(np.deg2rad(threshold_deg)), min_inliers)
+    p, q = pair.p, pair.q
     count = len(matches_idx)
     if count < max(min_inliers, MIN_MATCHES):
         return pair.failed(f"{count} {plural(count, 'match', 'matches')}, {max(min_inliers, MIN_MATCHES)} needed")
@@ -158,8 +154,8 @@ def verify_pose(
         threshold_deg: maximum spherical Sampson error of an inlier.
         min_inliers: minimum number of independent inliers.
     """
-    p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers)
+    pair = _Pair(first, second, matches_idx, rng, float(np.deg2rad(threshold_deg)), min_inliers, known=True)
+    p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0 or len(matches_idx) < min_inliers:
         return pair.failed(f"{_agreeing(len(matches_idx), len(p))}, {min_inliers} needed")
@@ -186,16 +182,8 @@ def pose_near(
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
         itself. None if hardly any match agrees, or those that do leave the direction open.
     """
-    p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
-    pair = _Pair(
-        matches_idx,
-        p,
-        q,
-        np.random.default_rng(0),
-        float(np.deg2rad(threshold_deg)),
-        _MIN_NEAR,
-        bool(first.learned and second.learned),
-    )
+    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), float(np.deg2rad(threshold_deg)), _MIN_NEAR)
+    p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0:
         return None
@@ -214,18 +202,20 @@ def pose_near(
     return near, evidence.log10_false_alarms, evidence.most
 
 
-def max_log10_false_alarms(p: FloatArray, q: FloatArray, *, learned: bool) -> float:
+def max_log10_false_alarms(
+    first: Features, second: Features, pose: Rigid3, *, rays: tuple[FloatArray, FloatArray]
+) -> float:
     """Return log₁₀ of the most false alarms with which the relative pose of a pair is accepted by itself.
 
     Args:
-        p: (M, 3) unit rays of the matches that agree with the pose, in the first image.
-        q: (M, 3) in the second image.
-        learned: whether both images have learned key points.
+        first: key points of the first image.
+        second: those of the second image.
+        pose: second_from_first, |t| = 1.
+        rays: (M, 3) unit rays of the matches that agree, in either image.
     """
-    if not learned:
+    if not (first.learned and second.learned):
         return MAX_LOG10_FALSE_ALARMS
-    left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
-    return MAX_LOG10_LEARNED * max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)) ** 3
+    return max_log10_of_learned(marks_of(first, second, pose, rays=rays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,15 +235,25 @@ class _Evidence:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """The matches of a pair, (M, 2), and their unit bearings, (M, 3)."""
+    """The matches of a pair, (M, 2)."""
 
+    first: Features
+    second: Features
     matches_idx: NDArray[np.int32]
-    p: FloatArray
-    q: FloatArray
     rng: np.random.Generator
     threshold_rad: float
     min_inliers: int
-    learned: bool = False
+    known: bool = False  # whether other pairs determine the pose
+
+    @cached_property
+    def p(self) -> FloatArray:
+        """Unit bearings of the matches in the first image, (M, 3)."""
+        return self.first.bearings[self.matches_idx[:, 0]]
+
+    @cached_property
+    def q(self) -> FloatArray:
+        """Unit bearings of the matches in the second image, (M, 3)."""
+        return self.second.bearings[self.matches_idx[:, 1]]
 
     def failed(self, reason: str) -> TwoView:
         """Return the falsy value of the pair with all its matches."""
@@ -285,7 +285,9 @@ class _Pair:
             models_per_sample=models,
         )
         enough = witnesses >= self.min_inliers
-        most = max_log10_false_alarms(self.p[inliers], self.q[inliers], learned=self.learned)
+        most = MAX_LOG10_FALSE_ALARMS
+        if not self.known:
+            most = max_log10_false_alarms(self.first, self.second, pose, rays=(self.p[inliers], self.q[inliers]))
         return _Evidence(pose, count, witnesses, alarms, enough, most)
 
     def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
@@ -319,8 +321,8 @@ class _Pair:
             agreeing = _agreeing(evidence.witnesses, len(self.p))
             few = f"{self.min_inliers} needed"
             chance = "which may be chance: the images may not overlap"
-            if self.learned and evidence.log10_false_alarms <= MAX_LOG10_LEARNED:
-                chance = "but a rotation nearly explains them: the images may show two things that look alike"
+            if evidence.log10_false_alarms <= MAX_LOG10_FALSE_ALARMS:
+                chance = "but the images may show two things that look alike"
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
         view, parallax = self.view(evidence)
         reason = _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)

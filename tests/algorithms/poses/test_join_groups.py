@@ -14,9 +14,10 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.joining.alignment import Alignment
 from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, errors_and_residuals, match_errors, vector_of
 from pano_mvs.algorithms.poses.joining.floors import height_above_floor
-from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _PairEvidence
+from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _Joint, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.algorithms.two_view.verification import pose_near
@@ -233,16 +234,26 @@ def test_learned_pairs_that_are_weak_by_themselves_add_up(pairs: list[tuple[str,
 def test_an_alignment_outweighs_the_pairs_that_contradict_it(
     alarms: float, agreeing: float, disagreeing: float, significant: bool
 ) -> None:
-    evidence = _PairEvidence(agreeing, disagreeing, has_length=True)
+    evidence = _PairEvidence({(0, 1): agreeing}, disagreeing, has_length=True)
     assert _is_significant(_alignment(alarms), evidence, learned=False) == significant
     assert _is_significant(_alignment(alarms), evidence, learned=True) == (significant and agreeing >= 1)
 
 
-@pytest.mark.parametrize(("best", "rival", "is_rival"), [(0.5, 0.0, True), (3.0, 0.0, False), (3.0, 2.0, True)])
+@pytest.mark.parametrize(
+    ("best", "rival", "is_rival"),
+    [
+        ({(0, 1): 0.5}, {}, True),
+        ({(0, 1): 3.0}, {}, False),
+        ({(0, 1): 3.0}, {(0, 2): 2.0}, True),
+        ({(0, 1): 3.0}, {(0, 1): 2.5}, True),  # only matches distinguish them
+        ({(0, 1): 3.0, (0, 2): 1.0}, {(0, 1): 3.0}, False),
+        ({(0, 1): 0.5}, {(0, 2): 1.5}, True),
+    ],
+)
 def test_pairs_decide_between_alignments_that_as_many_matches_support(
-    best: float, rival: float, is_rival: bool
+    best: dict[Edge, float], rival: dict[Edge, float], is_rival: bool
 ) -> None:
-    evidence = _PairEvidence(best, 0.0, has_length=True), _PairEvidence(rival, 0.0, has_length=True)
+    one, other = (_PairEvidence(agreeing, 0.0, has_length=True) for agreeing in (best, rival))
     ray = np.array([0.0, 0.0, 1.0])
     matches = CrossMatches(
         cameras=np.zeros((8, 2), np.intp),
@@ -251,7 +262,7 @@ def test_pairs_decide_between_alignments_that_as_many_matches_support(
         rays=np.tile(ray, (8, 2, 1)),
         ranges=np.ones((8, 2)),
     )
-    assert _is_rival(_alignment(-30.0), _alignment(-4.0), matches, evidence=evidence) == is_rival
+    assert _is_rival(_Joint(_alignment(-30.0), one), _Joint(_alignment(-4.0), other), matches) == is_rival
 
 
 def _alignment(log10_false_alarms: float) -> Alignment:

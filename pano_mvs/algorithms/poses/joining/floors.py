@@ -14,7 +14,6 @@ from pano_mvs.geometry import Rigid3, ranges_from_bearings
 _MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
 # Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
 _MAX_SPREAD = 0.05
-_MIN_POINTS = 30  # with 12 to 26, the lengths of a rendered pair were 40 % off
 LENGTH_STD = 0.06
 """Relative standard deviation of a length by the floor that a pair sees. 45 pairs of a real tour: 1.30 to 1.58 m."""
 
@@ -68,4 +67,4 @@ def _height(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[
         return 0.0
     centers = np.array([camera.center for camera in cameras])
     floor = floor_below(points, centers, up)
-    return floor.depth if floor.points >= _MIN_POINTS and np.std(centers @ up) <= _MAX_SPREAD * floor.depth else 0.0
+    return floor.depth if floor and np.std(centers @ up) <= _MAX_SPREAD * floor.depth else 0.0

@@ -42,24 +42,24 @@ def join_models(models: Sequence[PlacedModel]) -> list[Part]:
     points, and the matches of all its images count together, verified or not: a match with a known point fixes two
     angles instead of one, and seven numbers align two models with dozens of pairs (see `align_models`). Models are
     joined if the matches determine the alignment, if these are far more than chance, and if no other alignment is
-    nearly as good. The one with the most significant matches is the first.
+    nearly as good. The most significant alignment is the first.
 
     Args:
         models: of the same pairs, without common images; the world of the largest part is kept.
     """
     left: dict[int, Part] = {number: (model, (number,)) for number, model in enumerate(models)}
-    tried: dict[tuple[int, int], Alignment | None] = {}
+    tried: dict[tuple[int, int], _Joint | None] = {}
     numbers = count(len(models))
     while True:
         for pair in _promising({number: model for number, (model, _) in left.items()}):
             if pair not in tried:
-                tried[pair] = _certain_alignment(left[pair[0]][0], left[pair[1]][0])
+                tried[pair] = _certain_joint(left[pair[0]][0], left[pair[1]][0])
         usable = {pair: one for pair, one in tried.items() if one is not None and left.keys() >= {*pair}}
         if not usable:
             return list(left.values())
-        best = min(usable, key=lambda pair: (usable[pair].log10_false_alarms, pair))
+        best = min(usable, key=lambda pair: (-usable[pair].strength, pair))
         (first, one), (second, other) = (left.pop(number) for number in best)
-        joined = joined_model(first, second, usable[best].first_from_second)
+        joined = joined_model(first, second, usable[best].alignment.first_from_second)
         joined.verify_again()
         left[next(numbers)] = joined, tuple(sorted((*one, *other)))
 
@@ -87,20 +87,33 @@ def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[in
     return (a, b) if (len(models[a].cameras), -a) >= (len(models[b].cameras), -b) else (b, a)
 
 
-def _certain_alignment(first: PlacedModel, second: PlacedModel) -> Alignment | None:
+class _Joint(NamedTuple):
+    """An alignment of two models, and what the pairs between these say about it."""
+
+    alignment: Alignment
+    pairs: _PairEvidence
+
+    @property
+    def strength(self) -> float:
+        """How significant it is, by matches with known points or by pairs, relative to what is required."""
+        return max(self.alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS, self.pairs.agreeing)
+
+
+def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
     """Return the alignment of two models by the matches between them; None if these do not determine it.
 
-    Where pairs determine everything but the lengths, the heights of the cameras above the floor do.
+    Their heights above the floor are equal where both are known, which determines lengths that matches hardly do.
     """
     views = _views_between(first, second)
     matches = cross_matches(
         first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
     )
-    found = _by_matches(first, second, matches, views=views)
-    if found is None and _is_learned(first) and len(second.cameras) > 1 and any(views.values()):
-        heights = height_above_floor(first), height_above_floor(second)
-        found = _by_matches(first, second, matches, views=views, heights=heights) if all(heights) else None
-    return found
+    heights = None
+    if _is_learned(first) and any(views.values()):
+        height = height_above_floor(first)
+        both = height, height_above_floor(second) if len(second.cameras) > 1 else height
+        heights = both if all(both) else None
+    return _by_matches(first, second, matches, views=views, heights=heights)
 
 
 def _by_matches(
@@ -110,7 +123,7 @@ def _by_matches(
     *,
     views: Mapping[Edge, TwoView],
     heights: tuple[float, float] | None = None,
-) -> Alignment | None:
+) -> _Joint | None:
     """Return the certain alignment of two models, with equal heights above the floor if these are given."""
     scale = heights[0] / heights[1] if heights else None
     lengths = _lengths_by_floor(first, views, height=heights[0]) if heights else {}
@@ -124,7 +137,7 @@ def _by_matches(
     has_scale = len(second.cameras) > 1
     # Of the alignments with which many learned matches agree, the most significant one; the others may rival it.
     found = _aligned(matches, hypotheses, known, has_scale=has_scale)
-    judged: list[tuple[Alignment, _PairEvidence]] = []
+    certain: list[_Joint] = []
     for one in _distinct(found, first, second) if learned else found[:1]:
         if (
             one.rotation_std_deg > _MAX_TURN_STD_DEG
@@ -136,17 +149,16 @@ def _by_matches(
         if scale and _has_known_length(one, first, second, views=views, lengths=lengths):
             evidence = evidence._replace(has_length=True)
         if _is_significant(one, evidence, learned=learned):
-            judged.append((one, evidence))
-    if not judged:
+            certain.append(_Joint(one, evidence))
+    if not certain:
         return None
-    best, evidence = max(judged, key=lambda found: _strength(*found))
+    best = max(certain, key=lambda joint: joint.strength)
     # Where structure repeats, an alignment with another, similar place has matches of its own.
-    rest = _aligned(matches[np.flatnonzero(~best.inliers)], hypotheses, known, has_scale=has_scale)
-    rivals = [(other, _evidence_of_pairs(other, first, second, views=views)) for other in rest[:1]]
-    for other, against in (*judged, *rivals):
-        if are_apart((best.first_from_second, other.first_from_second), first, second) and _is_rival(
-            best, other, matches, evidence=(evidence, against)
-        ):
+    rest = _aligned(matches[np.flatnonzero(~best.alignment.inliers)], hypotheses, known, has_scale=has_scale)
+    rivals = [*certain, *(_Joint(other, _evidence_of_pairs(other, first, second, views=views)) for other in rest[:1])]
+    for other in rivals:
+        places = best.alignment.first_from_second, other.alignment.first_from_second
+        if are_apart(places, first, second) and _is_rival(best, other, matches):
             return None
     return best
 
@@ -163,10 +175,6 @@ def _distinct(alignments: Sequence[Alignment], first: PlacedModel, second: Place
         if all(are_apart((one.first_from_second, other.first_from_second), first, second) for other in kept):
             kept.append(one)
     return kept
-
-
-def _strength(alignment: Alignment, evidence: _PairEvidence) -> float:
-    return max(alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS, evidence.agreeing)
 
 
 def _lengths_by_floor(first: PlacedModel, views: Mapping[Edge, TwoView], *, height: float) -> dict[Edge, float]:
@@ -219,14 +227,23 @@ class _PairEvidence(NamedTuple):
     """What the pairs between two models say about an alignment.
 
     Attributes:
-        agreeing: sum of the significance of those that agree, relative to that which verifies a pair.
-        disagreeing: the same of those that do not agree.
+        by_pair: significance of each pair that agrees, relative to that which verifies a pair.
+        disagreeing: sum of that of those that do not agree.
         has_length: whether the matches of one that agrees determine its length, the floor does, or others that agree.
     """
 
-    agreeing: float
+    by_pair: Mapping[Edge, float]
     disagreeing: float
     has_length: bool
+
+    @property
+    def agreeing(self) -> float:
+        """Sum of the significance of the pairs that agree."""
+        return sum(self.by_pair.values())
+
+    def beyond(self, other: _PairEvidence) -> float:
+        """Return the sum of what pairs agree better with this alignment than with another one."""
+        return sum(max(0.0, own - other.by_pair.get(pair, 0.0)) for pair, own in self.by_pair.items())
 
 
 def _evidence_of_pairs(
@@ -234,7 +251,7 @@ def _evidence_of_pairs(
 ) -> _PairEvidence:
     """Return the evidence of the pairs between two models, verified or not, for and against an alignment."""
     joined = joined_model(first, second, alignment.first_from_second)
-    agreeing, disagreeing, has_length, alarms = 0.0, 0.0, False, list[float]()
+    by_pair, disagreeing, has_length, alarms = dict[Edge, float](), 0.0, False, list[float]()
     for (i, j), view in views.items():
         if view.geometry == "rotation":
             continue
@@ -245,11 +262,11 @@ def _evidence_of_pairs(
         if geometry is not None and view.log10_false_alarms < 0:
             pose, matches = oriented(geometry, i, j)
             p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
-            own, limit = view.log10_false_alarms, max_log10_false_alarms(p, q, learned=all(f.learned for f in features))
+            own, limit = view.log10_false_alarms, max_log10_false_alarms(features[0], features[1], pose, rays=(p, q))
             if not view and own <= limit:
                 continue  # it was refused since its direction is open, such as for distant scenery alone
             if _is_same(pose, relative):
-                agreeing += own / limit
+                by_pair[i, j] = own / limit
                 alarms.append(own)
                 has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
                 continue
@@ -261,11 +278,11 @@ def _evidence_of_pairs(
         near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], pose=relative)
         here = min(near[1], 0.0) if near and _is_same(near[0], relative) else 0.0
         if near and here < 0:
-            agreeing += here / near[2]
+            by_pair[i, j] = here / near[2]
             alarms.append(here)
         disagreeing += max(0.0, (own - here) / limit)
     has_length |= sum(sorted(alarms)[1:]) <= MAX_LOG10_FALSE_ALARMS
-    return _PairEvidence(agreeing, disagreeing, has_length)
+    return _PairEvidence(by_pair, disagreeing, has_length)
 
 
 def _is_same(pose: Rigid3, relative: Rigid3) -> bool:
@@ -343,21 +360,25 @@ def _aligned(
     return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses, known=known)
 
 
-def _is_rival(
-    best: Alignment, other: Alignment, matches: CrossMatches, *, evidence: tuple[_PairEvidence, _PairEvidence]
-) -> bool:
-    """Return whether another alignment is more than chance, and explains nearly as many matches of its own.
+def _is_rival(best: _Joint, other: _Joint, matches: CrossMatches) -> bool:
+    """Return whether another alignment of two models explains nearly as much of its own as the best one.
 
-    It is not a rival if pairs decide for the best one: they are as significant as a pair must be, and twice as much so
-    as those that agree with the other one. Matches without a known point are ignored, since many of them agree with any
+    Pairs decide if those that agree with one of the two better than with the other are as significant as a pair must be
+    (not, therefore, if the two differ in nothing but a length that pairs leave open), else the matches if the other
+    alignment is more than chance. Matches without a known point are ignored, since many of them agree with any
     alignment.
     """
-    if other.log10_false_alarms > 0 or evidence[0].agreeing >= max(1.0, _OWN_OF_RIVAL * evidence[1].agreeing):
+    own, others = best.pairs.beyond(other.pairs), other.pairs.beyond(best.pairs)
+    if max(own, others) >= 1:
+        return own < _OWN_OF_RIVAL * others
+    if other.alignment.log10_false_alarms > 0:
         return False
-    explained: NDArray[np.bool_] = match_errors(other.first_from_second, matches) < best.threshold_rad
-    own = int((best.inliers & ~explained & matches.known).sum())
-    others = int((explained & ~best.inliers & matches.known).sum())
-    return own < _OWN_OF_RIVAL * others + _MIN_OWN
+    explained: NDArray[np.bool_] = (
+        match_errors(other.alignment.first_from_second, matches) < best.alignment.threshold_rad
+    )
+    own_matches = int((best.alignment.inliers & ~explained & matches.known).sum())
+    others_matches = int((explained & ~best.alignment.inliers & matches.known).sum())
+    return own_matches < _OWN_OF_RIVAL * others_matches + _MIN_OWN
 
 
 def cross_matches(

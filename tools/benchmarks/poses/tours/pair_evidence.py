@@ -1,116 +1,153 @@
-"""How significant wrong learned pairs are.
+"""How far the relative pose of a learned pair can be believed, by what speaks for it.
 
-Each DIR is a capture with truth.json, see `tools.benchmarks.poses.tours.measure`. Each panorama is matched with those
-that have the most similar learned key points, as `matches.lightglue` does. The best relative pose of each pair is right
-if it agrees with the truth to 3° and 6°, or to 6° and 15° where the truth was drawn by hand. The table shows right and
-wrong pairs by log₁₀ of their false alarms and by the median angle that the best rotation leaves between the matches
-that agree, and how many of them `verify_pair` accepts. Below is where a logistic regression on the logarithm of this
-exponent gives even odds, which is the limit of `verify_pair` for learned matches. Results stay in DIR/pairs, also those
-of a run that was interrupted.
+Each DIR is a capture with truth.json, which `tools.benchmarks.poses.tours.measure DIR … --out OUT` has run. The best
+relative pose of each pair that a network has matched is right if it agrees with the truth to 3° and 10°, or to 5° and
+15° where the truth was drawn by hand. `--table FILE` gets a row for each pair; without DIR, the rows are read from it.
+
+A logistic regression gives the odds that a pair is right by its false alarms and its `Marks`, which are the
+coefficients of `pano_mvs.algorithms.two_view.learned_pairs`. The table shows the pairs that these accept, fitted to
+all captures but the one of the row, beside those with at most 10⁻⁵⁰ false alarms.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
-from functools import partial
-from itertools import pairwise, product
+import csv
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.features.tangent import extract_sift
-from pano_mvs.algorithms.learned.aliked import extract_aliked, joined
-from pano_mvs.algorithms.learned.lightglue import match_learned
-from pano_mvs.algorithms.learned.weak_images import learned_pairs
-from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
-from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.geometry import angle_between, geodesic_angle, nearest_rotation
-from pano_mvs.scene import Features
-from tools.benchmarks.poses.precision import cached
+from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, Marks, marks_of, terms_of
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
+from pano_mvs.scene import Features, TwoView
+from pano_mvs.scene.record import Record
 from tools.benchmarks.poses.tours.measure import read_truth
 
-EDGES = (-np.inf, -200.0, -100.0, -75.0, -50.0, -35.0, -25.0, -15.0, -6.0, np.inf)
-LEFT_DEG = (0.0, 3.0, 5.0, 8.0, np.inf)
-_EXACT_DEG, _DRAWN_DEG = (3.0, 6.0), (6.0, 15.0)
+_EXACT_DEG, _DRAWN_DEG = (3.0, 10.0), (5.0, 15.0)
+_MIN_EXPONENT = 3.0  # weaker pairs are hardly ever right, and many
+_RIDGE = 0.025
+_Kind = TypeVar("_Kind", bound=Record)
 
 
-def keypoints(picture: Path) -> Features:
-    """Return the SIFT and the learned key points of a panorama."""
-    stored = cv2.imread(str(picture))
-    assert stored is not None, picture
-    image = np.ascontiguousarray(stored[..., ::-1])
-    mask = np.ones(image.shape[:2], np.bool_)
-    return joined(extract_sift(image, mask), extract_aliked(image, mask, ups=ups_of_picture(image, mask)))
+class PairRow(NamedTuple):
+    """A pair of images: log₁₀ of its false alarms, what else speaks for its pose, and whether this is right."""
 
-
-def candidates(first: Features, second: Features) -> np.ndarray:
-    """Return the matches of both kinds of key points, as `matches.lightglue` finds them."""
-    own = match_features(first.without_learned(), second.without_learned())
-    return np.concatenate([own, match_learned(first, second)])
-
-
-class JudgedPair(NamedTuple):
-    """A pair with a hypothesis: log₁₀ of its false alarms, what a rotation leaves, and whether the pose is right."""
-
-    exponent: float
-    left_deg: float
-    accepted: bool
+    capture: str
+    first: str
+    second: str
+    log10_false_alarms: float
+    marks: Marks
     right: bool
 
 
-def judged_pairs(capture: Path, *, neighbours: int) -> Iterator[JudgedPair]:
-    """Yield the pairs of a capture that have a hypothesis."""
+def pair_rows(capture: Path, out: Path) -> Iterator[PairRow]:
+    """Yield the learned pairs of a finished run."""
     truth = read_truth(capture)
     assert truth is not None, f"{capture} has no truth.json with headings"
     poses, limits = truth
     most = _EXACT_DEG if limits[0] < 2 else _DRAWN_DEG
-    folder = capture / "pairs"
-    found: Mapping[str, Features] = {
-        name: cached(folder / f"{name}.pkl", partial(keypoints, capture / "images" / name)) for name in sorted(poses)
-    }
-    for first, second in learned_pairs(found, neighbours=neighbours).pairs:
-        ends = found[first], found[second]
-        matches = cached(folder / f"{first}_{second}.pkl", partial(candidates, *ends))
-        view = verify_pair(*ends, matches, rng=np.random.default_rng(0))
+    store = Store(out / "cache")
+    keys = next(run.keys for run in store.runs.entries() if run.out == str((out / "run").resolve()))
+
+    def load(stage: str, item: str, kind: type[_Kind]) -> _Kind:
+        record = store.read_record(keys[stage][item])
+        assert record is not None, f"{out}: {stage} of {item} is not in the cache"
+        value = store.load(record.output, kind)
+        assert isinstance(value, kind)
+        return value
+
+    for pair in keys.get("rematched", {}):
+        first, second = (name.strip() for name in pair.split("|"))
+        view = load("rematched", pair, TwoView)
+        ends = load("learned", first, Features), load("learned", second, Features)
         best, true = view if view else next(iter(view.alternatives), None), poses[second] @ poses[first].inverse()
-        if best is not None:
-            off = geodesic_angle(best.rotation, true.rotation), angle_between(best.direction, true.translation)
-            p, q = (end.bearings[idx] for end, idx in zip(ends, best.matches_idx.T, strict=True))
-            left = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
-            yield JudgedPair(view.log10_false_alarms, float(left), bool(view), bool(np.all(np.rad2deg(off) < most)))
+        if best is None or view.geometry == "rotation":
+            continue
+        pose = Rigid3(best.rotation, best.direction)
+        rays = ends[0].bearings[best.matches_idx[:, 0]], ends[1].bearings[best.matches_idx[:, 1]]
+        off = geodesic_angle(pose.rotation, true.rotation), angle_between(pose.translation, true.translation)
+        right = bool(np.all(np.rad2deg(off) < most))
+        yield PairRow(capture.name, first, second, view.log10_false_alarms, marks_of(*ends, pose, rays=rays), right)
 
 
-def even_exponent(exponents: np.ndarray, right: np.ndarray) -> float:
-    """Return the exponent at which a pair is as likely right as wrong, by logistic regression; NaN if all are alike."""
-    if right.all() or not right.any():
-        return float("nan")
-    x, sign = np.log(np.maximum(-exponents, 1.0)), np.where(right, 1.0, -1.0)
+def read_table(file: Path) -> list[PairRow]:
+    """Return the rows of a table."""
+    with file.open(encoding="utf-8", newline="") as stream:
+        return [
+            PairRow(
+                row["capture"],
+                row["first"],
+                row["second"],
+                float(row["log10_false_alarms"]),
+                Marks(*(float(row[name]) for name in Marks._fields)),
+                row["right"] == "1",
+            )
+            for row in csv.DictReader(stream)
+        ]
 
-    def loss(line: np.ndarray) -> float:
-        # The weak prior keeps the slope finite if a limit separates all pairs.
-        return float(np.logaddexp(0, -sign * (line[0] + line[1] * x)).sum() + 0.01 * line[1] ** 2)
 
-    offset, slope = minimize(loss, np.zeros(2)).x
-    return float(-np.exp(-offset / slope))
+def write_table(file: Path, rows: Sequence[PairRow]) -> None:
+    """Write rows, without what does not count."""
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*PairRow._fields[:4], *Marks._fields, "right"])
+        for row in rows:
+            if row.log10_false_alarms <= -_MIN_EXPONENT:
+                marks = [f"{mark:.3g}" for mark in row.marks]
+                writer.writerow([*row[:3], f"{row.log10_false_alarms:.1f}", *marks, int(row.right)])
+
+
+def fitted(rows: Sequence[PairRow]) -> NDArray[np.float64]:
+    """Return the coefficients: of one, of the logarithm of the exponent, and of the marks, each with its known sign."""
+    terms = np.array([terms_of(row.log10_false_alarms, row.marks) for row in rows])
+    sign = np.where([row.right for row in rows], 1.0, -1.0)
+
+    def loss(weights: NDArray[np.float64]) -> float:
+        # The weak prior keeps the weights finite if they separate all pairs.
+        return float(np.logaddexp(0, -sign * (terms @ weights)).sum() + _RIDGE * np.sum(weights[1:] ** 2))
+
+    better = {"floor"}
+    bounds = [(None, None), (0, None), *((0, None) if name in better else (None, 0) for name in Marks._fields)]
+    return np.asarray(minimize(loss, np.zeros(terms.shape[1]), bounds=bounds).x)
+
+
+def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
+    """Return for each capture its right pairs; the right and the wrong ones by the fit to the others; and by 10⁻⁵⁰."""
+    found = {}
+    for capture in sorted({row.capture for row in rows}):
+        weights = fitted([row for row in rows if row.capture != capture])
+        own = [row for row in rows if row.capture == capture]
+        right = np.array([row.right for row in own])
+        odds = np.array([terms_of(row.log10_false_alarms, row.marks) for row in own]) @ weights
+        fit, plain = odds >= ACCEPTED_ODDS, np.array([row.log10_false_alarms <= -50 for row in own])
+        counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
+        found[capture] = tuple(int(one.sum()) for one in counts)
+    return found
 
 
 def main() -> None:
-    """Print the table of the captures that the command line names."""
+    """Print the tables of the captures that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="+", type=Path, metavar="DIR")
-    parser.add_argument("--neighbours", type=int, default=8)
+    parser.add_argument("captures", nargs="*", type=Path, metavar="DIR")
+    parser.add_argument("--runs", type=Path, metavar="OUT", help="results of poses.tours.measure")
+    parser.add_argument("--table", type=Path, required=True, metavar="FILE")
     given = parser.parse_args()
-    pairs = [pair for capture in given.captures for pair in judged_pairs(capture, neighbours=given.neighbours)]
-    exponents, left, accepted, right = (np.array(column) for column in zip(*pairs, strict=True))
-    print("| log₁₀ of the false alarms | left by a rotation | right | wrong | accepted: right | wrong |")
+    if given.captures:
+        write_table(given.table, [row for one in given.captures for row in pair_rows(one, given.runs / one.name)])
+    rows = read_table(given.table)
+    print("| capture | right pairs | accepted: right | wrong | 10⁻⁵⁰: right | wrong |")
     print("|---" * 6 + "|")
-    for (low, high), (near, far) in product(pairwise(EDGES), pairwise(LEFT_DEG)):
-        inside = (exponents > low) & (exponents <= high) & (left >= near) & (left < far)
-        counts = (int((inside & one).sum()) for one in (right, ~right, accepted & right, accepted & ~right))
-        print(f"| {low:g} to {high:g} | {near:g}° to {far:g}° | " + " | ".join(map(str, counts)) + " |")
-    print(f"even odds at {even_exponent(exponents, right):.0f}")
+    counts = left_out(rows)
+    for capture, line in counts.items():
+        print(f"| {capture} | " + " | ".join(map(str, line)) + " |")
+    print("| all | " + " | ".join(str(sum(column)) for column in zip(*counts.values(), strict=True)) + " |")
+    print("coefficients:", ", ".join(f"{weight:.3f}" for weight in fitted(rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.joints import Joint
-from pano_mvs.algorithms.two_view.verification import MAX_LOG10_LEARNED
 from pano_mvs.geometry import geodesic_angle
 
 FloatArray = NDArray[np.float64]
@@ -62,9 +61,12 @@ def camera_evidence(
     return rows
 
 
+_CERTAIN_LOG10 = -50.0
+
+
 def _has_certain_pair(model: PlacedModel, image: int) -> bool:
     return any(
-        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < MAX_LOG10_LEARNED
+        image in edge and model.cameras.keys() >= {*edge} and view.log10_false_alarms < _CERTAIN_LOG10
         for edge, view in (model.pairs.compared or {}).items()
     )
 

@@ -1,0 +1,96 @@
+"""How significant a relative pose must be if a network has found its matches, by what else speaks for it.
+
+A network matches by the arrangement of key points as well. Its false matches, such as those of equal doors, agree with
+one another far more often than shuffled ones, so that their number alone says little. But false poses have marks of
+their own. They hardly ever show a floor: below the cameras, the points of false matches do not lie at one height. The
+verticals of the two images do not agree, and neither do the heights of the cameras. What looks alike in two places
+mostly matches as if it were seen from one place: a rotation alone nearly explains it, and the cameras seem to be close
+together compared with their height above the points below them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation, ranges_from_bearings
+from pano_mvs.scene import Features
+
+_UNIT = 50.0  # log₁₀ of the false alarms is counted in this unit
+_ALIKE_DEG = 5.0
+_MOST_DEG = 8.0  # tilt and climb count up to here
+_BELOW = 0.25  # sine of how far below the horizon a match may lie on a floor
+_MOST_DOUBLINGS = 20.0
+
+
+class Marks(NamedTuple):
+    """What speaks for or against a relative pose beside the number of matches that agree; none is negative.
+
+    Attributes:
+        alike: log₂ of how many times closer than 5° the best rotation alone brings the matches; 0 if not closer.
+        tilt: angle between the verticals of the two images, in degrees.
+        climb: angle of the baseline with the horizon, in degrees.
+        floor: share of the matches below the horizon that lie at the height of the floor; 0 without a floor.
+        near: log₂ of the height of the cameras above this floor in units of their distance; 0 if it is less.
+    """
+
+    alike: float
+    tilt: float
+    climb: float
+    floor: float
+    near: float
+
+
+WEIGHTS = (0.77, 0.63, -0.35, -0.75, -0.43, 5.62, -1.71)
+"""Of `terms_of` in the logarithm of the odds that a pose is right, as `poses.tours.pair_evidence` of the tools fits."""
+
+ACCEPTED_ODDS = float(np.log(5.0))
+"""A pose is accepted with five to one, because a wrong one costs as much as five missed ones."""
+
+
+def terms_of(log10_false_alarms: float, marks: Marks) -> FloatArray:
+    """Return what counts for and against a pose: one, log₂ of the exponent of its false alarms, and its marks, (7,)."""
+    doublings = np.log2(max(-log10_false_alarms, 1.0) / _UNIT)
+    return np.array([1.0, doublings, *np.minimum(marks, _MOST_DEG)], np.float64)
+
+
+def marks_of(first: Features, second: Features, pose: Rigid3, *, rays: tuple[FloatArray, FloatArray]) -> Marks:
+    """Return the marks of a relative pose.
+
+    Args:
+        first: key points of the first image, whose `ups` are the candidates for its zenith.
+        second: those of the second one.
+        pose: second_from_first, |t| = 1.
+        rays: (M, 3) unit rays of the matches that agree, in either image.
+    """
+    p, q = rays
+    left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
+    # Of the likely zeniths of turned cameras, those that agree best.
+    one, other = min(
+        ((np.array(up), np.array(above) @ pose.rotation) for up, above in product(first.ups, second.ups)),
+        key=lambda ups: -float(ups[0] @ ups[1]),
+    )
+    up = (one + other) / max(float(np.linalg.norm(one + other)), 1e-12)
+    ranges, others = ranges_from_bearings(p, q, pose)
+    seen = (ranges > 0) & (others > 0)
+    floor = floor_below(ranges[seen, None] * p[seen], np.stack([np.zeros(3), pose.center]), up)
+    below = min(int((p @ one < -_BELOW).sum()), int((q @ pose.rotation @ other < -_BELOW).sum()))
+    return Marks(
+        alike=float(np.log2(max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)))),
+        tilt=float(np.rad2deg(angle_between(one, other))),
+        climb=float(np.rad2deg(np.arcsin(min(abs(float(pose.center @ up)), 1.0)))),
+        floor=min(1.0, floor.points / below) if floor and below else 0.0,
+        near=float(np.log2(max(1.0, floor.depth))),
+    )
+
+
+def max_log10_of_learned(marks: Marks) -> float:
+    """Return log₁₀ of the most false alarms with which a pair of learned matches is accepted by itself."""
+    odds = float(terms_of(-_UNIT, marks) @ WEIGHTS)
+    doublings = min((ACCEPTED_ODDS - odds) / WEIGHTS[1], _MOST_DOUBLINGS)
+    return float(min(-_UNIT * 2.0**doublings, MAX_LOG10_FALSE_ALARMS))
