@@ -46,7 +46,7 @@ class Marks(NamedTuple):
     near: float
 
 
-WEIGHTS = (0.77, 0.63, -0.35, -0.75, -0.43, 5.62, -1.71)
+WEIGHTS = (0.453, 0.585, -0.671, -0.561, -0.365, 3.739, -1.488)
 """Of `terms_of` in the logarithm of the odds that a pose is right, as `poses.tours.pair_evidence` of the tools fits."""
 
 ACCEPTED_ODDS = float(np.log(5.0))

@@ -88,7 +88,7 @@ def test_learned_matches_must_be_far_more_than_chance() -> None:
         assert -50 < plain.log10_false_alarms < -6
         level, other = (replace(one, learned=len(one)) for one in (first, second))
         found = verify_pair(level, other, _all(90), rng=np.random.default_rng(0))
-        assert "may be chance" in found.reason
+        assert "two things that look alike" in found.reason
         assert found.alternatives
     _, first, second = _pair(true=90, count=90, tilt_deg=8.0)
     level, other = (replace(one, learned=len(one)) for one in (first, second))
