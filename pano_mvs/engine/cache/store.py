@@ -379,12 +379,15 @@ class Store:
 
         Raises:
             DamagedBlobError: if a blob is damaged; it has been removed, and the next run computes it again.
+            ContractError: if the value is of another kind.
         """
         try:
             parts = {name: self.blobs.get(part) for name, part in ref.parts.items()}
             try:
                 return kind.from_parts(parts)
             except (TypeError, ValueError, KeyError, AttributeError, AssertionError) as error:
+                if ref.kind != kind.kind_name():
+                    raise ContractError(f"a stored {ref.kind} was read as a {kind.kind_name()}") from error
                 errors = [
                     self.blobs.discard(part, f"is not a part of a {kind.kind_name()}") for part in ref.parts.values()
                 ]

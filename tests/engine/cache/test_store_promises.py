@@ -23,7 +23,7 @@ from pano_mvs.engine.cache import store as store_module
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, DiskGuard, ItemRef, Store, UnitRecord, record_from_bytes
-from pano_mvs.scene import FilePart, Part, Record
+from pano_mvs.scene import Features, FilePart, Part, Record
 from tests.engine.conftest import settle
 
 KEY = "ab" * 16
@@ -172,6 +172,15 @@ def test_parts_that_make_no_value_are_removed_and_reported(tmp_path: Path) -> No
         store.load(ItemRef("Pair", "d" * 32, parts), Pair)
     assert not any(store.blobs.exists(ref) for ref in parts.values())
     assert len(store.damaged) == 1
+
+
+def test_a_value_read_as_another_kind_stays(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    ref = store.put_value(Pair(np.arange(3), ("a",)))
+    with pytest.raises(ContractError, match="a stored Pair was read as a Features"):
+        store.load(ref, Features)
+    assert store.load(ref, Pair)
+    assert not store.damaged
 
 
 def test_a_blob_is_there_if_its_size_is(tmp_path: Path) -> None:
