@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.logistic import steps_behind
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.model import steps_behind
 from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture

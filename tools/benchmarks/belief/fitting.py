@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.poses.verification.belief.model import Model, Term, steps_behind
+from pano_mvs.algorithms.logistic import Model, Term, steps_behind
 
 FloatArray = NDArray[np.float64]
 
@@ -115,14 +115,34 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
     without any, since users may lack either or both.
     """
     cameras = joined([cameras, *(_only(cameras, names) for names in (OF_IMAGES, OF_PAIRS, set[str]()))])
-    knots = {name: _knots(cameras.columns[name], sign, ENOUGH.get(name)) for name, sign in signs.items()}
-    behind = np.hstack([steps_behind(cameras.columns[name], knots[name]) for name in signs])
-    target = cameras.right.astype(np.float64)
+    knots = {name: quantile_knots(cameras.columns[name], sign, enough=ENOUGH.get(name)) for name, sign in signs.items()}
+    weights = np.ones(len(cameras.right))
+    return most_likely(cameras.columns, cameras.right.astype(np.float64), weights, knots=knots, penalty=penalty)
+
+
+def most_likely(
+    columns: Mapping[str, FloatArray],
+    target: FloatArray,
+    weights: FloatArray,
+    *,
+    knots: Mapping[str, tuple[float, ...]],
+    penalty: float,
+) -> Model:
+    """Return the model with the largest likelihood less a penalty on the squared losses, all of which are at least 0.
+
+    Args:
+        columns: measurement to its values (N,), NaN where missing.
+        target: (N,) what is to be predicted, 0 to 1.
+        weights: (N,) of each row.
+        knots: of each measurement that is used.
+        penalty: on the squared losses.
+    """
+    behind = np.hstack([steps_behind(columns[name], own) for name, own in knots.items()])
 
     def cost(values: FloatArray) -> tuple[float, FloatArray]:
         logit = values[0] - behind @ values[1:]
-        likelihood = np.logaddexp(0.0, -logit) + (1 - target) * logit
-        error = 1 / (1 + np.exp(-logit)) - target
+        likelihood = weights * (np.logaddexp(0.0, -logit) + (1 - target) * logit)
+        error = weights * (1 / (1 + np.exp(-logit)) - target)
         gradient = np.concatenate([[error.sum()], -behind.T @ error + 2 * penalty * values[1:]])
         return float(likelihood.sum() + penalty * (values[1:] ** 2).sum()), gradient
 
@@ -136,11 +156,10 @@ def fit(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] 
         options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-12},
     )
     terms, at = {}, 1
-    for name in signs:
-        count = len(knots[name])
-        losses = np.round(found.x[at : at + count], 4)
-        terms[name] = Term(knots[name], tuple(losses[:-1].tolist()), float(losses[-1]))
-        at += count
+    for name, own in knots.items():
+        losses = np.round(found.x[at : at + len(own)], 4)
+        terms[name] = Term(own, tuple(losses[:-1].tolist()), float(losses[-1]))
+        at += len(own)
     return Model(
         round(float(found.x[0]), 4), {name: term for name, term in terms.items() if any(term.losses) or term.missing}
     )
@@ -164,12 +183,15 @@ def joined(parts: Sequence[Cameras]) -> Cameras:
     )
 
 
-def _knots(values: FloatArray, sign: int, enough: float | None) -> tuple[float, ...]:
+def quantile_knots(
+    values: FloatArray, sign: int, *, quantiles: Sequence[float] = QUANTILES, enough: float | None = None
+) -> tuple[float, ...]:
+    """Return quantiles of the known ones of values (N,), from the worst to the best, up to what is enough."""
     known = values[np.isfinite(values)]
     if not len(known):
         return (0.0, 1.0) if sign > 0 else (1.0, 0.0)
-    quantiles = QUANTILES if sign > 0 else tuple(1 - one for one in QUANTILES)
-    found = [float(f"{value:.4g}") for value in np.quantile(known, quantiles)]
+    ordered = quantiles if sign > 0 else [1 - one for one in quantiles]
+    found = [float(f"{value:.4g}") for value in np.quantile(known, ordered)]
     if enough is not None:  # without a knot so near that the step to it would be a threshold
         found = [*(value for value in found if value < 0.9 * enough), enough]
     distinct = [found[0]]

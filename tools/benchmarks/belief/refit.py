@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.verification.belief.model import Model
+from pano_mvs.algorithms.logistic import Model
 from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful
 from tools.benchmarks.belief.fitting import (
     PENALTY,
@@ -139,7 +139,7 @@ def source_of(model: Model) -> str:
     )
     return (
         '"""The coefficients that `python -m tools benchmarks belief.refit` has fitted."""\n\n'
-        "from pano_mvs.algorithms.poses.verification.belief.model import Model, Term\n\n"
+        "from pano_mvs.algorithms.logistic import Model, Term\n\n"
         f"FITTED = Model(\n    {model.intercept},\n    {{\n{terms}    }},\n)\n"
     )
 

@@ -1,6 +1,6 @@
 """The coefficients that `python -m tools benchmarks belief.refit` has fitted."""
 
-from pano_mvs.algorithms.poses.verification.belief.model import Model, Term
+from pano_mvs.algorithms.logistic import Model, Term
 
 FITTED = Model(
     5.952,

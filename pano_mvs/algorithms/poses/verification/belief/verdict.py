@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.verification.belief.model import Model
+from pano_mvs.algorithms.logistic import Model
 from pano_mvs.core.text import plural
 
 MISS_COST = 5.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.logistic import Model, Term
 from pano_mvs.algorithms.poses.verification.belief.coefficients import FITTED
-from pano_mvs.algorithms.poses.verification.belief.model import Model, Term
 from pano_mvs.algorithms.poses.verification.belief.verdict import is_doubtful, is_left_out, reason
 
 BEST = {

@@ -1,4 +1,4 @@
-"""A monotone logistic model: the probability that a camera is right, from one row of its evidence."""
+"""A monotone logistic model: the probability that something is so, from what was measured of it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Model:
     """The fitted model.
 
     Attributes:
-        intercept: logarithm of the odds of a camera whose evidence is the best in everything.
+        intercept: logarithm of the odds where every measurement is the best.
         terms: measurement to what it contributes.
     """
 
@@ -68,5 +68,12 @@ class Model:
         }
 
     def probability(self, row: Mapping[str, float]) -> float:
-        """Return the probability that a camera with this evidence is right."""
+        """Return the probability for one row of measurements."""
         return float(1 / (1 + np.exp(-self.intercept - sum(self.contributions(row).values()))))
+
+    def probabilities(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the probabilities (N,) for columns (N,) of measurements, NaN where missing."""
+        logit = np.full(len(next(iter(columns.values()))), self.intercept)
+        for name, term in self.terms.items():
+            logit += term.contributions(columns[name])
+        return np.asarray(1 / (1 + np.exp(-logit)))
