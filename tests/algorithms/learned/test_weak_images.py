@@ -82,6 +82,17 @@ def test_images_are_paired_by_their_learned_descriptors() -> None:
     assert learned_pairs(CAPTURE).pairs == ()
 
 
+def test_verified_pairs_of_images_with_learned_key_points_are_compared_again() -> None:
+    both = {
+        name: joined(features_of(name, place=ord(name)), features_of(name, place=name in "ef", learned=name != "c"))
+        for name in NAMES
+    }
+    matches = {("a", "b"): pair_of(30), ("a", "c"): pair_of(30), ("b", "d"): TwoView.failed("few")}
+    plain, found = learned_pairs(both, neighbours=1).pairs, learned_pairs(both, matches, neighbours=1).pairs
+    assert {*found} == {*plain, ("a", "b")}
+    assert list(found) == sorted(found)
+
+
 def test_learned_key_points_follow_those_of_sift() -> None:
     first, learned = features_of("a"), features_of("b", learned=True)
     both = joined(first, learned)
