@@ -32,15 +32,10 @@ _RECOVERY_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of the camera since the anchor.
+    """The motion of the camera since the anchor."""
 
-    Attributes:
-        parallax_rad: median angle by which points of the scene moved, without the rotation of the camera.
-        seen_share: share of the points of the anchor that were found again.
-    """
-
-    parallax_rad: float
-    seen_share: float
+    parallax_rad: float  # median angle by which points of the scene moved, without the rotation of the camera
+    seen_share: float  # share of the points of the anchor that were found again
 
 
 class ParallaxTracker:

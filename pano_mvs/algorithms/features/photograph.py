@@ -16,15 +16,10 @@ MAX_SIDE_PX = 1600
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographKeypoints:
-    """Key points of a photograph, strongest first.
+    """Key points of a photograph, strongest first."""
 
-    Attributes:
-        pixels_px: (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner.
-        descriptors: (N, 128) float32, RootSIFT as in `extract_sift`.
-    """
-
-    pixels_px: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
+    pixels_px: NDArray[np.float64]  # (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner
+    descriptors: NDArray[np.float32]  # (N, 128) float32, RootSIFT as in `extract_sift`
 
 
 def photograph_keypoints(picture: NDArray[np.uint8], *, max_keypoints: int = 6000) -> PhotographKeypoints:

@@ -42,14 +42,10 @@ class GeodesicGrid:
 
     A position is a face and lattice coordinates (u, v), with u, v >= 0 and u + v <= steps inside the face; cell (u, v)
     of face f is element [f, v + margin, u + margin] of an array (20, side, side).
-
-    Attributes:
-        steps: number of lattice steps along an edge.
-        margin: number of cells by which each lattice extends beyond its face.
     """
 
-    steps: int
-    margin: int
+    steps: int  # number of lattice steps along an edge
+    margin: int  # number of cells by which each lattice extends beyond its face
 
     @property
     def side(self) -> int:

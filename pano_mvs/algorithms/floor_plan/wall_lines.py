@@ -30,12 +30,9 @@ _FITS = 3
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Straight walls.
+    """Straight walls."""
 
-    Attributes:
-        ends_xy: (N, 2, 2) start and end of each; the side that was seen is on the left of the way from start to end.
-    """
-
+    # (N, 2, 2) start and end of each; the side that was seen is on the left of the way from start to end
     ends_xy: FloatArray
 
     @property

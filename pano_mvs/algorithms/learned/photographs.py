@@ -19,17 +19,11 @@ _THRESHOLD, _MIN_SCORE = 0.01, 0.1  # of key points and matches, as in `extract_
 
 @dataclass(frozen=True, eq=False)
 class PhotographView:
-    """The learned key points of a photograph, strongest first.
+    """The learned key points of a photograph, strongest first."""
 
-    Attributes:
-        pixels_px: (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner.
-        descriptors: (N, 128) float32 whole numbers, of length `DESCRIPTOR_NORM`.
-        places: (N, 2) float32 positions in the square picture that the network saw, −1 … 1 from edge to edge.
-    """
-
-    pixels_px: NDArray[np.float64]
-    descriptors: Array
-    places: Array
+    pixels_px: NDArray[np.float64]  # (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner
+    descriptors: Array  # (N, 128) float32 whole numbers, of length `DESCRIPTOR_NORM`
+    places: Array  # (N, 2) float32 positions in the square picture that the network saw, −1 … 1 from edge to edge
 
 
 def view_of_photograph(

@@ -71,36 +71,22 @@ _MAX_OFFSET_STD = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The lenses of a camera, as found in a capture.
+    """The lenses of a camera, as found in a capture."""
 
-    Attributes:
-        lenses: both lenses.
-        second_from_first: pose of the second lens; the translation has length 1, or 0 if it is not determined.
-        offset_std: standard deviation of the offset, relative to its length; NaN if it is not determined.
-        turn_std_deg: standard deviation of the rotation about its least certain axis.
-        focal_std_px: of each lens.
-        principal_std_px: of each lens, in its less certain direction.
-        ray_std_deg: (2,) standard deviation of the angle from the axis, the largest in the field that was observed.
-        observed_deg: angle from the axis within which 99 % of the observations of each lens lie.
-        residual_px: median distance of an observation from the projection of its point.
-        captures: number of captures with a pose.
-        observations: number of observations.
-        circles: the image circle of each lens.
-        rim_matches: matches between the rims of both lenses that determined the start values; 0 if too few were found.
-    """
-
-    lenses: tuple[FisheyeLens, FisheyeLens]
-    second_from_first: Rigid3
-    offset_std: float
-    turn_std_deg: float
-    focal_std_px: tuple[float, float]
-    principal_std_px: tuple[float, float]
+    lenses: tuple[FisheyeLens, FisheyeLens]  # both lenses
+    second_from_first: Rigid3  # pose of the second lens; the translation has length 1, or 0 if it is not determined
+    offset_std: float  # standard deviation of the offset, relative to its length; NaN if it is not determined
+    turn_std_deg: float  # standard deviation of the rotation about its least certain axis
+    focal_std_px: tuple[float, float]  # of each lens
+    principal_std_px: tuple[float, float]  # of each lens, in its less certain direction
+    # (2,) standard deviation of the angle from the axis, the largest in the field that was observed
     ray_std_deg: tuple[float, float]
-    observed_deg: tuple[float, float]
-    residual_px: float
-    captures: int
-    observations: int
-    circles: tuple[ImageCircle, ImageCircle]
+    observed_deg: tuple[float, float]  # angle from the axis within which 99 % of the observations of each lens lie
+    residual_px: float  # median distance of an observation from the projection of its point
+    captures: int  # number of captures with a pose
+    observations: int  # number of observations
+    circles: tuple[ImageCircle, ImageCircle]  # the image circle of each lens
+    # matches between the rims of both lenses that determined the start values; 0 if too few were found
     rim_matches: int
 
 

@@ -24,18 +24,12 @@ _MAX_RESIDUAL = 0.01
 
 @dataclass(frozen=True)
 class ImageCircle:
-    """The image circle of a lens.
+    """The image circle of a lens."""
 
-    Attributes:
-        center_xy: its centre in pixels.
-        residual_px: median distance of the edge from the circle.
-        seen: share of the circumference where the edge was found.
-    """
-
-    center_xy: tuple[float, float]
+    center_xy: tuple[float, float]  # its centre in pixels
     radius_px: float
-    residual_px: float
-    seen: float
+    residual_px: float  # median distance of the edge from the circle
+    seen: float  # share of the circumference where the edge was found
 
 
 def brightest(pictures: Iterable[Picture]) -> NDArray[np.uint8]:

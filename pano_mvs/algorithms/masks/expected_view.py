@@ -44,22 +44,15 @@ class OtherView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """What other views expect of a panorama, (H, W) each.
+    """What other views expect of a panorama, (H, W) each."""
 
-    Attributes:
-        ranges: where they put the nearest surface; NaN if they do not know.
-        ground: whether that is the ground.
-        difference: by how many grey levels the panorama's colour differs from all that the views show there and around
-            it, NaN unless two of them see the surface.
-        ratio: (H, W, 3) the panorama's colours on the ground divided by the median of theirs; NaN elsewhere.
-        height: the camera's height above the ground, in scene units; NaN if it is not known.
-    """
-
-    ranges: Plane
-    ground: Mask
+    ranges: Plane  # where they put the nearest surface; NaN if they do not know
+    ground: Mask  # whether that is the ground
+    # by how many grey levels the panorama's colour differs from all that the views show there and around it, NaN unless
+    # two of them see the surface
     difference: Plane
-    ratio: Plane
-    height: float
+    ratio: Plane  # (H, W, 3) the panorama's colours on the ground divided by the median of theirs; NaN elsewhere
+    height: float  # the camera's height above the ground, in scene units; NaN if it is not known
 
 
 def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherView]) -> Expected:

@@ -117,13 +117,9 @@ class StereographicView:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A square view, and where its pixels and those of a map of directions lie in one another.
+    """A square view, and where its pixels and those of a map of directions lie in one another."""
 
-    Attributes:
-        view: its geometry.
-    """
-
-    view: PinholeView | StereographicView
+    view: PinholeView | StereographicView  # its geometry
 
     @property
     def wide(self) -> bool:

@@ -28,17 +28,11 @@ _MAX_SPACING = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles with coloured corners.
+    """Triangles with coloured corners."""
 
-    Attributes:
-        vertices_in_world: (V, 3) float32, scene units.
-        colors_rgb: (V, 3) uint8.
-        faces: (F, 3) int32 vertex positions, counter-clockwise as seen from the side that was seen.
-    """
-
-    vertices_in_world: NDArray[np.float32]
-    colors_rgb: NDArray[np.uint8]
-    faces: NDArray[np.int32]
+    vertices_in_world: NDArray[np.float32]  # (V, 3) float32, scene units
+    colors_rgb: NDArray[np.uint8]  # (V, 3) uint8
+    faces: NDArray[np.int32]  # (F, 3) int32 vertex positions, counter-clockwise as seen from the side that was seen
 
 
 def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -20,19 +20,12 @@ _SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class OctreeNode:
-    """A cube of the octree.
+    """A cube of the octree."""
 
-    Attributes:
-        name: "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z.
-        lower: (3,) float64, the cube's corner with the smallest coordinates.
-        size: length of its edges.
-        chosen: (K,) int64, the points that this node adds, in no order.
-    """
-
-    name: str
-    lower: NDArray[np.float64]
-    size: float
-    chosen: NDArray[np.int64]
+    name: str  # "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z
+    lower: NDArray[np.float64]  # (3,) float64, the cube's corner with the smallest coordinates
+    size: float  # length of its edges
+    chosen: NDArray[np.int64]  # (K,) int64, the points that this node adds, in no order
 
 
 def octree(

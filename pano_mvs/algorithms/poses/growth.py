@@ -39,19 +39,12 @@ _RIVALS = 2
 
 @dataclass(frozen=True, eq=False)
 class GrownModel:
-    """A model, and the images that could not be added to it.
+    """A model, and the images that could not be added to it."""
 
-    Attributes:
-        model: the cameras.
-        refused: position of each image that could not be added, to the reason.
-        checks: result of the check against the images; None if the images were not consulted.
-        aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
-    """
-
-    model: PlacedModel
-    refused: dict[int, str]
-    checks: CameraChecks | None
-    aliased: bool = False
+    model: PlacedModel  # the cameras
+    refused: dict[int, str]  # position of each image that could not be added, to the reason
+    checks: CameraChecks | None  # result of the check against the images; None if the images were not consulted
+    aliased: bool = False  # whether runner-up geometries of several pairs suggest the same move of a block of cameras
 
     def is_satisfactory(self) -> bool:
         """Return whether no other model needs to be tried."""

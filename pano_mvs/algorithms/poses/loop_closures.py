@@ -28,15 +28,10 @@ _SAME_RAD = 1e-5
 
 @dataclass(frozen=True)
 class FalseClosure:
-    """A loop closure that contradicts the path.
+    """A loop closure that contradicts the path."""
 
-    Attributes:
-        pair: the images.
-        steps: distance between the two places of the same points, in median steps of the path.
-    """
-
-    pair: Pair
-    steps: float
+    pair: Pair  # the images
+    steps: float  # distance between the two places of the same points, in median steps of the path
 
 
 def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pair, TwoView]) -> list[FalseClosure]:

@@ -33,19 +33,13 @@ _SIGNIFICANT_STD = 4.0
 
 
 class Aligned(NamedTuple):
-    """A camera after alignment.
+    """A camera after alignment."""
 
-    Attributes:
-        camera: the camera.
-        confirmed: number of points that the photograph shows where the camera predicts them.
-        tested: number of points that it could show.
-        off_center: distance of the optical centre from the middle of the photograph, as a share of the longer side;
-            0 if it is not significant.
-    """
-
-    camera: PhotographCamera
-    confirmed: int
-    tested: int
+    camera: PhotographCamera  # the camera
+    confirmed: int  # number of points that the photograph shows where the camera predicts them
+    tested: int  # number of points that it could show
+    # distance of the optical centre from the middle of the photograph, as a share of the longer side; 0 if it is not
+    # significant
     off_center: float = 0.0
 
     @property

@@ -18,17 +18,11 @@ _BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownPoints:
-    """The key points of a panorama whose position is known.
+    """The key points of a panorama whose position is known."""
 
-    Attributes:
-        descriptors: (N, D).
-        points_in_world: (N, 3) float64.
-        keypoints_idx: (N,) their positions among all key points of the panorama.
-    """
-
-    descriptors: NDArray[np.generic]
-    points_in_world: NDArray[np.float64]
-    keypoints_idx: NDArray[np.intp]
+    descriptors: NDArray[np.generic]  # (N, D)
+    points_in_world: NDArray[np.float64]  # (N, 3) float64
+    keypoints_idx: NDArray[np.intp]  # (N,) their positions among all key points of the panorama
 
 
 def has_sift(features: Features) -> bool:

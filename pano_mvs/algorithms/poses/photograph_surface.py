@@ -21,21 +21,13 @@ _STD, _STD_BOUNDS = 0.005, (0.003, 0.05)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Points of surfaces that a panorama sees.
+    """Points of surfaces that a panorama sees."""
 
-    Attributes:
-        cam_from_world: the panorama's pose.
-        bearings: (N, 3) float64 unit, in its camera frame.
-        ranges: (N,) float64.
-        normals_in_cam: (N, 3) float64 unit, towards the camera.
-        range_stds: (N,) float64 standard deviations of the logarithms of the ranges.
-    """
-
-    cam_from_world: Rigid3
-    bearings: FloatArray
-    ranges: FloatArray
-    normals_in_cam: FloatArray
-    range_stds: FloatArray
+    cam_from_world: Rigid3  # the panorama's pose
+    bearings: FloatArray  # (N, 3) float64 unit, in its camera frame
+    ranges: FloatArray  # (N,) float64
+    normals_in_cam: FloatArray  # (N, 3) float64 unit, towards the camera
+    range_stds: FloatArray  # (N,) float64 standard deviations of the logarithms of the ranges
 
     @property
     def points_in_world(self) -> FloatArray:

@@ -27,15 +27,10 @@ _ENDS, _MAX_CUT_OFF = (3, 252), 10.0
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """reference ≈ gain · source + offset.
+    """reference ≈ gain · source + offset."""
 
-    Attributes:
-        gain: (C,) float64 for each colour.
-        offset: (C,) float64 in grey levels.
-    """
-
-    gain: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    gain: NDArray[np.float64]  # (C,) float64 for each colour
+    offset: NDArray[np.float64]  # (C,) float64 in grey levels
 
     def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the picture as the reference's exposure would have shown it, (H, W, C)."""

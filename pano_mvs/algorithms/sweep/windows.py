@@ -88,15 +88,10 @@ def box_mean(picture: NDArray[np.float64], window: CostWindow) -> NDArray[np.flo
 
 @dataclass(frozen=True, eq=False)
 class WindowBands:
-    """The rows of a picture in bands within which all windows are equally wide, to be worked on by slices.
+    """The rows of a picture in bands within which all windows are equally wide, to be worked on by slices."""
 
-    Attributes:
-        radius: rows on either side of a window's centre.
-        columns: (H, 2 radius + 1) columns of a window's pixels against its centre.
-    """
-
-    radius: int
-    columns: NDArray[np.int64]
+    radius: int  # rows on either side of a window's centre
+    columns: NDArray[np.int64]  # (H, 2 radius + 1) columns of a window's pixels against its centre
     width: int
 
     @staticmethod

@@ -29,21 +29,13 @@ _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The relative pose with most support; falsy if no hypothesis could be formed.
+    """The relative pose with most support; falsy if no hypothesis could be formed."""
 
-    Attributes:
-        second_from_first: rotation, and translation of length 1.
-        inliers: (M,) bool, True for matches with a small residual in front of both cameras.
-        residuals_rad: (M,) spherical Sampson error of all matches.
-        iterations: number of hypotheses.
-        reason: why there is no pose.
-    """
-
-    second_from_first: Rigid3
-    inliers: NDArray[np.bool_]
-    residuals_rad: FloatArray
-    iterations: int
-    reason: str = ""
+    second_from_first: Rigid3  # rotation, and translation of length 1
+    inliers: NDArray[np.bool_]  # (M,) bool, True for matches with a small residual in front of both cameras
+    residuals_rad: FloatArray  # (M,) spherical Sampson error of all matches
+    iterations: int  # number of hypotheses
+    reason: str = ""  # why there is no pose
 
     def __bool__(self) -> bool:
         """Return whether a pose was found."""

@@ -25,17 +25,11 @@ _MAX_STDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class ElevationRange:
-    """The elevations of the upper and the lower edge of the panoramas.
+    """The elevations of the upper and the lower edge of the panoramas."""
 
-    Attributes:
-        top_deg: of the upper edge; 90 for a full sphere.
-        bottom_deg: of the lower edge; −90 for a full sphere.
-        stds_deg: standard deviations of both from noise in the rays; inf if they cannot be estimated.
-    """
-
-    top_deg: float
-    bottom_deg: float
-    stds_deg: tuple[float, float]
+    top_deg: float  # of the upper edge; 90 for a full sphere
+    bottom_deg: float  # of the lower edge; −90 for a full sphere
+    stds_deg: tuple[float, float]  # standard deviations of both from noise in the rays; inf if they cannot be estimated
 
     @property
     def is_full(self) -> bool:

@@ -43,21 +43,13 @@ _MAX_OFF_CENTER = 0.02
 
 
 class Localised(NamedTuple):
-    """A photograph's pose and camera (see `Photographs`).
+    """A photograph's pose and camera (see `Photographs`)."""
 
-    Attributes:
-        cam_from_world: the pose.
-        focal_px: focal length.
-        radial: coefficient of the distortion.
-        inliers: number of key points that agree.
-        error_px: median error of these.
-    """
-
-    cam_from_world: Rigid3
-    focal_px: float
-    radial: float
-    inliers: int
-    error_px: float
+    cam_from_world: Rigid3  # the pose
+    focal_px: float  # focal length
+    radial: float  # coefficient of the distortion
+    inliers: int  # number of key points that agree
+    error_px: float  # median error of these
 
 
 @checks_settings

@@ -30,25 +30,15 @@ _GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)
 
 @dataclass(frozen=True, eq=False)
 class GpsFit:
-    """A fit of camera positions to GPS; falsy, with the reason, if there is no reliable one.
+    """A fit of camera positions to GPS; falsy, with the reason, if there is no reliable one."""
 
-    Attributes:
-        local_from_world: the similarity into metres east, down, north of `origin_lla`.
-        origin_lla: (3,) latitude deg, longitude deg, altitude m.
-        used: number of positions that agree with the fit.
-        of: number of registered panoramas with a position.
-        residual_m: median horizontal distance between the positions and the fit.
-        scale_error: relative standard deviation of the scale.
-        reason: why there is no reliable fit; "" if there is one.
-    """
-
-    local_from_world: Similarity3
-    origin_lla: FloatArray
-    used: int
-    of: int
-    residual_m: float = float("nan")
-    scale_error: float = float("nan")
-    reason: str = ""
+    local_from_world: Similarity3  # the similarity into metres east, down, north of `origin_lla`
+    origin_lla: FloatArray  # (3,) latitude deg, longitude deg, altitude m
+    used: int  # number of positions that agree with the fit
+    of: int  # number of registered panoramas with a position
+    residual_m: float = float("nan")  # median horizontal distance between the positions and the fit
+    scale_error: float = float("nan")  # relative standard deviation of the scale
+    reason: str = ""  # why there is no reliable fit; "" if there is one
 
     def __bool__(self) -> bool:
         """Return whether the fit is reliable."""

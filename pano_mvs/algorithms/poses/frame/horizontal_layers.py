@@ -30,19 +30,12 @@ _MIN_FLOOR_POINTS = 12
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none.
+    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none."""
 
-    Attributes:
-        up: (3,) unit vector.
-        contrast: sharpness of the layers relative to the median direction within 8°.
-        reason: why there is none; else "".
-        uncertainty_deg: standard deviation of the direction, from four parts of the points.
-    """
-
-    up: FloatArray
-    contrast: float
-    reason: str = ""
-    uncertainty_deg: float = float("nan")
+    up: FloatArray  # (3,) unit vector
+    contrast: float  # sharpness of the layers relative to the median direction within 8°
+    reason: str = ""  # why there is none; else ""
+    uncertainty_deg: float = float("nan")  # standard deviation of the direction, from four parts of the points
 
     def __bool__(self) -> bool:
         """Return whether there are layers."""
@@ -51,19 +44,12 @@ class Layers:
 
 @dataclass(frozen=True)
 class Floor:
-    """The depth of the floor below the cameras; falsy, with the reason, if no floor was found.
+    """The depth of the floor below the cameras; falsy, with the reason, if no floor was found."""
 
-    Attributes:
-        depth: median height of the cameras above the floor, scene units.
-        points: number of sparse points on the floor.
-        spread: median distance of these points from the floor, scene units.
-        reason: why no floor was found; else "".
-    """
-
-    depth: float
-    points: int = 0
-    spread: float = 0.0
-    reason: str = ""
+    depth: float  # median height of the cameras above the floor, scene units
+    points: int = 0  # number of sparse points on the floor
+    spread: float = 0.0  # median distance of these points from the floor, scene units
+    reason: str = ""  # why no floor was found; else ""
 
     def __bool__(self) -> bool:
         """Return whether a floor was found."""

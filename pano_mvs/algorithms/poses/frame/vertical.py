@@ -47,25 +47,17 @@ _MIN_LIMIT_DEG = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Vertical:
-    """The direction away from gravity; falsy, with the reason, if it is unknown.
+    """The direction away from gravity; falsy, with the reason, if it is unknown."""
 
-    Attributes:
-        up_in_world: (3,) unit vector.
-        source: "sensors", "lines", "structure" or "cameras".
-        evidence: description of the source, with its amount and agreement.
-        disagreement_deg: median angle between single readings and `up_in_world`; NaN if there is only one.
-        reason: why the direction is unknown; "" if it is known.
-        uncertainty_deg: standard deviation of `up_in_world`; NaN if unknown.
-        upside_down: probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on,
-            `up_in_world` is opposite to their up direction.
-    """
-
-    up_in_world: FloatArray
-    source: str = ""
-    evidence: str = ""
+    up_in_world: FloatArray  # (3,) unit vector
+    source: str = ""  # "sensors", "lines", "structure" or "cameras"
+    evidence: str = ""  # description of the source, with its amount and agreement
+    # median angle between single readings and `up_in_world`; NaN if there is only one
     disagreement_deg: float = float("nan")
-    reason: str = ""
-    uncertainty_deg: float = float("nan")
+    reason: str = ""  # why the direction is unknown; "" if it is known
+    uncertainty_deg: float = float("nan")  # standard deviation of `up_in_world`; NaN if unknown
+    # probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on, `up_in_world` is
+    # opposite to their up direction.
     upside_down: float = float("nan")
 
     def __bool__(self) -> bool:

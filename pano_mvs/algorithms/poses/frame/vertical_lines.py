@@ -48,16 +48,11 @@ _BIAS_DEG = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Line segments in the world.
+    """Line segments in the world."""
 
-    Attributes:
-        normals: (M, 3) unit normals of the planes through the segments and their cameras.
-        weights: (M,) lengths in radians.
-        groups: (M,) number of the view in which the segment was found; errors within a view are not independent.
-    """
-
-    normals: FloatArray
-    weights: FloatArray
+    normals: FloatArray  # (M, 3) unit normals of the planes through the segments and their cameras
+    weights: FloatArray  # (M,) lengths in radians
+    # (M,) number of the view in which the segment was found; errors within a view are not independent
     groups: NDArray[np.int64]
 
     def nearly_vertical(self, up: FloatArray, *, groups: int) -> Segments:
@@ -68,22 +63,15 @@ class Segments:
 
 @dataclass(frozen=True, eq=False)
 class VerticalLines:
-    """The direction that vertical lines agree on; falsy, with the reason, if there is none.
+    """The direction that vertical lines agree on; falsy, with the reason, if there is none."""
 
-    Attributes:
-        up: (3,) unit vector.
-        count: number of segments that agree on it.
-        uncertainty_deg: standard deviation of the direction, from leaving out one view at a time, and 0.1° for what
-            all views have in common.
-        contrast: weight of agreeing segments relative to the median direction within 8°.
-        reason: why there is none; else "".
-    """
-
-    up: FloatArray
-    count: int = 0
+    up: FloatArray  # (3,) unit vector
+    count: int = 0  # number of segments that agree on it
+    # standard deviation of the direction, from leaving out one view at a time, and 0.1° for what all views have in
+    # common
     uncertainty_deg: float = float("nan")
-    contrast: float = 0.0
-    reason: str = ""
+    contrast: float = 0.0  # weight of agreeing segments relative to the median direction within 8°
+    reason: str = ""  # why there is none; else ""
 
     def __bool__(self) -> bool:
         """Return whether there is such a direction."""

@@ -30,22 +30,16 @@ _ALTERNATIVE_STD_DEG = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """One of the geometries of a pair (i, j), i < j.
+    """One of the geometries of a pair (i, j), i < j."""
 
-    Attributes:
-        view: second_from_first with the matches that support it.
-        weight: grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false
-            geometry, and with their share of the matches of the pair's best geometry.
-        direction_std_deg: standard deviation of its direction.
-        unit_ranges: (2, M) ranges of its matches from either image, in units of its translation, NaN where not usable.
-        parallax_rad: (M,) angle between the rays of each match after de-rotation.
-    """
-
-    view: TwoView
+    view: TwoView  # second_from_first with the matches that support it
+    # grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false geometry,
+    # and with their share of the matches of the pair's best geometry
     weight: float
-    direction_std_deg: float
+    direction_std_deg: float  # standard deviation of its direction
+    # (2, M) ranges of its matches from either image, in units of its translation, NaN where not usable
     unit_ranges: FloatArray
-    parallax_rad: FloatArray
+    parallax_rad: FloatArray  # (M,) angle between the rays of each match after de-rotation
 
     @cached_property
     def parallax_deg(self) -> float:
@@ -80,27 +74,17 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
 
 @dataclass(frozen=True, eq=False)
 class PairEvidence:
-    """The W geometries that join an image to registered images.
+    """The W geometries that join an image to registered images."""
 
-    Attributes:
-        partner: (W,) position of the registered image.
-        rank: (W,) rank of the geometry in its pair.
-        weight: (W,) weight of the geometry.
-        rotations: (W, 3, 3) rotation of cam_from_world of the image according to the geometry.
-        origins: (W, 3) centre of the partner in the world.
-        directions: (W, 3) unit vector from there to the image.
-        lengths: (W,) the distance at which points are at their known ranges; NaN if too few points determine it.
-        tolerance_rad: (W,) largest error of a direction.
-    """
-
-    partner: NDArray[np.intp]
-    rank: NDArray[np.intp]
-    weight: FloatArray
-    rotations: FloatArray
-    origins: FloatArray
-    directions: FloatArray
+    partner: NDArray[np.intp]  # (W,) position of the registered image
+    rank: NDArray[np.intp]  # (W,) rank of the geometry in its pair
+    weight: FloatArray  # (W,) weight of the geometry
+    rotations: FloatArray  # (W, 3, 3) rotation of cam_from_world of the image according to the geometry
+    origins: FloatArray  # (W, 3) centre of the partner in the world
+    directions: FloatArray  # (W, 3) unit vector from there to the image
+    # (W,) the distance at which points are at their known ranges; NaN if too few points determine it
     lengths: FloatArray
-    tolerance_rad: FloatArray
+    tolerance_rad: FloatArray  # (W,) largest error of a direction
 
     def __len__(self) -> int:
         """Return the number of geometries."""

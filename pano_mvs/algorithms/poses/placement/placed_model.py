@@ -33,21 +33,15 @@ _MAX_PARTNERS = 16
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs of a capture with all their geometries.
+    """The pairs of a capture with all their geometries."""
 
-    Attributes:
-        features: key points by image name, in the capture's order.
-        geometries: (i, j), i < j, to the geometries of the pair, the heaviest first.
-        estimator: how translation scale factors are estimated from the ratios of single features.
-        kappa: the paper's κ.
-        compared: (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without
-            success; None: all, without matches.
-    """
-
-    features: Mapping[str, Features]
-    geometries: Mapping[Edge, tuple[Geometry, ...]]
+    features: Mapping[str, Features]  # key points by image name, in the capture's order
+    geometries: Mapping[Edge, tuple[Geometry, ...]]  # (i, j), i < j, to the geometries of the pair, the heaviest first
+    # how translation scale factors are estimated from the ratios of single features
     estimator: ScaleEstimator = "cauchy"
-    kappa: float = 0.01
+    kappa: float = 0.01  # the paper's κ
+    # (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without success; None:
+    # all, without matches
     compared: Mapping[Edge, TwoView] | None = None
     names: tuple[str, ...] = field(init=False)
     bearings: tuple[FloatArray, ...] = field(init=False)
@@ -103,17 +97,12 @@ def pairs_of(
 
 @dataclass(eq=False)
 class PlacedModel:
-    """Registered cameras; the world frame is that of the first camera that was added.
+    """Registered cameras; the world frame is that of the first camera that was added."""
 
-    Attributes:
-        pairs: all pairs of the capture.
-        cameras: image position to cam_from_world.
-        chosen: pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such
-            a geometry are left out.
-    """
-
-    pairs: Pairs
-    cameras: dict[int, Rigid3] = field(default_factory=dict)
+    pairs: Pairs  # all pairs of the capture
+    cameras: dict[int, Rigid3] = field(default_factory=dict)  # image position to cam_from_world
+    # pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such a
+    # geometry are left out.
     chosen: dict[Edge, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

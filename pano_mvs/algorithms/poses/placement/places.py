@@ -24,17 +24,11 @@ _SAME_TURN_RAD, _SAME_PLACE = float(np.deg2rad(1.0)), 0.03
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A pose on which some of an image's pairs agree.
+    """A pose on which some of an image's pairs agree."""
 
-    Attributes:
-        cam_from_world: the pose.
-        explained: (W,) bool, the geometries that agree.
-        score: sum over the partners of the weight of their heaviest geometry that agrees.
-    """
-
-    cam_from_world: Rigid3
-    explained: NDArray[np.bool_]
-    score: float
+    cam_from_world: Rigid3  # the pose
+    explained: NDArray[np.bool_]  # (W,) bool, the geometries that agree
+    score: float  # sum over the partners of the weight of their heaviest geometry that agrees
 
 
 def placements(evidence: PairEvidence) -> list[Placement]:

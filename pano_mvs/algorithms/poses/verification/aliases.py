@@ -40,22 +40,15 @@ _MAX_MOVES, _MAX_TURNED = 1500, 60
 
 @dataclass(frozen=True, eq=False)
 class Alias:
-    """A motion that runner-up geometries of several pairs suggest alike.
+    """A motion that runner-up geometries of several pairs suggest alike."""
 
-    Attributes:
-        move: (3,) in the world, after the rotation about the origin.
-        support: weight of the pairs that suggest it.
-        signed_weights: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move
-            relative to i, negative if by its inverse.
-        turn: (3, 3) rotation of the world, usually the identity.
-        own_inverse: whether the motion is its own inverse, like a half turn.
-    """
-
-    move: FloatArray
-    support: float
+    move: FloatArray  # (3,) in the world, after the rotation about the origin
+    support: float  # weight of the pairs that suggest it
+    # (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move relative to i,
+    # negative if by its inverse
     signed_weights: dict[Edge, float]
-    turn: FloatArray = field(default_factory=lambda: np.eye(3))
-    own_inverse: bool = False
+    turn: FloatArray = field(default_factory=lambda: np.eye(3))  # (3, 3) rotation of the world, usually the identity
+    own_inverse: bool = False  # whether the motion is its own inverse, like a half turn
 
     def motion(self, *, inverse: bool = False) -> Rigid3:
         """Return the motion of a block, or its inverse."""

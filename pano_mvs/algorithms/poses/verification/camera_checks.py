@@ -49,25 +49,17 @@ _HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or mor
 
 @dataclass(eq=False)
 class CameraChecks:
-    """Evidence of the images for or against the cameras of a model.
+    """Evidence of the images for or against the cameras of a model."""
 
-    Attributes:
-        shares: image position to the confirmed share of its textured pixels; NaN if too little can be judged.
-        expected: image position to the share that its neighbours suggest; NaN likewise.
-        moved: images that were moved to another pose.
-        p_right: image position to the probability that its pose is right.
-        doubts: images with a doubtful pose, with the reason.
-        removed: images that were removed from the model, with the reason.
-        asked: whether the images were consulted.
-    """
-
+    # image position to the confirmed share of its textured pixels; NaN if too little can be judged
     shares: dict[int, float] = field(default_factory=dict)
+    # image position to the share that its neighbours suggest; NaN likewise
     expected: dict[int, float] = field(default_factory=dict)
-    moved: set[int] = field(default_factory=set)
-    p_right: dict[int, float] = field(default_factory=dict)
-    doubts: dict[int, str] = field(default_factory=dict)
-    removed: dict[int, str] = field(default_factory=dict)
-    asked: bool = True
+    moved: set[int] = field(default_factory=set)  # images that were moved to another pose
+    p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
+    doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
+    removed: dict[int, str] = field(default_factory=dict)  # images that were removed from the model, with the reason
+    asked: bool = True  # whether the images were consulted
 
 
 def correct_cameras(
@@ -144,17 +136,11 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
 
 
 class BlockMove(NamedTuple):
-    """A block of cameras that an alias may have moved.
+    """A block of cameras that an alias may have moved."""
 
-    Attributes:
-        gain: relative gain in agreement of images and pairs if the block is moved.
-        alias: the motion.
-        labels: image position to 1 for the images of the block, 0 for the others.
-    """
-
-    gain: float
-    alias: Alias
-    labels: dict[int, int]
+    gain: float  # relative gain in agreement of images and pairs if the block is moved
+    alias: Alias  # the motion
+    labels: dict[int, int]  # image position to 1 for the images of the block, 0 for the others
 
 
 def block_moves(model: PlacedModel, confirmation: Confirmation) -> list[BlockMove]:

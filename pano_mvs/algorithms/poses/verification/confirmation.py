@@ -45,30 +45,19 @@ _MAX_RELATIVE_ERROR, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 0.5, 0.05
 
 @dataclass(frozen=True, eq=False)
 class _Small:
-    """A panorama at 256 columns.
+    """A panorama at 256 columns."""
 
-    Attributes:
-        image: (128, 256, 3) uint8.
-        mask: (128, 256) bool, False is ignored.
-        textured: (128, 256) bool, True where there is texture to match.
-    """
-
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
-    textured: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (128, 256, 3) uint8
+    mask: NDArray[np.bool_]  # (128, 256) bool, False is ignored
+    textured: NDArray[np.bool_]  # (128, 256) bool, True where there is texture to match
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How much of what an image sees other images confirm, by parallax.
+    """How much of what an image sees other images confirm, by parallax."""
 
-    Attributes:
-        textured: (B,) solid angle of the textured pixels in each parallax class.
-        confirmed: (B,) solid angle of the pixels that other images confirm.
-    """
-
-    textured: NDArray[np.float64]
-    confirmed: NDArray[np.float64]
+    textured: NDArray[np.float64]  # (B,) solid angle of the textured pixels in each parallax class
+    confirmed: NDArray[np.float64]  # (B,) solid angle of the pixels that other images confirm
 
     @property
     def share(self) -> float:

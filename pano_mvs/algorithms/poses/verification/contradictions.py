@@ -32,17 +32,11 @@ _MOSTLY_CONFIRMED = 0.5
 
 @dataclass(frozen=True)
 class ContradictedPart:
-    """A part of a model, no larger than the rest, whose place verified pairs contradict.
+    """A part of a model, no larger than the rest, whose place verified pairs contradict."""
 
-    Attributes:
-        images: of the part; all images of the model if both sides of the cut are equally large.
-        share: of the significance of all verified pairs across the cut, that of those that contradict the cameras.
-        pair: the most significant pair that contradicts.
-    """
-
-    images: tuple[int, ...]
-    share: float
-    pair: Edge
+    images: tuple[int, ...]  # of the part; all images of the model if both sides of the cut are equally large
+    share: float  # of the significance of all verified pairs across the cut, that of those that contradict the cameras
+    pair: Edge  # the most significant pair that contradicts
 
 
 def contradicted_parts(

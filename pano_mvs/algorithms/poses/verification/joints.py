@@ -26,17 +26,12 @@ _SAME_RANGE, _BEYOND = 0.1, 1.2
 
 @dataclass(frozen=True)
 class Joint:
-    """Two parts of a model that meet.
+    """Two parts of a model that meet."""
 
-    Attributes:
-        parts: images of either part.
-        matches: number of matches between them with which their cameras agree.
-        contradicting: solid angle in which one part looks through a surface of the other one, relative to all in which
-            both see one; NaN if a part has one camera only, or if they see nothing in common.
-    """
-
-    parts: tuple[tuple[int, ...], tuple[int, ...]]
-    matches: int
+    parts: tuple[tuple[int, ...], tuple[int, ...]]  # images of either part
+    matches: int  # number of matches between them with which their cameras agree
+    # solid angle in which one part looks through a surface of the other one, relative to all in which both see one; NaN
+    # if a part has one camera only, or if they see nothing in common
     contradicting: float
 
 

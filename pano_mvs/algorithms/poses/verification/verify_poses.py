@@ -67,19 +67,12 @@ def verify_poses(
 
 @dataclass(frozen=True, eq=False)
 class VerifiedGroup:
-    """Checked poses of one group, and what they were checked with.
+    """Checked poses of one group, and what they were checked with."""
 
-    Attributes:
-        poses: the poses, with their doubts.
-        model: the same cameras with their pairs.
-        checks: the evidence of the images for each of them.
-        confirmation: of the capture.
-    """
-
-    poses: Poses
-    model: PlacedModel
-    checks: CameraChecks
-    confirmation: Confirmation
+    poses: Poses  # the poses, with their doubts
+    model: PlacedModel  # the same cameras with their pairs
+    checks: CameraChecks  # the evidence of the images for each of them
+    confirmation: Confirmation  # of the capture
 
 
 def verified_group(
