@@ -100,8 +100,6 @@ def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
 MIN_CAMERAS = 4
 """Spacing, links and confirmed shares are compared within a group only if it has at least this many cameras."""
 
-GAP = 2.0
-"""Cameras are far apart if their distance is more than this many times the median distance of neighbours."""
 
 LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 """Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
@@ -265,7 +263,8 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
     typical = median([length for _, _, length in edges]) or 0.0
     for first, second, length in edges if len(group.names) >= MIN_CAMERAS and typical > 0 else ():
         ranges = [known for idx in (first, second) if (known := group.typical_range(idx)) is not None]
-        if length > GAP * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
+        # Cameras are far apart if their distance is more than this many times the median distance of neighbours.
+        if length > 2.0 * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
             reason = (
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"

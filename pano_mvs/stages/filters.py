@@ -206,10 +206,6 @@ def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams,
     return result
 
 
-# Of what is above or below a camera, at least this share must have a range, or it is a sky or masked.
-_MIN_VALID = 0.5
-
-
 @params_from(median_range)
 class MedianParams(Params):
     """Settings of filters.median."""
@@ -411,6 +407,7 @@ def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:
     for side, rows in (("above", slice(0, quarter)), ("below", slice(-quarter, None))):
         weights = pixel_solid_angle(confirmed.shape)[rows, None]
         valid = float((range_map.valid[rows] * weights).mean())
-        if valid >= _MIN_VALID * float(weights.mean()):
+        # Of what is above or below a camera, at least this share must have a range, or it is a sky or masked.
+        if valid >= 0.5 * float(weights.mean()):
             ctx.metric(f"confirmed_{side}", float((confirmed[rows] * weights).mean()) / valid)
     return range_map

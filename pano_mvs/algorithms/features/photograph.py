@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.tangent import root_sift, sift_detector
 
-MAX_SIDE_PX = 1600
-"""Photographs are reduced to this size: panoramas have fewer pixels per degree anyway."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographKeypoints:
@@ -30,7 +27,8 @@ def photograph_keypoints(picture: NDArray[np.uint8], *, max_keypoints: int = 600
         max_keypoints: maximum number of key points.
     """
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
+    # Photographs are reduced to this size: panoramas have fewer pixels per degree anyway.
+    scale = min(1.0, 1600 / max(gray.shape))
     if scale < 1:
         size_xy = [max(1, round(side * scale)) for side in gray.shape[::-1]]
         gray = cv2.resize(gray, size_xy, interpolation=cv2.INTER_AREA)

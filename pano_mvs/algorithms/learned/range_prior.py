@@ -28,10 +28,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 Output: TypeAlias = Literal["range", "inverse_range"]
 
-_ITERATIONS = 20
-_LEAST_ERROR = 1e-3  # relative errors below this weigh the same
-_NORMAL = 1.4826  # standard deviations of a normal distribution per median absolute deviation
-
 
 @checks_settings
 def network_values(
@@ -117,7 +113,8 @@ def fill_from_prior(
         error = np.abs(np.log(aligned / range_map.range[part]))
         errors.append(np.where(np.isfinite(error), error, np.inf))
         constants.append(np.abs(np.log(range_map.range[part] / np.median(range_map.range[other]))))
-    sigma, constant = (_NORMAL * float(np.median(np.concatenate(each))) for each in (errors, constants))
+    # Standard deviations of a normal distribution per median absolute deviation.
+    sigma, constant = (1.4826 * float(np.median(np.concatenate(each))) for each in (errors, constants))
     if not sigma < constant:
         return range_map, float("inf")
     laid = _aligned(range_map, guide, prior, weight=np.where(known, weight, 0), output=output)
@@ -146,10 +143,11 @@ def _aligned(
     relative = np.stack([own, np.full_like(own, inverse)], axis=-1) / target[:, None]
     scale = shift = 0.0
     robust: FloatArray = weight[known]
-    for _ in range(_ITERATIONS):  # of least absolute relative errors, by weighted squares
+    for _ in range(20):  # of least absolute relative errors, by weighted squares
         root = np.sqrt(robust)
         scale, shift = np.linalg.lstsq(relative * root[:, None], root, rcond=None)[0]
-        robust = weight[known] / np.maximum(np.abs(relative @ np.array([scale, shift]) - 1), _LEAST_ERROR)
+        # Relative errors below this weigh the same.
+        robust = weight[known] / np.maximum(np.abs(relative @ np.array([scale, shift]) - 1), 1e-3)
     values = prior * scale + shift
     inside = (values >= target.min()) & (values <= target.max())
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,8 +14,6 @@ from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Pairs, TwoView, WeakImages
 
-_SAMPLE = 1000
-
 
 @checks_settings
 def weak_images(
@@ -77,6 +75,6 @@ def learned_pairs(
         neighbours: number of images for each.
     """
     descriptors = {
-        name: vlad_descriptor(one.only_learned(), sample=_SAMPLE) for name, one in features.items() if one.learned
+        name: vlad_descriptor(one.only_learned(), sample=1000) for name, one in features.items() if one.learned
     }
     return retrieval_pairs(list(descriptors), descriptors, neighbours=neighbours)

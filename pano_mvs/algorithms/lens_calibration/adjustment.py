@@ -19,7 +19,6 @@ INTRINSICS = 7  # f, cx, cy, k1, k2, k3, k4
 RIG = slice(2 * INTRINSICS, 2 * INTRINSICS + 6)
 CAMERAS = RIG.stop
 _FIRST_DAMPING = 1e-4
-_CONVERGED = 1e-5
 _GAUGE_WEIGHT = 1e8
 _LEAST_SHARE = 1e-9
 
@@ -96,7 +95,7 @@ def adjust_rig(
             continue
         gained = (system.cost - trial.cost) / system.cost
         bundle, turned, system, damping = moved, more, trial, max(damping / 5, 1e-9)
-        if gained < _CONVERGED:
+        if gained < 1e-5:
             break
     return bundle, system.covariance()
 

@@ -45,7 +45,6 @@ from pano_mvs.scene.pose_groups import split_groups
 View = tuple[int, int]
 """Number of a capture, and of a lens: 0 or 1."""
 
-_MAX_WIDTH = 2560
 # All key points are matched between the rims, some of them between captures, and some of the tracks are adjusted.
 _KEYPOINTS, _BETWEEN_CAPTURES, _MAX_POINTS = 6000, 2500, 2500
 # The edge of the circle is blurred: key points and the field of view end at this share of its radius.
@@ -56,17 +55,14 @@ _SIGMA_FOCAL, _SIGMA_CENTER = 0.2, 0.05
 _SIGMA_DISTORTION = (0.1, 0.05, 0.02, 0.005)
 _SIGMA_TURN_RAD = float(np.radians(10))
 
-_RIM_DEG = 75.0
 _RIM_SCALES = np.arange(0.85, 1.151, 0.01)
 _RIM_MIN, _RIM_THRESHOLD_DEG = 12, 1.5
-_MAX_TILT_DEG = 15.0
 
 # Maximum error of a match in each round, and whether the offset of the second lens is adjusted.
 _ROUNDS = ((1.0, False), (0.3, True), (0.15, True))
 _MIN_ANGLE_DEG = 1.0
 _MIN_OBSERVATIONS = 300
 _MAX_RAY_STD_DEG = 0.1
-_MAX_OFFSET_STD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +159,7 @@ def calibrate_lenses(
     offset_std = np.nan
     if length > 0:
         offset_std = float(np.sqrt(np.linalg.eigvalsh(covariance[RIG, RIG][3:, 3:])[-1])) / length
-    if length > 0 and not offset_std < _MAX_OFFSET_STD:
+    if length > 0 and not offset_std < 0.2:
         bundle, covariance = _adjusted(
             seen, state, _freedom(state, centers, with_offset=False), threshold_deg=2 * _ROUNDS[-1][0]
         )
@@ -194,7 +190,7 @@ def _observed(
 ) -> _Seen:
     """Return key points, found in panoramas of one lens each, and their matches."""
     features, pixels, matches = {}, {}, {}
-    width = min(_MAX_WIDTH, round(2 * np.pi * max(lens.focal_xy[0] for lens in lenses)) // 4 * 4)
+    width = min(2560, round(2 * np.pi * max(lens.focal_xy[0] for lens in lenses)) // 4 * 4)
     for capture, lens_idx in product(range(count), (0, 1)):
         if lens_idx == 0:
             progress(f"finding key points, capture {capture + 1} of {count}")
@@ -220,7 +216,7 @@ def _observed(
 
 
 def _rim(features: Features) -> NDArray[np.intp]:
-    return np.flatnonzero(features.bearings[:, 2] < np.cos(np.radians(_RIM_DEG)))
+    return np.flatnonzero(features.bearings[:, 2] < np.cos(np.radians(75.0)))
 
 
 def _part(features: Features, chosen: NDArray[np.intp]) -> Features:
@@ -251,7 +247,7 @@ def _start_rigs(
             _scaled(p, scale), _scaled(q, scale), rng=rng, threshold_rad=float(np.radians(_RIM_THRESHOLD_DEG))
         )
         tilt = np.degrees(np.arccos(np.clip(-rotation[2, 2], -1, 1)))
-        if tilt < _MAX_TILT_DEG and inliers.sum() > best.sum():
+        if tilt < 15.0 and inliers.sum() > best.sum():
             best_rotation, best_scale, best = rotation, float(scale), inliers
     if best.sum() >= _RIM_MIN:
         # Opposite lenses see a point at angles from their axes that sum to 180°; a tilt cancels over the circumference.

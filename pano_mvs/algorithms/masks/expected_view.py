@@ -23,9 +23,6 @@ Plane = NDArray[np.float32]
 _SAME = 0.06
 # The ground is a plane through points this far below the horizon, as flat as this.
 _GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
-_GROUND_TRIALS = 60
-# Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
-_AROUND_DEG = 1.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +102,7 @@ def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
     points = points[rng.permutation(len(points))[:3000]]
     best: FloatArray | None = None
     most = _MIN_GROUND_POINTS
-    for _ in range(_GROUND_TRIALS):
+    for _ in range(60):
         plane = _plane_through(points[rng.choice(len(points), 3, replace=False)])
         if plane is None:
             continue
@@ -228,7 +225,8 @@ def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp]
 def _colors_around(picture: Picture) -> Plane:
     """Return the darkest, the mean and the lightest colours around each pixel, (3, 3, H W): which, colour and pixel."""
     smooth = mean_around(picture)
-    around = max(1, round(_AROUND_DEG * len(picture) / 180))
+    # Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
+    around = max(1, round(1.4 * len(picture) / 180))
     window = square_window(around)
     darkest, lightest = (
         filtered(smooth, around, lambda padded, extreme=extreme: extreme(padded, window))  # type: ignore[misc]

@@ -310,10 +310,6 @@ def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:
     return Pairs(tuple((names[first], names[second]) for first, second in sorted(links)))
 
 
-_MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR = 300, 10
-_RATIO = 0.8  # threshold of the ratio test of Lowe 2004, section 7.1
-
-
 def sample_matches(
     samples: Sequence[NDArray[np.int16]], dissimilarities: NDArray[np.float64], *, neighbours: int
 ) -> NDArray[np.float64]:
@@ -332,7 +328,7 @@ def sample_matches(
         (N, N) symmetric; zero for pairs on no shortlist and on the diagonal.
     """
     count = len(samples)
-    length = min(count, max(_MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR * neighbours))
+    length = min(count, max(300, 10 * neighbours))
     listed = np.zeros((count, count), np.bool_)
     np.put_along_axis(listed, np.argsort(dissimilarities, axis=1, kind="stable")[:, :length], values=True, axis=1)
     listed = np.triu(listed | listed.T, 1)
@@ -359,5 +355,6 @@ def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
 
 def _count_matches(found: NearestTwo) -> int:
     """Return the number of mutual nearest neighbours that pass the ratio test."""
-    distinct = found.squared < np.float32(_RATIO**2) * found.next_squared
+    # Threshold of the ratio test of Lowe 2004, section 7.1.
+    distinct = found.squared < np.float32(0.8**2) * found.next_squared
     return int(np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest])))

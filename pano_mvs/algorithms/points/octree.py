@@ -14,7 +14,6 @@ NODE_POINTS = 30_000
 """Largest number of points that a node adds."""
 
 _SMALL_CHILD = 500
-_MAX_DEPTH = 20
 _SEED = 0
 
 
@@ -48,7 +47,7 @@ def octree(
     pending = [("r", lower, size, order)]
     while pending:
         name, lower, size, inside = pending.pop(0)
-        if len(inside) <= node_points + _SMALL_CHILD or len(name) > _MAX_DEPTH:
+        if len(inside) <= node_points + _SMALL_CHILD or len(name) > 20:
             nodes.append(OctreeNode(name, lower, size, inside))
             continue
         half = size / 2

@@ -23,17 +23,10 @@ from pano_mvs.algorithms.poses.verification.camera_checks import (
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_FULL_PARALLAX_DEG = 10.0
-_SEEDS = 12  # number of seeds whose support by third images is computed
-_THIRDS = 8
 _MAX_GROWN = 3  # number of seeds from which models are grown
-_ADJUST_GROWTH = 1.25  # all cameras are adjusted each time their number has grown by this factor
 _LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
-_MIN_SHARE = 0.5  # share of an image's pairs, by weight, that must agree with a clear placement
 _CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
 _CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
-_SATISFYING = 0.85  # the first model is accepted if it explains this share of the pairs
-_CERTAIN = 0.97  # the images are not consulted if the model explains this share of the pairs
 _RIVALS = 2
 
 
@@ -51,7 +44,8 @@ class GrownModel:
         if self.refused or self.aliased:
             return False
         if self.checks is None:
-            return self.model.explained_share() > _SATISFYING
+            # The first model is accepted if it explains this share of the pairs.
+            return self.model.explained_share() > 0.85
         return not self.checks.doubts and not self.checks.removed
 
     def rank(self) -> tuple[float, float]:
@@ -120,7 +114,7 @@ def ranked_seeds(
 
     def quality(edge: Edge, rank: int) -> float:
         geometry = pairs.geometries[edge][rank]
-        return geometry.weight**2 * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
+        return geometry.weight**2 * min(geometry.parallax_deg / 10.0, 1.0)
 
     seeds = [
         (edge, rank)
@@ -130,7 +124,7 @@ def ranked_seeds(
         if (edge, rank) not in without
     ]
     seeds.sort(key=lambda seed: (-quality(*seed), seed))
-    seeds = seeds[:_SEEDS]
+    seeds = seeds[:12]  # number of seeds whose support by third images is computed
     support = {seed: _support(pairs, *seed) for seed in seeds}
     most = max((quality(*seed) for seed in seeds), default=1.0)
     return sorted(seeds, key=lambda seed: (-support[seed] * np.sqrt(quality(*seed) / most), -quality(*seed), seed))
@@ -140,7 +134,7 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
     """Return the support of a seed by third images: the weight of the placements on which both cameras agree."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
-    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:_THIRDS]
+    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:8]
     total = 0.25
     for image in thirds:
         _, found = model.place(image)
@@ -172,7 +166,8 @@ def _grown(
     refused = {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
-    if left or aliased or model.explained_share() < _CERTAIN:
+    # The images are not consulted if the model explains this share of the pairs.
+    if left or aliased or model.explained_share() < 0.97:
         checks = check_cameras(model, confirmation)
     return GrownModel(model, refused, checks, aliased)
 
@@ -202,7 +197,8 @@ def add_images(
         left.discard(image)
         del weights[image]
         _count_pairs(model.pairs, image, left, weights=weights)
-        if not adjust or len(model.cameras) > _ADJUST_GROWTH * adjusted:
+        # All cameras are adjusted each time their number has grown by this factor.
+        if not adjust or len(model.cameras) > 1.25 * adjusted:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     return {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
@@ -254,7 +250,8 @@ def _next(
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
-            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
+            # Share of an image's pairs, by weight, that must agree with a clear placement.
+            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
             if clear and (pose := _accepted(model, image, evidence, placement=found[0], reasons=reasons)):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))

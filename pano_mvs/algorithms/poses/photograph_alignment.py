@@ -23,13 +23,8 @@ from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
 from pano_mvs.core.errors import UsageError
 
 _MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
-_KEPT_PANORAMAS = 10
 # Levels of the panoramas in each round: coarse patches are aligned from further away.
 _ROUNDS = (1, 0, 0)
-# With fewer patches than these, the pose is wrong.
-_MIN_SIGHTINGS, _MIN_SEEN_SHARE = 12, 0.03
-_CONFIRMED_STD = 3.0
-_SIGNIFICANT_STD = 4.0
 
 
 class Aligned(NamedTuple):
@@ -64,7 +59,7 @@ class PanoramaPatches:
     def levels(self, name: str) -> list[NDArray[np.float32]]:
         """Return the `panorama_levels` of a panorama."""
         if name not in self._held:
-            while len(self._held) >= _KEPT_PANORAMAS:
+            while len(self._held) >= 10:
                 self._held.popitem(last=False)
             self._held[name] = panorama_levels(_reduced(self._load(name), _MAX_PANORAMA_PX), max(_ROUNDS) + 1)
         self._held.move_to_end(name)
@@ -109,14 +104,15 @@ class PhotographPatches:
         chosen, sightings = list(names), Sightings.joined([])
         for level in _ROUNDS:
             sightings = self._sightings(camera, chosen, level)
-            if len(sightings.pixels_px) < max(_MIN_SIGHTINGS, _MIN_SEEN_SHARE * sightings.tested):
+            # With fewer patches than these, the pose is wrong.
+            if len(sightings.pixels_px) < max(12, 0.03 * sightings.tested):
                 return Aligned(camera, 0, sightings.tested)
             camera = refine_by_sightings(camera, sightings, size_hw=self._size_hw, prior=prior)
         errors = np.linalg.norm(sightings.errors(camera, self._size_hw), axis=1)
         offset, stds = optical_center_offset(camera, sightings, size_hw=self._size_hw, prior=prior)
-        significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > _SIGNIFICANT_STD
+        significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > 4.0
         off_center = float(np.linalg.norm(offset)) if significant else 0.0
-        return Aligned(camera, int((errors < _CONFIRMED_STD).sum()), sightings.tested, off_center)
+        return Aligned(camera, int((errors < 3.0).sum()), sightings.tested, off_center)
 
     def _sightings(self, camera: PhotographCamera, names: Iterable[str], level: int) -> Sightings:
         return Sightings.joined(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 
-_ROUNDS, _MIN_POINTS = 4, 6
 # Typical changes of rotation, translation, log focal length and distortion.
 _STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
 _RADIAL_STD = 0.1
@@ -102,10 +101,10 @@ def refine_camera(
         prior: what is known about the focal length.
         max_error: the largest error of an inlier, in radians at the centre.
     """
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         errors = camera.errors(pixels_px, points_in_world, size_hw)
         inliers = errors < camera.focal_px * max_error
-        if inliers.sum() < _MIN_POINTS:
+        if inliers.sum() < 6:
             break
         scale_px = max(0.1, _ROBUST * float(np.median(errors[inliers])))
         camera = _adjusted(

@@ -21,7 +21,6 @@ from pano_mvs.geometry import Rigid3
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
 _SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
-_FINALISTS = 4  # number of hypotheses of a batch that are compared on all matches
 _LAG_SIGMAS = 3.0  # hypotheses that are worse than the best by more than this are rejected early
 _LEADERS = 6  # number of hypotheses whose direction is estimated again
 _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
@@ -160,6 +159,7 @@ class _Search:
         if not len(hypotheses):
             return None, np.inf, 0
         screened = slice(None, _SCREEN)
+        # Number of hypotheses of a batch that are compared on all matches.
         finalists = least_essentials(
             hypotheses,
             self.first[screened],
@@ -168,7 +168,7 @@ class _Search:
             # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=_LAG_SIGMAS if self.optimise else np.inf,
-            count=_FINALISTS,
+            count=4,
         )
         if not len(finalists):
             return None, np.inf, len(hypotheses)

@@ -30,16 +30,10 @@ from pano_mvs.scene import Features, TwoView
 MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""
 
-_MAX_DIRECTION_STD_DEG = 3.0
-_ROTATION_SHARE = 0.9
-_MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
-_UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
 _NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 MAX_LOG10_LEARNED = -50.0
 """For learned matches: about where a pair is as likely right as wrong (see docs/learned.md, False pairs)."""
-_ALIKE_DEG = 5.0
-"""Learned matches that a rotation alone brings as close must be more significant (see docs/learned.md, False pairs)."""
 
 
 @checks_settings
@@ -104,11 +98,11 @@ def verify_pair(
     tried = [pair.evidence(pose.second_from_first, sample=minimal.sample, models=minimal.models)] if pose else []
     if refine and not learned and not any(tried):
         tried += [
-            pair.evidence(upright, sample=_UPRIGHT_SAMPLE, models=_UPRIGHT_MODELS)
+            pair.evidence(upright, sample=3, models=4)
             for upright in upright_poses(p, q, rng=rng, threshold_rad=pair.threshold_rad)
         ]
     tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
-    if turned.sum() >= max(min_inliers, _ROTATION_SHARE * (tried[0].inliers if tried else 0)):
+    if turned.sum() >= max(min_inliers, 0.9 * (tried[0].inliers if tried else 0)):
         return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
     if not tried:
         return pair.failed(pose.reason)
@@ -225,7 +219,8 @@ def max_log10_false_alarms(p: FloatArray, q: FloatArray, *, learned: bool) -> fl
     if not learned:
         return MAX_LOG10_FALSE_ALARMS
     left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
-    return MAX_LOG10_LEARNED * max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)) ** 3
+    # Learned matches that a rotation alone brings as close must be more significant (see docs/learned.md, False pairs).
+    return MAX_LOG10_LEARNED * max(1.0, 5.0 / max(float(left_deg), 0.1)) ** 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +343,7 @@ def _agreeing(witnesses: int, count: int) -> str:
 
 def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
     """Return a reason if hardly any inlier moved by more than the noise; "" otherwise."""
-    moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
+    moved = int((parallax > 4.0 * threshold_rad).sum())  # in units of the threshold
     if moved >= _MIN_WITH_PARALLAX:
         return ""
     return (
@@ -359,7 +354,7 @@ def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
 
 def _why_open(direction_std_deg: float) -> str:
     """Return a reason if the inliers do not determine the direction; "" otherwise."""
-    if direction_std_deg <= _MAX_DIRECTION_STD_DEG:
+    if direction_std_deg <= 3.0:
         return ""
     return (
         f"the matches determine the direction between the images only to {direction_std_deg:.0f}°: they lie too close "

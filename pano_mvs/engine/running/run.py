@@ -44,7 +44,6 @@ from pano_mvs.scene import Axis, Files, Record
 
 GRACE_S = 10.0  # time for which running units may go on after an interrupt, so that their results are not lost
 WAIT_S = 5.0  # time without an event after which observers are notified that the run is waiting for units
-_MAX_REPAIRS = 3
 _STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 
 
@@ -183,7 +182,7 @@ class Run:
                 for text in dict.fromkeys(self._pass.damaged or [str(error)]):
                     self.warn(text)
                     found[text] += 1
-                    if found[text] > _MAX_REPAIRS:
+                    if found[text] > 3:
                         raise StoreError(
                             f"{text} again and again: check the disk, or choose another cache with --cache DIR"
                         ) from error

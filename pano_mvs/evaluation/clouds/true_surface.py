@@ -13,8 +13,6 @@ from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_
 
 # A view sees a sample if the sample's distance lies within the four true ranges around it, give or take this share.
 _SEEN_WITHIN = 0.01
-# Surfaces seen at a flatter angle than this have no reliable area.
-_MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +107,8 @@ def _cosines(ranges: NDArray[np.float32]) -> NDArray[np.float64]:
     normals = np.cross(across, down)
     length = np.linalg.norm(normals, axis=-1)
     cosine = np.abs(np.sum(rays * normals, axis=-1)) / np.where(length > 0, length, np.nan)
-    return np.where(np.isfinite(cosine), cosine.clip(_MIN_COSINE), 1.0)
+    # Surfaces seen at a flatter angle than this have no reliable area.
+    return np.where(np.isfinite(cosine), cosine.clip(0.05), 1.0)
 
 
 def _step_on_surface(points: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:

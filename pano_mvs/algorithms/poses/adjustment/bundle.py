@@ -17,7 +17,6 @@ from pano_mvs.geometry import rotation_from_rotvec
 
 Loss: TypeAlias = Literal["cauchy", "huber"]
 
-_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
 _LENGTH_PULL = 3.0  # standard deviations at which an expected length starts to lose influence
 
 
@@ -194,11 +193,11 @@ def _adjust_ordered(
         moved_cost = cost_of(moved, moved_errors)
         if not moved_cost < cost:
             damping *= 10
-            if damping > _MAX_DAMPING:
+            if damping > 1e6:
                 break
             continue
         converged = cost - moved_cost < tolerance * cost
-        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, _MIN_DAMPING)
+        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, 1e-9)
         if converged:
             break
     return bundle

@@ -19,7 +19,6 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 SIZE, MARGIN = 13, 4
 _MAX_WIDTH = 4096  # wider panoramas are rarely sharp to a pixel, and their patches would contain too little detail
-_SMOOTHING = 0.5  # standard deviation, in samples
 _PAD_PX = 8
 # All of these were tuned on rendered and synthetic captures; the result changes little around them.
 _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
@@ -217,7 +216,7 @@ def _masked(mask: NDArray[np.bool_], rays: tuple[FloatArray, FloatArray, FloatAr
 def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the grey levels from which patches are sampled, (H + 16, W + 16), with a margin of 8 pixels."""
     gray = cv2.cvtColor(panorama, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    sigma_px = _SMOOTHING * max(1.0, panorama.shape[1] / _MAX_WIDTH)
+    sigma_px = 0.5 * max(1.0, panorama.shape[1] / _MAX_WIDTH)  # standard deviation, in samples
     return np.asarray(cv2.GaussianBlur(pad_panorama(gray, _PAD_PX), (0, 0), sigma_px), np.float32)
 
 

@@ -13,7 +13,6 @@ from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, cam
 from pano_mvs.core.arrays import FloatArray
 
 _COLUMNS_AT_ONCE = 64  # cameras
-_HELD_LENGTH = 1e6  # stiffness of the unit of length, relative to the stiffest camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +81,7 @@ def _hold_length(band: FloatArray, centers: FloatArray, first: int, *, neighbour
     """Constrain the system so that the distance between two cameras does not change."""
     along = centers[neighbour] - centers[first]
     along /= np.linalg.norm(along)
-    stiffness = _HELD_LENGTH * float(band[:, 0].max())
+    stiffness = 1e6 * float(band[:, 0].max())  # stiffness of the unit of length, relative to the stiffest camera
     for j in range(3):
         for i in range(j, 3):
             band[6 * neighbour + 3 + j, i - j] += stiffness * along[i] * along[j]

@@ -18,7 +18,6 @@ from pano_mvs.scene import Features, TwoView
 
 # With more threads COLMAP numbers the images in the order in which they are finished.
 _THREADS = 1
-_SIFT_PATCH_SCALES = 12.0  # SIFT describes 4 × 4 bins of three scales each
 
 
 @checks_settings
@@ -140,10 +139,11 @@ def _features(database: Any, image_id: int, picture: Path) -> Features:
     keypoints = np.asarray(database.read_keypoints(image_id), np.float64).reshape(-1, 6)
     columns, rows = (np.floor(keypoints[:, axis]).astype(int) for axis in (0, 1))
     scales_px = np.sqrt(np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4]))
+    # SIFT describes 4 × 4 bins of three scales each.
     return Features(
         bearings=ray_from_pixel(keypoints[:, :2], (height, width)),
         descriptors=np.asarray(database.read_descriptors(image_id).data, np.float32).reshape(-1, 128),
-        sizes_rad=(_SIFT_PATCH_SCALES * scales_px * 2 * np.pi / width).astype(np.float32),
+        sizes_rad=(12.0 * scales_px * 2 * np.pi / width).astype(np.float32),
         scores=scales_px.astype(np.float32),
         colors_rgb=image[np.clip(rows, 0, height - 1), columns % width],
         metric="l2",

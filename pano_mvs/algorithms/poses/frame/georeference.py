@@ -22,8 +22,6 @@ ComplexArray = NDArray[np.complex128]
 _UP = np.array([0.0, -1.0, 0.0])
 _MIN_POSITIONS = 3
 _MAX_HYPOTHESES = 2000
-# A scale with a larger relative uncertainty than this is not used.
-_MAX_SCALE_ERROR = 0.1
 _OUTLIER_SIGMAS = 3.0
 _GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)°, (-?[\d.]+)°, (-?[\d.]+) m\)")
 
@@ -159,7 +157,8 @@ def _judged(
     noise_m = max(gps_noise_m, float(np.sqrt(np.sum(residuals_m**2) / freedom)))
     spread_m = float(abs(factor) * np.sqrt(np.sum(np.abs(source - source.mean()) ** 2)))
     fit = replace(fit, scale_error=noise_m / spread_m if spread_m > 0 else float("inf"))
-    if fit.scale_error > _MAX_SCALE_ERROR:
+    # A scale with a larger relative uncertainty than this is not used.
+    if fit.scale_error > 0.1:
         side_m = spread_m / np.sqrt(len(source))
         return replace(
             fit,

@@ -16,9 +16,6 @@ from pano_mvs.geometry import angle_between
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
 _MIN_POINTS = 100
 _PARTS = 4
-# Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms, 200
-# to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
-_MIN_CONTRAST = 1.3
 _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
 _BINS_PER_WIDTH = 2.0
 # The floor: density along the logarithm of the depth below the cameras, which makes it independent of the unit.
@@ -80,7 +77,9 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
     others = directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
     usual = np.median([_concentration(near @ other, width) for other in others])
     contrast = float(_concentration(near @ best, width) / usual)
-    if contrast < _MIN_CONTRAST:
+    # Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms,
+    # 200 to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
+    if contrast < 1.3:
         return Layers(up, contrast, f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
     return Layers(best, contrast, uncertainty_deg=_scatter_deg(near, best))
 

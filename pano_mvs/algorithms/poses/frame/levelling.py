@@ -19,8 +19,6 @@ from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_t
 from pano_mvs.scene import Poses
 
 _UP = np.array([0.0, -1.0, 0.0])
-_MIN_HEADINGS = 2
-_MAX_HEADING_DISAGREEMENT_DEG = 15.0
 
 
 @checks_settings
@@ -86,7 +84,7 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
     unturned = "z close to where it pointed before levelling"
     # Software that knows no heading writes zero for all images.
-    if len(headings) < _MIN_HEADINGS or not any(heading for _, heading in headings):
+    if len(headings) < 2 or not any(heading for _, heading in headings):
         return np.eye(3), unturned
     forward = np.array([level.rotations[idx][2] for idx, _ in headings])
     measured_rad = np.deg2rad([heading for _, heading in headings])
@@ -94,7 +92,7 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     medoid = turns[int(np.argmin(np.abs(np.angle(turns[:, None] / turns[None, :])).sum(axis=1)))]
     turn_rad = float(np.angle(medoid)) + float(np.median(np.angle(turns / medoid)))
     off_deg = float(np.median(np.abs(np.rad2deg(np.angle(turns * np.exp(-1j * turn_rad))))))
-    if off_deg > _MAX_HEADING_DISAGREEMENT_DEG:
+    if off_deg > 15.0:
         return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
     return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
         f"z north, by {len(headings)} compass {plural(len(headings), 'heading')} (median disagreement {off_deg:.1f}°)"

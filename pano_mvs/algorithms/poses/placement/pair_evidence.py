@@ -16,7 +16,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 _MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
@@ -24,8 +23,6 @@ _AGREEING, _MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
 _SHUFFLES = 50
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
-# Standard deviation of the direction that is assumed for a geometry without one.
-_ALTERNATIVE_STD_DEG = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +57,12 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
     for rank, geometry in enumerate((view, *view.alternatives)):
         p, q = bearings_first[geometry.matches_idx[:, 0]], bearings_second[geometry.matches_idx[:, 1]]
         ranges, parallax = unit_ranges(Rigid3(geometry.rotation, geometry.direction), p, q)
+        # Standard deviation of the direction that is assumed for a geometry without one.
         found.append(
             Geometry(
                 view=geometry,
                 weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
-                direction_std_deg=view.direction_std_deg if rank == 0 else _ALTERNATIVE_STD_DEG,
+                direction_std_deg=view.direction_std_deg if rank == 0 else 0.5,
                 unit_ranges=ranges,
                 parallax_rad=parallax,
             )
@@ -234,5 +232,5 @@ def unit_ranges(second_from_first: Rigid3, p: FloatArray, q: FloatArray) -> tupl
     ranges = np.stack(ranges_from_bearings(p, q, second_from_first))
     parallax = angle_between(p @ second_from_first.rotation.T, q)
     with np.errstate(invalid="ignore"):
-        usable = (ranges > 0).all(axis=0) & (parallax > _MIN_ANGLE_RAD)
+        usable = (ranges > 0).all(axis=0) & (parallax > float(np.deg2rad(1.0)))
     return np.where(usable, ranges, np.nan), parallax

@@ -27,9 +27,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.5))
-_MAX_PARTNERS = 16
-
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
@@ -127,7 +124,7 @@ class PlacedModel:
     def evidence(self, image: int, partners: Sequence[int] | None = None) -> PairEvidence:
         """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
-            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
+            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:16]
         return gather_pair_evidence(
             image,
             partners,
@@ -341,7 +338,7 @@ class PlacedModel:
         ranges = ranges_from_bearings(p, q, relative)
         parallax = angle_between(p @ relative.rotation.T, q)
         with np.errstate(invalid="ignore"):
-            usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > _MIN_ANGLE_RAD)
+            usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > float(np.deg2rad(1.5)))
         usable &= view.residuals_rad < MAX_ERROR_RAD
         for image, keypoints, found in ((first, mine, ranges[0]), (second, theirs, ranges[1])):
             better = usable & (parallax > self._parallax[image][keypoints])

@@ -11,8 +11,6 @@ from pano_mvs.core.errors import UsageError
 
 ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
 
-_CAUCHY_STEPS, _CONVERGED = 20, 1e-7
-
 
 def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
     """Estimate one scale factor from the ratios of single features.
@@ -48,12 +46,12 @@ def _most_neighbours(ratios: FloatArray, kappa: float) -> float:
 
 def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> float:
     spread = np.sqrt(weights / _median(weights))
-    for _ in range(_CAUCHY_STEPS):
+    for _ in range(20):
         deviations = (logs - center) * spread
         scale = max(1.4826 * _median(np.abs(deviations)), 1e-9)
         robust = weights / (1 + (deviations / (2 * scale)) ** 2)
         moved = float(np.sum(robust * logs) / np.sum(robust))
-        if abs(moved - center) < _CONVERGED:
+        if abs(moved - center) < 1e-7:
             break
         center = moved
     return center

@@ -17,8 +17,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
-_MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
-
 
 @checks_settings
 def verify_poses(
@@ -118,7 +116,7 @@ def poses_of(model: PlacedModel) -> Poses:
         scale="the first reference–neighbour baseline is 1",
         metric=False,
     )
-    return poses_with_points(poses, tracks, max_error_deg=_MAX_ERROR_DEG, min_angle_deg=_MIN_ANGLE_DEG)
+    return poses_with_points(poses, tracks, max_error_deg=0.4, min_angle_deg=1.0)
 
 
 def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Poses:
