@@ -88,7 +88,7 @@ def masked_areas(values: StoredValues, kept: EarlierPage) -> MaskedAreas:
     return MaskedAreas(tuple(counts), len(shares), len(names), tuple(shown))
 
 
-def chosen_pictures(shares: Mapping[str, Mapping[str, float]], most: int = MAX_PICTURES) -> list[str]:
+def chosen_pictures(shares: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Return the images to show: for each reason that with the largest share, then evenly spaced others."""
     masked = [name for name, found in shares.items() if found]
     first = [
@@ -96,9 +96,9 @@ def chosen_pictures(shares: Mapping[str, Mapping[str, float]], most: int = MAX_P
         for kind in KINDS
         if any(kind.name in shares[name] for name in masked)
     ]
-    chosen = dict.fromkeys(first[:most])
+    chosen = dict.fromkeys(first[:MAX_PICTURES])
     rest = [name for name in masked if name not in chosen]
-    chosen |= dict.fromkeys(evenly_spaced(rest, most - len(chosen)))
+    chosen |= dict.fromkeys(evenly_spaced(rest, MAX_PICTURES - len(chosen)))
     return [name for name in masked if name in chosen]
 
 

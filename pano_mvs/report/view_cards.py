@@ -174,17 +174,17 @@ class ViewCard:
         return "uncertainty" in self.pictures
 
 
-def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always: Collection[str] = ()) -> list[int]:
+def chosen_views(views: Sequence[ViewSummary], *, always: Collection[str] = ()) -> list[int]:
     """Return the positions of the views to show in full: all, or the least complete third and evenly spaced others.
 
     The views in `always` come first in that third, as far as there is room.
     """
     everything = list(range(len(views)))
-    if len(views) <= most:
+    if len(views) <= MAX_CARDS:
         return everything
     by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, _quality(views[idx]), idx))
-    worst, rest = by_quality[: most // 3], sorted(by_quality[most // 3 :])
-    return sorted({*worst, *evenly_spaced(rest, most - len(worst))})
+    worst, rest = by_quality[: MAX_CARDS // 3], sorted(by_quality[MAX_CARDS // 3 :])
+    return sorted({*worst, *evenly_spaced(rest, MAX_CARDS - len(worst))})
 
 
 def view_cards(

@@ -49,7 +49,6 @@ def estimate_two_view(
     threshold_rad: float,
     solver: Solver = "five_point",
     refine: bool = True,
-    confidence: float = 0.9999,
     max_iterations: int = 15_000,
 ) -> RelativePose:
     """Estimate the relative pose of two panoramas by robust estimation on the sphere.
@@ -68,7 +67,6 @@ def estimate_two_view(
         solver: "five_point" needs fewer samples and handles planar scenes; "eight_point" is linear (the paper's) and
             ambiguous on planar scenes.
         refine: False returns the best minimal hypothesis unrefined, as in the paper.
-        confidence: stop when a better model would have been found with this probability.
         max_iterations: maximum number of hypotheses.
 
     Raises:
@@ -90,7 +88,8 @@ def estimate_two_view(
     # Hypotheses are rejected after the first few matches, so the order of matches must be random.
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
-    leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
+    # Stop when a better model would have been found with this probability.
+    leaders, iterations = search.run(confidence=0.9999, max_iterations=max_iterations)
     if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
     pose: Rigid3 | None = leaders[0]

@@ -15,9 +15,9 @@ _MIN_MATCHES = 6
 
 
 def upright_poses(
-    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float, count: int = 4
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
 ) -> list[Rigid3]:
-    """Return relative poses of two upright images, |t| = 1, best first.
+    """Return at most four relative poses of two upright images, |t| = 1, best first.
 
     With a known vertical, a heading and two matches determine a relative pose, so that one true match in ten is enough
     to find it, where five matches at random would hardly ever all be true. The poses are refined without the
@@ -28,7 +28,6 @@ def upright_poses(
         second: (M, 3) in the second.
         rng: draws the matches.
         threshold_rad: Sampson error from which a match costs 1 after refinement.
-        count: maximum number of poses.
     """
     if len(first) < _MIN_MATCHES:
         return []
@@ -43,7 +42,7 @@ def upright_poses(
             rough.append((float(costs[best]), Rigid3(rotation, directions[best])))
     poses: list[Rigid3] = []
     for _, pose in sorted(rough, key=lambda item: item[0]):
-        if len(poses) == count:
+        if len(poses) == 4:
             break
         if all(float(geodesic_angle(pose.rotation, other.rotation)) > float(np.deg2rad(3.0)) for other in poses):
             poses.append(pose)

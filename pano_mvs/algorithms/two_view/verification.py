@@ -136,8 +136,6 @@ def verify_pose(
     *,
     pose: Rigid3,
     rng: np.random.Generator,
-    threshold_deg: float = 0.2,
-    min_inliers: int = 8,
 ) -> TwoView:
     """Return the two-view geometry near a relative pose that is known from other pairs, as `verify_pair` does.
 
@@ -149,11 +147,10 @@ def verify_pose(
         matches_idx: (M, 2) positions of matching key points.
         pose: second_from_first; its length is ignored.
         rng: draws false matches.
-        threshold_deg: maximum spherical Sampson error of an inlier.
-        min_inliers: minimum number of independent inliers.
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
-    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(threshold_deg)), min_inliers)
+    min_inliers = 8
+    pair = _Pair(matches_idx, p, q, rng, float(np.deg2rad(0.2)), min_inliers)
     length = float(np.linalg.norm(pose.translation))
     if length <= 0 or len(matches_idx) < min_inliers:
         return pair.failed(f"{_agreeing(len(matches_idx), len(p))}, {min_inliers} needed")
@@ -165,7 +162,7 @@ def verify_pose(
 
 
 def pose_near(
-    first: Features, second: Features, matches_idx: NDArray[np.int32], *, pose: Rigid3, threshold_deg: float = 0.2
+    first: Features, second: Features, matches_idx: NDArray[np.int32], *, pose: Rigid3
 ) -> tuple[Rigid3, float, float] | None:
     """Return the relative pose near another that most matches agree with, and how significant it is by itself.
 
@@ -174,7 +171,6 @@ def pose_near(
         second: key points of the second image.
         matches_idx: (M, 2) positions of matching key points.
         pose: second_from_first; its length is ignored.
-        threshold_deg: maximum spherical Sampson error of an inlier.
 
     Returns:
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
@@ -186,7 +182,7 @@ def pose_near(
         p,
         q,
         np.random.default_rng(0),
-        float(np.deg2rad(threshold_deg)),
+        float(np.deg2rad(0.2)),
         _MIN_NEAR,
         bool(first.learned and second.learned),
     )
