@@ -433,10 +433,10 @@ class RunPass:
             entry.name,
             unit.item,
             outcome.cause,
-            outcome.trace,
             consequence_of(entry, unit.item),
-            log="" if finished.log is None else str(finished.log),
-            said=finished.said,
+            "" if finished.log is None else str(finished.log),
+            finished.said,
+            outcome.trace,
         )
         self._statistics.unit_failed(failure, outcome.seconds)
         if outcome.exit_code and self.queue.states[entry.name].axis is Axis.ONE:
