@@ -235,7 +235,7 @@ def _start_rigs(
     p, q = (
         np.concatenate(
             [
-                seen.features[capture, lens].bearings[_rim_matches(seen, capture)[:, lens]]
+                seen.features[capture, lens].bearings[seen.matches[(capture, 0), (capture, 1)][:, lens]]
                 for capture in range(seen.count)
             ]
         )
@@ -257,10 +257,6 @@ def _start_rigs(
         return [_State(known, Rigid3(best_rotation, np.zeros(3)), {})], int(best.sum())
     turns = [rotation_from_rotvec(np.array([0.0, 0.0, quarter * np.pi / 2])) for quarter in range(4)]
     return [_State(lenses, Rigid3(turn @ halfway, np.zeros(3)), {}) for turn in turns], 0
-
-
-def _rim_matches(seen: _Seen, capture: int) -> NDArray[np.int32]:
-    return seen.matches[(capture, 0), (capture, 1)]
 
 
 def _scaled(bearings: FloatArray, scale: float) -> FloatArray:

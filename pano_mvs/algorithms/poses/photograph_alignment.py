@@ -103,7 +103,18 @@ class PhotographPatches:
             raise UsageError(f"the photograph, reduced to {self._gray.shape}, is smaller than a patch")
         chosen, sightings = list(names), Sightings.joined([])
         for level in _ROUNDS:
-            sightings = self._sightings(camera, chosen, level)
+            sightings = Sightings.joined(
+                [
+                    sight_points(
+                        self._panoramas.surface(name),
+                        self._panoramas.levels(name)[level],
+                        self._levels,
+                        camera=camera,
+                        size_hw=self._size_hw,
+                    )
+                    for name in chosen
+                ]
+            )
             # With fewer patches than these, the pose is wrong.
             if len(sightings.pixels_px) < max(12, 0.03 * sightings.tested):
                 return Aligned(camera, 0, sightings.tested)
@@ -113,20 +124,6 @@ class PhotographPatches:
         significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > 4.0
         off_center = float(np.linalg.norm(offset)) if significant else 0.0
         return Aligned(camera, int((errors < 3.0).sum()), sightings.tested, off_center)
-
-    def _sightings(self, camera: PhotographCamera, names: Iterable[str], level: int) -> Sightings:
-        return Sightings.joined(
-            [
-                sight_points(
-                    self._panoramas.surface(name),
-                    self._panoramas.levels(name)[level],
-                    self._levels,
-                    camera=camera,
-                    size_hw=self._size_hw,
-                )
-                for name in names
-            ]
-        )
 
 
 def _reduced(picture: NDArray[np.uint8], max_px: int) -> NDArray[np.uint8]:

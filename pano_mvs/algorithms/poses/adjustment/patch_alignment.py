@@ -59,7 +59,7 @@ def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
 def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     if not len(poses.track_point_idx):
         return poses
-    step_rad = _step_rad(load(poses.names[0])[0].shape[1])
+    step_rad = 2 * np.pi / min(load(poses.names[0])[0].shape[1], _MAX_WIDTH)
     sightings = _sightings(poses, step_rad)
     bearings = np.array(poses.track_bearings)
     chosen = _longest_tracks(poses.track_point_idx, _MAX_PER_IMAGE * len(poses.names))
@@ -92,10 +92,6 @@ class _Sightings:
     first_axes: FloatArray
     second_axes: FloatArray
     zoom: FloatArray
-
-
-def _step_rad(width: int) -> float:
-    return 2 * np.pi / min(width, _MAX_WIDTH)
 
 
 def _sightings(poses: Poses, step_rad: float) -> _Sightings:
