@@ -46,7 +46,6 @@ def extract_aliked(
         mask: (H, W) bool; masked (False) pixels have no key points.
         ups: directions (3,) in the camera frame that may be the zenith, at least one.
         max_keypoints: maximum number of key points for each of `ups`, spread evenly over the sphere.
-        threshold: minimum score.
         networks: the network files and what executes them.
 
     Raises:

@@ -41,7 +41,6 @@ def match_learned(
     Args:
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
-        min_score: minimum probability of a match.
         max_views: how many of the 256 or more pairs of views are compared, those with the most similar descriptors.
         networks: the network files and what executes them.
 

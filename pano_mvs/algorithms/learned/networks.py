@@ -166,7 +166,6 @@ class Network:
     """
 
     def __init__(self, session: Any) -> None:
-        """Wrap a session of ONNX Runtime."""
         self._session = session
 
     @property

@@ -50,8 +50,6 @@ def network_values(
         network: with one input (1, 3, h, w) float32 and a first output of h' × w' values, at any resolution.
         picture: (H, W, 3) RGB panorama.
         width: columns of the panorama that the network gets, with half as many rows, where the file leaves them open.
-        mean: of the network's training pictures, subtracted from red, green and blue in [0, 1].
-        std: what the differences are divided by.
 
     Raises:
         UsageError: if the network has another input or output, or a divisor is not positive.
@@ -89,9 +87,7 @@ def fill_from_prior(
         range_map: (H, W) with even W, the full sphere.
         guide: (H, W, 3) RGB panorama.
         prior: (H, W) the network's values; NaN where it has none.
-        output: "range": values proportional to the range; "inverse_range": a linear function of 1/range.
         valid: (H, W) pixels that may have a range; None: all.
-        block_deg: side of the areas that are left out in turn to measure the error.
 
     Returns:
         The range map and the relative standard deviation of the network's ranges: their deviation from confirmed ranges

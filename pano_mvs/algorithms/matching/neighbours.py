@@ -43,9 +43,6 @@ def position_pairs(
     Args:
         names: image names in the capture's order.
         positions: image name to position, (2,) or (3,), all in one frame and unit; some may be missing.
-        neighbours: number of nearest images for each image.
-        window: an image without position is paired with this number of images before and after it in the capture's
-            order.
 
     Raises:
         UsageError: if a number of neighbours is less than 1.
@@ -82,7 +79,6 @@ def retrieval_pairs(
     Args:
         names: image names in the capture's order.
         descriptors: image name to its global descriptor; images without one are not paired.
-        neighbours: number of most similar images for each image.
 
     Raises:
         UsageError: if the number of neighbours is less than 1.
@@ -110,9 +106,6 @@ def loop_closing_pairs(
     Args:
         names: image names in the order in which they were taken.
         descriptors: image name to its global descriptor.
-        window: each image is paired with this number of following images.
-        loop: whether the first image follows the last one.
-        loop_closure: number of similar images beyond the window to pair each image with.
 
     Raises:
         UsageError: if the window is less than 1.

@@ -38,7 +38,6 @@ def vlad_descriptor(
 
     Args:
         features: key points, strongest first, with either kind of descriptor.
-        strongest: number of key points in the vector.
         sample: number of key points, those of the coarsest scales, whose descriptors are kept unchanged. Key points of
             coarse scales are the ones most likely found from other positions (Wu, "Towards linear-time incremental
             structure from motion", 2013, section 3.1).

@@ -156,7 +156,6 @@ class FreeSpace:
     """Counts how many panoramas confirm each vertex of a mesh, and how many look through it."""
 
     def __init__(self, vertices_in_world: NDArray[np.float32]) -> None:
-        """Start without panoramas."""
         self._vertices = vertices_in_world
         self._confirmed = np.zeros(len(vertices_in_world), np.uint8)
         self._through = np.zeros(len(vertices_in_world), np.uint8)

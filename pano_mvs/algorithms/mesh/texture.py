@@ -193,7 +193,6 @@ class Surface:
     """A mesh with what its painting needs."""
 
     def __init__(self, vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-        """Prepare the normals."""
         self.vertices_in_world, self.faces = vertices_in_world, faces
         self.normals = vertex_normals(vertices_in_world, faces)
 

@@ -36,8 +36,6 @@ def extend_poses(
         known: poses by the names in `features`; others are ignored. The points of these poses are replaced.
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
-        max_error_deg: observations with a larger error are dropped.
-        min_angle_deg: smallest angle between the rays of a point that is seen twice.
 
     Returns:
         Poses of all registered images in the capture's order, in the frame and unit of the known poses. Images that

@@ -37,7 +37,6 @@ class RelativePose:
     reason: str = ""  # why there is no pose
 
     def __bool__(self) -> bool:
-        """Return whether a pose was found."""
         return not self.reason
 
 

@@ -66,11 +66,8 @@ def refine_poses(
 
     Args:
         poses: poses with tracks; poses without tracks are returned unchanged.
-        loss: "huber" or "cauchy".
         loss_scale_deg: error at which an observation starts to lose influence. If the precision of observations is
             known, this is for a standard deviation of 0.07°, and scales with it.
-        max_iterations: maximum number of steps in each round.
-        max_error_deg: observations with a larger error are dropped.
         load: returns the panorama and the mask of an image by its name; None keeps the observations as they are.
         rigs: image name to the lenses of its panorama; other images are central cameras.
 

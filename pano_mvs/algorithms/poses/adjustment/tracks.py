@@ -33,7 +33,6 @@ class Tracks:
     count: int  # number of tracks
 
     def __len__(self) -> int:
-        """Return the number of tracks."""
         return self.count
 
 

@@ -77,9 +77,6 @@ def localise_photograph(
         focal_px: focal length if it is known, None otherwise.
         patches: the photograph and the panoramas, to align patches; None: key points only.
         learned: by panorama, matches (M, 2) that a network found: positions in `keypoints` and in the known points.
-        candidates: number of most similar panoramas that are used; 0: all.
-        min_inliers: minimum number of key points that agree with the pose.
-        max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
     if patches is not None and patches.too_narrow:

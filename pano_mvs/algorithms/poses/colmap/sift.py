@@ -35,7 +35,6 @@ def colmap_sift(
     Args:
         pictures: name, (H, W, 3) uint8 RGB and (H, W) bool valid pixels of each panorama, in the capture's order;
             loaded one at a time, so they need not all be in memory.
-        max_keypoints: maximum number per panorama.
         rng: gives COLMAP's seed.
         scratch: an empty folder for the images, their masks and COLMAP's database.
     """

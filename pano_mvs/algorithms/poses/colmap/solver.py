@@ -45,7 +45,6 @@ def solve_colmap(
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs; those without a general geometry are left out.
-        mapper: "incremental" or "global".
         cameras: "sphere": EQUIRECTANGULAR cameras; "faces": six pinhole faces, held together as one rig.
         rng: gives COLMAP's seed.
         scratch: an empty folder for COLMAP's files.

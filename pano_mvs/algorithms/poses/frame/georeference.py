@@ -39,7 +39,6 @@ class GpsFit:
     reason: str = ""  # why there is no reliable fit; "" if there is one
 
     def __bool__(self) -> bool:
-        """Return whether the fit is reliable."""
         return not self.reason
 
     @property

@@ -35,7 +35,6 @@ class Layers:
     uncertainty_deg: float = float("nan")  # standard deviation of the direction, from four parts of the points
 
     def __bool__(self) -> bool:
-        """Return whether there are layers."""
         return not self.reason
 
 
@@ -49,7 +48,6 @@ class Floor:
     reason: str = ""  # why no floor was found; else ""
 
     def __bool__(self) -> bool:
-        """Return whether a floor was found."""
         return not self.reason
 
 

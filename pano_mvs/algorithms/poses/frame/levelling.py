@@ -51,7 +51,6 @@ def level_poses(
         heading_deg: image name to the compass heading of its centre, clockwise from north.
         pictures: image name to a function that loads its panorama, for vertical lines.
         evidence: as in `find_vertical`.
-        max_uncertainty_deg: standard deviation of the vertical above which the poses stay as they are.
 
     Returns:
         The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned

@@ -51,7 +51,6 @@ class Vertical:
     upside_down: float = float("nan")
 
     def __bool__(self) -> bool:
-        """Return whether the direction is known."""
         return not self.reason
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.faces.render import face_image, face_mask
+from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
@@ -62,7 +63,6 @@ class VerticalLines:
     reason: str = ""  # why there is none; else ""
 
     def __bool__(self) -> bool:
-        """Return whether there is such a direction."""
         return not self.reason
 
 
@@ -158,7 +158,7 @@ def _in_panorama(
     image: NDArray[np.uint8], valid: NDArray[np.bool_], sides: Sequence[FloatArray]
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return normals in the camera frame (M, 3) and lengths (M,) of the segments in each view, by its rotation."""
-    small = _reduced(image, width=4 * 512)
+    small = reduced_panorama(image, 4 * 512)
     mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
     size = max(16, small.shape[1] // 4)
     focal = size / 2 / np.tan(np.deg2rad(_FOV_DEG / 2))
@@ -183,12 +183,6 @@ def _in_view(image: NDArray[np.uint8], valid: NDArray[np.bool_], view: PinholeVi
     normals = np.cross(rays[:, 0], rays[:, 1])
     sines = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / sines, np.arcsin(np.clip(sines[:, 0], 0, 1))
-
-
-def _reduced(image: NDArray[np.uint8], *, width: int) -> NDArray[np.uint8]:
-    if image.shape[1] <= width:
-        return image
-    return np.asarray(cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _support(segments: Segments, candidates: FloatArray, tolerance_deg: float) -> FloatArray:

@@ -85,7 +85,6 @@ class PairEvidence:
     tolerance_rad: FloatArray  # (W,) largest error of a direction
 
     def __len__(self) -> int:
-        """Return the number of geometries."""
         return len(self.partner)
 
     @property

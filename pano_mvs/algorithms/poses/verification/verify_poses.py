@@ -44,7 +44,6 @@ def verify_poses(
         load: returns the panorama and the mask of an image by its name.
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
-        correct: False only reports.
         miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost), and left out
             if it is doubted and below 1 / (1 + miss_cost).
 
