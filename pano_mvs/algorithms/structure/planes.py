@@ -19,6 +19,7 @@ from pano_mvs.algorithms.structure.outline import outline_planes, same_wall, sup
 from pano_mvs.algorithms.structure.view import PLAIN_WEIGHT, PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import UP
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
@@ -30,7 +31,6 @@ _ALONG_NORMAL = 0.7
 _LEAST_UNCERTAINTY = 0.002
 # Cosines of the angles between the two points that a plane is drawn from.
 _PAIR_COSINES = 0.9, 0.9985
-_UP = np.array([0.0, -1.0, 0.0])
 
 
 def find_planes(
@@ -47,7 +47,7 @@ def find_planes(
     least = min_share * 4 * np.pi
     planes = [
         plane
-        for normal in (_UP, -_UP)
+        for normal in (UP, -UP)
         for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
     ]
     planes += supposed_ceiling(views, planes)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
+from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
 from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
@@ -19,7 +20,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
-_SEED_LIMIT = 2**31 - 1
 _FOV_BOUNDS_DEG = (15.0, 120.0)
 # How well EXIF's focal length, or a guessed one, is known: the standard deviation of its natural logarithm.
 _EXIF_LOG_STD, _GUESSED_LOG_STD = 0.1, 0.4
@@ -104,7 +104,7 @@ def localise_photograph(
         min_inliers=min_inliers,
         max_error=float(np.radians(max_error_deg)),
     )
-    found = search.located(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+    found = search.located(matches, seed=colmap_seed(rng))
     if isinstance(found, Localised | _Cropped) or patches is None:
         return found
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
@@ -190,7 +190,7 @@ class _Search:
         assert self.patches is not None
         best: tuple[Aligned, _Matches] | None = None
         for matches in candidates:
-            first = self.first(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+            first = self.first(matches, seed=colmap_seed(rng))
             if first is None:
                 continue
             camera = self.refined(matches, first)

@@ -10,14 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
+from pano_mvs.algorithms.poses.colmap.mapping import THREADS, quiet_colmap
 from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
 from pano_mvs.scene import Features, TwoView
-
-# With more threads COLMAP numbers the images in the order in which they are finished.
-_THREADS = 1
 
 
 @checks_settings
@@ -88,7 +85,7 @@ def _extraction_options(max_keypoints: int) -> Any:
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = _THREADS, False
+    options.num_threads, options.use_gpu = THREADS, False
     options.sift.max_num_features = max_keypoints
     return options
 
@@ -97,7 +94,7 @@ def _matching_options() -> Any:
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = _THREADS, False
+    options.num_threads, options.use_gpu = THREADS, False
     return options
 
 
@@ -106,7 +103,7 @@ def _verification_options(seed: int) -> Any:
 
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
-    options.ransac.random_seed, options.ransac.num_threads = seed, _THREADS
+    options.ransac.random_seed, options.ransac.num_threads = seed, THREADS
     return options
 
 

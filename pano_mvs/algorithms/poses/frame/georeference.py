@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import UP, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses
 
 ComplexArray = NDArray[np.complex128]
 
-_UP = np.array([0.0, -1.0, 0.0])
 _MIN_POSITIONS = 3
 _MAX_HYPOTHESES = 2000
 _OUTLIER_SIGMAS = 3.0
@@ -83,7 +82,7 @@ def fit_gps(
     lla = np.array([position for _, position in located], np.float64)
     origin_lla = np.median(lla, axis=0)
     local = local_from_lla(lla, origin_lla)
-    levelling = rotation_from_two_vectors(up_in_world, _UP)
+    levelling = rotation_from_two_vectors(up_in_world, UP)
     level = poses.centers[[idx for idx, _ in located]] @ levelling.T
     source, target = level[:, 0] + 1j * level[:, 2], local[:, 0] + 1j * local[:, 2]
     factor, shift = _fit_plane(source, target, gps_noise_m, rng=rng)

@@ -15,10 +15,8 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import UP, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
-
-_UP = np.array([0.0, -1.0, 0.0])
 
 
 @checks_settings
@@ -57,7 +55,7 @@ def level_poses(
         the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
     if origin_of_frame(poses.frame) is not None:
-        return poses, Vertical(_UP, reason="GPS has already turned it: x east, y down, z north")
+        return poses, Vertical(UP, reason="GPS has already turned it: x east, y down, z north")
     vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
     if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
         reason = (
@@ -67,7 +65,7 @@ def level_poses(
         vertical = replace(vertical, reason=reason)
     if not vertical:
         return poses, vertical
-    levelling = rotation_from_two_vectors(vertical.up_in_world, _UP)
+    levelling = rotation_from_two_vectors(vertical.up_in_world, UP)
     level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
     towards, heading = _northward(level, heading_deg or {})
     # Adding 0 turns −0 into 0: the first camera is exactly at the origin.

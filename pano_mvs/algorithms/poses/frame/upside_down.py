@@ -24,10 +24,9 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import (
     up_from_lines,
 )
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
+from pano_mvs.geometry import UP, ray_grid, rotate_panorama, rotation_from_two_vectors
 from pano_mvs.scene import Poses
 
-_UP = np.array([0.0, -1.0, 0.0])
 _SIZE_HW = (256, 512)
 # Pictures are compared between these elevations: beyond furniture, up to the tripod.
 _BAND_DEG = (55.0, 80.0)
@@ -65,10 +64,10 @@ def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[F
         valid: (H, W) bool; masked (False) pixels do not count.
     """
     segments = find_segments({"": lambda: (image, valid)}, {"": np.eye(3)})
-    lines = up_from_lines(segments.nearly_vertical(_UP, groups=SIDES), _UP)
-    own = lines.up if lines else _UP
+    lines = up_from_lines(segments.nearly_vertical(UP, groups=SIDES), UP)
+    own = lines.up if lines else UP
     axes = orthogonal_directions(segments)
-    turned = np.zeros((0, 3)) if axes is None else axes[np.abs(axes @ _UP) < np.cos(np.radians(LEVEL_DEG))]
+    turned = np.zeros((0, 3)) if axes is None else axes[np.abs(axes @ UP) < np.cos(np.radians(LEVEL_DEG))]
     ends = np.concatenate([[own, -own], turned, -turned])
     prior = np.full(len(ends), (1 - _LEVEL) / max(1, 2 * len(turned)))
     prior[:2] = _LEVEL * (_OUTSIDE if len(turned) == 3 else 1) * np.array([1, np.exp(PRIOR_LOG_ODDS)])
@@ -139,7 +138,7 @@ def _reduced(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[NDArra
 
 def _in_picture(small: NDArray[np.uint8], mask: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
     """Return the differences of brightness and texture, (2,); 0 where too little is valid both below and above."""
-    turn = rotation_from_two_vectors(up_in_cam, _UP)
+    turn = rotation_from_two_vectors(up_in_cam, UP)
     level = rotate_panorama(small, turn)
     is_valid = rotate_panorama(mask, turn) > 254
     # Logarithms of noise in black and of grain in plain surfaces say nothing.

@@ -20,7 +20,7 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import (
 )
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import angle_between
+from pano_mvs.geometry import UP, angle_between
 from pano_mvs.scene import Poses
 
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
@@ -28,7 +28,6 @@ Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 SURE = 0.8
 """Probability from which a capture is taken to be upside down. Of upright ones that were measured, none reaches .01."""
 
-_UP = np.array([0.0, -1.0, 0.0])
 # Errors that all sensors of a type, or all cameras of one person, have in common; that of a single reading.
 _SENSOR_BIAS_DEG, _CAMERA_BIAS_DEG, _SINGLE_READING_DEG = 0.5, 1.0, 1.0
 # Of the median of the angles between directions and their mean, in terms of the standard deviation of the direction.
@@ -120,7 +119,7 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
     """Return the robust mean of the cameras' up directions: panoramas are taken with the camera nearly upright."""
     if len(poses.names) < 2:
         return _unknown("a single camera does not determine the vertical")
-    up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ _UP)
+    up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ UP)
     disagreement_deg = float(np.median(deviations_deg))
     # Cameras whose up directions differ by more than this were not held upright.
     if disagreement_deg > 20.0:
@@ -215,7 +214,7 @@ def _of_one_camera(poses: Poses) -> Vertical:
     if not poses.names:
         return _unknown("there is no camera")
     # How far from upright a single camera is usually held.
-    return Vertical(poses.rotations[0].T @ _UP, "cameras", "a single camera", 2.0)
+    return Vertical(poses.rotations[0].T @ UP, "cameras", "a single camera", 2.0)
 
 
 def _too_far(up: FloatArray, prior: Vertical, what: str) -> str:
@@ -232,4 +231,4 @@ def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) 
 
 
 def _unknown(reason: str) -> Vertical:
-    return Vertical(_UP, reason=reason)
+    return Vertical(UP, reason=reason)

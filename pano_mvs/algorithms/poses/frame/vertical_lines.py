@@ -19,12 +19,11 @@ from pano_mvs.algorithms.faces.render import face_image, face_mask
 from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
+from pano_mvs.geometry import UP, PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
 
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
 
-_UP = np.array([0.0, -1.0, 0.0])
 _FOV_DEG = 90.0
 SIDES = 4
 """Views of a panorama around the horizon; the other two look up and down."""
@@ -82,7 +81,7 @@ def find_segments(
     for idx in chosen:
         rotation = rotations[names[idx]]
         image, valid = pictures[names[idx]]()
-        level_from_cam = np.eye(3) if up is None else rotation_from_two_vectors(rotation @ up, _UP)
+        level_from_cam = np.eye(3) if up is None else rotation_from_two_vectors(rotation @ up, UP)
         sides = CUBE_ROTATIONS if up is None else CUBE_ROTATIONS[:SIDES]
         for normals_in_cam, lengths in _in_panorama(image, valid, [side @ level_from_cam for side in sides]):
             found.append((normals_in_cam @ rotation, lengths))
@@ -134,7 +133,7 @@ def orthogonal_directions(segments: Segments) -> FloatArray | None:
         return None
     angles = np.deg2rad(np.arange(0.0, 90.0))
     across = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
-    across = across @ rotation_from_two_vectors(_UP, first.up).T
+    across = across @ rotation_from_two_vectors(UP, first.up).T
     along = np.cross(first.up, across)
     best = int(np.argmax(sum(_support(segments, each, tolerance_deg) for each in (across, along))))
     return np.array([first.up, across[best], along[best]])
