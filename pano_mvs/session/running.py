@@ -66,11 +66,7 @@ class Execution:
 
 
 def _check_not_merged(out: Path) -> None:
-    """Check that a run does not replace the run.json and the report of merged blocks.
-
-    Raises:
-        UsageError: if the folder holds merged blocks.
-    """
+    """Check that a run does not replace the run.json and the report of merged blocks."""
     try:
         merged = RunSummary.read(out).merged
     except InputError:

@@ -412,9 +412,6 @@ def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
     """Yield the cloud in cloud.ply, with its arrays in files, and a folder that is deleted afterwards.
 
     Points of blocks that do not state how many views agree on them count as confirmed.
-
-    Raises:
-        StoreError: if the arrays cannot be written.
     """
     with ExitStack() as stack:
         try:
