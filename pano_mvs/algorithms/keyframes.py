@@ -269,7 +269,9 @@ class _Selector:
                 # The frames after the chosen one are compared with it.
                 later = self.candidates if self.last is None else self.seen
                 waiting.extendleft(reversed([other for other in later if other.time_s > chosen.time_s]))
-                self._begin_at(chosen)
+                self.last = chosen
+                self.tracker.anchor(chosen.grey)
+                self.candidates, self.seen, self.lost_since = [], [], None
                 yield chosen
 
     def finish(self) -> Iterator[SmallFrame]:
@@ -329,8 +331,3 @@ class _Selector:
         needed = 0.9 * max(frame.sharpness for frame in self.candidates)  # of the sharpness of the sharpest candidate
         sharp = [frame for frame in self.candidates if frame.sharpness >= needed]
         return min(sharp, key=lambda frame: (abs(frame.parallax_deg - self.settings.parallax_deg), frame.time_s))
-
-    def _begin_at(self, keyframe: SmallFrame) -> None:
-        self.last = keyframe
-        self.tracker.anchor(keyframe.grey)
-        self.candidates, self.seen, self.lost_since = [], [], None

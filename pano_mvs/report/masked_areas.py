@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.core.arrays import Mask
@@ -201,9 +200,6 @@ def _picture(values: StoredValues, kept: EarlierPage, name: str, *, masks: Stati
         return None
     for kind in KINDS:
         if kind.name in kinds:
-            _tint(image, _nearest(kinds[kind.name], (image.shape[0], image.shape[1])), kind.color_rgb)
+            pixels = _nearest(kinds[kind.name], (image.shape[0], image.shape[1]))
+            image[pixels] = 0.5 * image[pixels] + 0.5 * np.array(kind.color_rgb, np.float32)
     return picture(image.astype(np.uint8), width=_WIDTH, most_bytes=MAX_BYTES, key=key)
-
-
-def _tint(image: NDArray[np.float32], pixels: Mask, color_rgb: Sequence[int]) -> None:
-    image[pixels] = 0.5 * image[pixels] + 0.5 * np.array(color_rgb, np.float32)

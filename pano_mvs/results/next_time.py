@@ -148,7 +148,12 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
         if group is None:
             continue
         _spacing(group, found)
-        _doubtful(group, found)
+        for idx, name in enumerate(group.names):
+            if name in group.poses.doubts:
+                reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
+                _stand_between(
+                    group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason
+                )
         _weak(group, summary, found)
         _loose(group, found)
         _lonely(group, found)
@@ -309,13 +314,6 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     found.add(
         _Severity.SPACING, Suggestion(f"Take panoramas {low}–{high} {group.unit} apart.", (reason,), group.number)
     )
-
-
-def _doubtful(group: CameraGroup, found: _Collected) -> None:
-    for idx, name in enumerate(group.names):
-        if name in group.poses.doubts:
-            reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
-            _stand_between(group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason)
 
 
 def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:

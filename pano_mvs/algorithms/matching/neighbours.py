@@ -329,7 +329,11 @@ def sample_matches(
     compare = _comparison(samples)
     for first, second in np.argwhere(listed).tolist():
         if _comparable(samples[first], samples[second]):
-            matches[first, second] = _count_matches(compare(first, second))
+            found = compare(first, second)
+            distinct = found.squared < np.float32(0.8**2) * found.next_squared
+            matches[first, second] = int(
+                np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest]))
+            )
     return matches + matches.T
 
 
@@ -344,10 +348,3 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
 def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
     """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
     return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
-
-
-def _count_matches(found: NearestTwo) -> int:
-    """Return the number of mutual nearest neighbours that pass the ratio test."""
-    # Threshold of the ratio test of Lowe 2004, section 7.1.
-    distinct = found.squared < np.float32(0.8**2) * found.next_squared
-    return int(np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest])))

@@ -134,9 +134,12 @@ class BlobStore:
             return self._put_file(part)
         if isinstance(part, np.ndarray):
             return self._put_array(part)
-        return self._put_bytes(
-            json.dumps(part, sort_keys=True, separators=(",", ":"), allow_nan=False).encode(), ".json"
-        )
+        data = json.dumps(part, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+        ref = BlobRef(digest_from_bytes(data), len(data), ".json")
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
+                temporary.write_bytes(data)
+        return ref
 
     def get(self, ref: BlobRef) -> Part:
         """Return a stored part; arrays are read-only, and large ones are memory-mapped.
@@ -228,13 +231,6 @@ class BlobStore:
             raise self.discard(ref, "is damaged or missing")
         self._verified.add(ref)
         return place
-
-    def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
-        ref = BlobRef(digest_from_bytes(data), len(data), suffix)
-        if not self._keep(ref):
-            with self._writing(ref) as temporary:
-                temporary.write_bytes(data)
-        return ref
 
     def _put_array(self, array: NDArray[Any]) -> BlobRef:
         """Store an array as .npy without a second copy of it in memory."""

@@ -126,11 +126,18 @@ class Run:
             KeyboardInterrupt: if the user interrupts; running units get some time to finish.
         """
         self.publisher.earlier = dict(earlier_files or {})
-        self._warn_of_timeouts()
+        names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]
+        if names and not self.executor.enforces_timeouts:
+            self.warn(
+                f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
+                "Use --executor processes"
+            )
         try:
             self._execute_passes()
             self._has_passed = True
-            self._warn_of_unused_refresh()
+            for unit in self.options.refresh:
+                if ":" in unit and unit not in self.refreshed:
+                    self.warn(f"--refresh {unit}: nothing was computed again, because no unit of that name was reached")
             if not self.result.stopped and not self.graph.is_part:
                 self.result.removed = self.publisher.remove_stale(self.publisher.earlier, complete=self.result.complete)
         except KeyboardInterrupt:
@@ -247,19 +254,6 @@ class Run:
             self.observer(Warned(f"{text}; interrupt again to stop at once"))
             while self.dispatcher and (left := deadline - time.monotonic()) > 0:
                 self.dispatcher.next_finished(left)
-
-    def _warn_of_timeouts(self) -> None:
-        names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]
-        if names and not self.executor.enforces_timeouts:
-            self.warn(
-                f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
-                "Use --executor processes"
-            )
-
-    def _warn_of_unused_refresh(self) -> None:
-        for unit in self.options.refresh:
-            if ":" in unit and unit not in self.refreshed:
-                self.warn(f"--refresh {unit}: nothing was computed again, because no unit of that name was reached")
 
 
 class RunPass:

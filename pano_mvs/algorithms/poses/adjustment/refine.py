@@ -224,7 +224,10 @@ def _adjusted(
             max_iterations=settings.max_iterations,
             tolerance=_TOLERANCES[round_idx - rounds] if widen == 1 else _TOLERANCES[0],
         )
-    return _without_outliers(bundle, colors, max_error_rad=max_error_rad)
+    # Drop observations with large errors, then points with fewer than two observations.
+    used = bundle.errors_rad() <= max_error_rad
+    valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
+    return _selected(bundle, colors, used & valid[bundle.point_idx], valid=valid)
 
 
 def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, *, neighbour: int) -> Poses:
@@ -299,15 +302,6 @@ def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float)
         min_angle_rad=float(np.deg2rad(1.0)),
     )
     return _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
-
-
-def _without_outliers(
-    bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float
-) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Drop observations with large errors, then points with fewer than two observations."""
-    used = bundle.errors_rad() <= max_error_rad
-    valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
-    return _selected(bundle, colors, used & valid[bundle.point_idx], valid=valid)
 
 
 def _selected(
