@@ -105,7 +105,10 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         if name in copies:
             copy = copies[name]
             turned = f", turned by {copy.turn_deg:.0f}°" if copy.turn_deg else ""
-            problem = f"it is a copy of {copy.original}{turned}, which is used alone, as a copy adds nothing; remove one of them"
+            problem = (
+                f"it is a copy of {copy.original}{turned}, which is used alone, as a copy adds nothing; "
+                "remove one of them"
+            )
         yield SourceItem(name, files, problem, (*unread, *_notes_on_masks(name, mask, params)))
 
 

@@ -443,7 +443,7 @@ class Store:
                 "Choose another cache with --cache DIR"
             )
         self.folder_digits = _FOLDER_DIGITS[version]
-        mark = self.root / CACHE_MARK
+        mark = self.root / CACHE_MARK  # missing from caches of earlier versions
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
