@@ -30,9 +30,6 @@ from pano_mvs.geometry import (
 )
 from pano_mvs.scene import Poses
 
-# Images of two blocks are of one place if they are this near, in median steps of the path.
-_NEAR = 1.5
-
 
 def divide_capture(
     names: Sequence[str],
@@ -81,7 +78,8 @@ def _with_returns(
     known = [[idx for idx in sorted(stretch) if names[idx] in positions] for stretch in stretches]
     centers = [np.array([positions[names[idx]] for idx in own]).reshape(-1, 3) for own in known]
     steps = [np.linalg.norm(np.diff(own, axis=0), axis=1) for own in centers if len(own) > 1]
-    reach = _NEAR * float(np.median(np.concatenate(steps))) if steps else 0.0
+    # Images of two blocks are of one place if they are this near, in median steps of the path.
+    reach = 1.5 * float(np.median(np.concatenate(steps))) if steps else 0.0
     found = [set(stretch) for stretch in stretches]
     trees = [cKDTree(own) if len(own) else None for own in centers]
     for here, there in permutations(range(len(stretches)), 2):
@@ -101,10 +99,8 @@ def _with_returns(
 MIN_COMMON = 3
 """Number of common cameras that two blocks need."""
 
-_ROUNDS = 30
 # A rotation is compared with a position at this distance, in median distances between neighbouring cameras.
 _ARM = 3.0
-_LOSS_SCALE = 0.02  # in median distances between neighbouring cameras
 
 
 @dataclass(frozen=True)
@@ -192,7 +188,7 @@ def similarity_from_cameras(source: Sequence[Rigid3], target: Sequence[Rigid3]) 
     before, after = _reference_points(source), _reference_points(target)
     weights = np.ones(len(before))
     found = Similarity3(1.0, np.eye(3), np.zeros(3))
-    for _ in range(_ROUNDS):
+    for _ in range(30):
         found = _weighted_similarity(before, after, weights)
         errors = np.linalg.norm(found.apply(before) - after, axis=-1).max(axis=1)
         weights = 1 / (errors + 1e-9 + 0.01 * float(np.median(errors)))
@@ -285,8 +281,9 @@ def _adjusted(
     # Each block is turned about the origin of the world; lengths of the world are of the order of its extent.
     extent = max(float(np.abs(start[a].apply(centers[0])).max()) for a, _, centers, _, _ in pairs)
     sizes = np.tile([1.0, 1.0, 1.0, 1.0, extent, extent, extent], len(free))
+    # In median distances between neighbouring cameras.
     solution = least_squares(
-        residuals, np.zeros(7 * len(free)), loss="cauchy", f_scale=_LOSS_SCALE, x_scale=sizes, xtol=1e-12, ftol=1e-12
+        residuals, np.zeros(7 * len(free)), loss="cauchy", f_scale=0.02, x_scale=sizes, xtol=1e-12, ftol=1e-12
     )
     return unpacked(solution.x)
 
@@ -303,12 +300,6 @@ def _link(
     turns = np.array([geodesic_angle(a.rotation, b.rotation) for a, b in zip(first, second, strict=True)])
     offsets = np.linalg.norm(centers[0] - centers[1], axis=1)
     return BlockLink(*pair, names, offsets, turns, camera_spacing(centers[0]))
-
-
-# Two observations in one image within this angle are of the same point; patch alignment moves them differently in
-# different blocks.
-_SAME_RAD = float(np.radians(0.03))
-_MAX_ERROR_RAD = float(np.radians(0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,7 +444,7 @@ def _with_points(merged: Poses, blocks: Sequence[Poses], world_from_block: Seque
     point_idx, image_idx, bearings = point_idx[first], everything.image_idx[first], everything.bearings[first]
     in_cam = np.einsum("tij,tj->ti", merged.rotations[image_idx], points[point_idx] - merged.centers[image_idx])
     errors = angle_between(in_cam, bearings)
-    used = errors <= _MAX_ERROR_RAD
+    used = errors <= float(np.radians(0.5))
     seen = np.bincount(point_idx[used], minlength=count) >= 2
     used &= seen[point_idx]
     totals = np.bincount(point_idx[used], errors[used], count)
@@ -499,7 +490,9 @@ def _joined_points(found: _Observations) -> tuple[NDArray[np.intp], NDArray[np.i
     links = []
     for of_image in np.split(order, starts[1:]):
         if len(of_image) > 1:
-            close = cKDTree(found.bearings[of_image]).query_pairs(_SAME_RAD, output_type="ndarray")
+            # Two observations in one image within this angle are of the same point; patch alignment moves them
+            # differently in different blocks.
+            close = cKDTree(found.bearings[of_image]).query_pairs(float(np.radians(0.03)), output_type="ndarray")
             pairs = found.point_idx[of_image][close]
             links.append(pairs[found.block_of_point[pairs[:, 0]] != found.block_of_point[pairs[:, 1]]])
     joined = np.concatenate(links) if links else np.zeros((0, 2), np.intp)

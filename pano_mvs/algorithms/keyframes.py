@@ -20,27 +20,16 @@ REDUCED_HW = (128, 256)
 
 _PAD = 24  # columns that are repeated on each side of the seam
 _MAX_POINTS, _MIN_DISTANCE, _QUALITY = 160, 6, 0.005
-_MAX_LATITUDE_DEG = 50.0
 _WINDOW = (11, 11)
-_MAX_RETURN_PX = 0.7
-_LARGE_TURN_RAD = float(np.radians(3))
-_ROUNDS = 3
-_FIT_ROUNDS = 5
 _FIT_SCALE_RAD = float(np.radians(0.5))
-_RECOVERY_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of the camera since the anchor.
+    """The motion of the camera since the anchor."""
 
-    Attributes:
-        parallax_rad: median angle by which points of the scene moved, without the rotation of the camera.
-        seen_share: share of the points of the anchor that were found again.
-    """
-
-    parallax_rad: float
-    seen_share: float
+    parallax_rad: float  # median angle by which points of the scene moved, without the rotation of the camera
+    seen_share: float  # share of the points of the anchor that were found again
 
 
 class ParallaxTracker:
@@ -56,7 +45,7 @@ class ParallaxTracker:
 
     def __init__(self, mask: NDArray[np.bool_] | None = None) -> None:
         rays = ray_grid(REDUCED_HW)
-        usable = np.abs(np.arcsin(rays[..., 1])) < np.radians(_MAX_LATITUDE_DEG)
+        usable = np.abs(np.arcsin(rays[..., 1])) < np.radians(50.0)
         if mask is not None:
             usable &= mask
         self._usable = np.zeros((REDUCED_HW[0], REDUCED_HW[1] + 2 * _PAD), np.uint8)
@@ -90,7 +79,7 @@ class ParallaxTracker:
             return Motion(0.0, 0.0)
         start = self._cam_from_anchor, self._guess
         motion = self._measured(grey)
-        if motion.seen_share < _RECOVERY_SHARE:
+        if motion.seen_share < 0.5:
             # Perhaps the camera turned quickly: begin again at the heading at which both frames look alike.
             self._cam_from_anchor = start[0] @ _heading(_turned(grey, start[0], self._rays), self._template)
             self._guess = self._bearings
@@ -102,7 +91,7 @@ class ParallaxTracker:
 
     def _measured(self, grey: GreyImage) -> Motion:
         parallax, share = 0.0, 0.0
-        for _ in range(_ROUNDS):
+        for _ in range(3):
             found, is_found = self._tracked(_padded(_turned(grey, self._cam_from_anchor, self._rays)))
             share = float(is_found.mean())
             if is_found.sum() < 8:
@@ -112,7 +101,7 @@ class ParallaxTracker:
             parallax = float(np.median(residuals))
             self._cam_from_anchor = nearest_rotation(self._cam_from_anchor @ turn)
             self._guess = np.where(is_found[:, None], found @ turn, self._guess)
-            if float(geodesic_angle(turn, np.eye(3))) < _LARGE_TURN_RAD:
+            if float(geodesic_angle(turn, np.eye(3))) < float(np.radians(3)):
                 break
         return Motion(parallax, share)
 
@@ -126,7 +115,7 @@ class ParallaxTracker:
         before = np.ascontiguousarray(self._corners)
         after, there = _flow(self._template, image, before, guess=guess.astype(np.float32))
         back, here = _flow(image, self._template, after, guess=before.copy())
-        returned = np.linalg.norm(back - self._corners, axis=1) < _MAX_RETURN_PX
+        returned = np.linalg.norm(back - self._corners, axis=1) < 0.7
         inside = (after[:, 1] > 0) & (after[:, 1] < REDUCED_HW[0] - 1)
         return _bearings(after), there & here & returned & inside
 
@@ -193,21 +182,13 @@ def _robust_rotation(before: FloatArray, after: FloatArray) -> FloatArray:
     """
     weights = np.ones(len(before))
     turn = np.eye(3)
-    for _ in range(_FIT_ROUNDS):
+    for _ in range(5):
         turn = nearest_rotation((after * weights[:, None]).T @ before)
         weights = 1 / (_FIT_SCALE_RAD + angle_between(before @ turn.T, after))
     return turn
 
 
-# A keyframe is chosen among the frames whose parallax is between these multiples of the wanted one.
-_OPENS, _CLOSES = 0.7, 1.25
-_MAX_WAIT_S = 1.0  # the first possible frame waits at most this time for sharper ones
-_FIRST_S = 0.4  # the first keyframe is among the frames of this time
 _LOST_SHARE = 0.3
-_LOST_S = 0.5  # frames without known points for this time show another place
-_SHARP_SHARE = 0.9  # of the sharpness of the sharpest candidate
-_MIN_POINTS = 30
-_LATE_S = 0.1  # frames this shortly before the maximum time may be chosen, too
 _EPSILON_S = 1e-6
 _BY_TIME_S = 1.0  # between keyframes if there is nothing to measure motion by
 
@@ -288,7 +269,9 @@ class _Selector:
                 # The frames after the chosen one are compared with it.
                 later = self.candidates if self.last is None else self.seen
                 waiting.extendleft(reversed([other for other in later if other.time_s > chosen.time_s]))
-                self._begin_at(chosen)
+                self.last = chosen
+                self.tracker.anchor(chosen.grey)
+                self.candidates, self.seen, self.lost_since = [], [], None
                 yield chosen
 
     def finish(self) -> Iterator[SmallFrame]:
@@ -300,7 +283,8 @@ class _Selector:
         """Return the keyframe that is complete with a frame, or None."""
         if self.last is None:
             self.candidates.append(frame)
-            return self._best() if frame.time_s - self.candidates[0].time_s >= _FIRST_S else None
+            # The first keyframe is among the frames of this time.
+            return self._best() if frame.time_s - self.candidates[0].time_s >= 0.4 else None
         frame, state = self._compared(frame, self.last)
         self.seen.append(frame)
         if state.may_be_chosen:
@@ -311,13 +295,14 @@ class _Selector:
             self.seen.clear()
         if not self.candidates:
             return None
-        has_waited = frame.time_s - self.candidates[0].time_s >= _MAX_WAIT_S
+        # The first possible frame waits at most this time for sharper ones.
+        has_waited = frame.time_s - self.candidates[0].time_s >= 1.0
         return self._best() if state.must_be_chosen or state.is_elsewhere or has_waited else None
 
     def _compared(self, frame: SmallFrame, last: SmallFrame) -> tuple[SmallFrame, _State]:
         """Return a frame with its parallax to the last keyframe, and what follows from it."""
         wanted_deg, since = self.settings.parallax_deg, frame.time_s - last.time_s
-        is_plain = self.tracker.points < _MIN_POINTS
+        is_plain = self.tracker.points < 30
         motion = self.tracker.measure(frame.grey)
         is_lost = not is_plain and motion.seen_share < _LOST_SHARE
         if not is_lost:
@@ -328,23 +313,21 @@ class _Selector:
         longest = min(_BY_TIME_S, self.settings.max_s or _BY_TIME_S) if is_plain else self.settings.max_s
         is_late = longest is not None and since >= longest - _EPSILON_S
         is_too_late = longest is not None and since > longest + _EPSILON_S and bool(self.candidates)
-        is_nearly_late = longest is not None and since >= longest - _LATE_S
+        # Frames this shortly before the maximum time may be chosen, too.
+        is_nearly_late = longest is not None and since >= longest - 0.1
         is_soon = since < self.settings.min_s - _EPSILON_S or is_too_late
-        is_elsewhere = self.lost_since is not None and frame.time_s - self.lost_since >= _LOST_S
+        # Frames without known points for this time show another place.
+        is_elsewhere = self.lost_since is not None and frame.time_s - self.lost_since >= 0.5
+        # A keyframe is chosen among the frames whose parallax is between these multiples of the wanted one.
         return replace(frame, parallax_deg=parallax), _State(
-            may_be_chosen=not is_soon and not is_lost and (parallax >= _OPENS * wanted_deg or is_nearly_late),
-            must_be_chosen=parallax >= _CLOSES * wanted_deg or is_late,
+            may_be_chosen=not is_soon and not is_lost and (parallax >= 0.7 * wanted_deg or is_nearly_late),
+            must_be_chosen=parallax >= 1.25 * wanted_deg or is_late,
             is_lost=is_lost,
             is_elsewhere=is_elsewhere and not is_soon,
         )
 
     def _best(self) -> SmallFrame:
         """Return the candidate nearest to the wanted parallax, of those that are about as sharp as the sharpest."""
-        needed = _SHARP_SHARE * max(frame.sharpness for frame in self.candidates)
+        needed = 0.9 * max(frame.sharpness for frame in self.candidates)  # of the sharpness of the sharpest candidate
         sharp = [frame for frame in self.candidates if frame.sharpness >= needed]
         return min(sharp, key=lambda frame: (abs(frame.parallax_deg - self.settings.parallax_deg), frame.time_s))
-
-    def _begin_at(self, keyframe: SmallFrame) -> None:
-        self.last = keyframe
-        self.tracker.anchor(keyframe.grey)
-        self.candidates, self.seen, self.lost_since = [], [], None

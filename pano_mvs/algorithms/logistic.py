@@ -18,16 +18,12 @@ class Term:
 
     The contribution falls piecewise linearly from one knot to the next and is constant beyond the last one on either
     side, so that no measurement, however extreme, counts for more than the draws that it was fitted on.
-
-    Attributes:
-        knots: (K) values from the worst to the best: increasing if more is better, otherwise decreasing.
-        losses: (K − 1) what is lost from each knot to the one before it; not negative.
-        missing: what is lost if it was not measured; not negative.
     """
 
+    # (K) values from the worst to the best: increasing if more is better, otherwise decreasing
     knots: tuple[float, ...]
-    losses: tuple[float, ...]
-    missing: float
+    losses: tuple[float, ...]  # (K − 1) what is lost from each knot to the one before it; not negative
+    missing: float  # what is lost if it was not measured; not negative
 
     def lost(self, values: FloatArray) -> FloatArray:
         """Return how far each value (N,) stays behind the best one on each step, (N, K), the last for missing ones."""
@@ -51,15 +47,10 @@ def steps_behind(values: FloatArray, knots: tuple[float, ...]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Model:
-    """The fitted model.
+    """The fitted model."""
 
-    Attributes:
-        intercept: logarithm of the odds where every measurement is the best.
-        terms: measurement to what it contributes.
-    """
-
-    intercept: float
-    terms: Mapping[str, Term]
+    intercept: float  # logarithm of the odds where every measurement is the best
+    terms: Mapping[str, Term]  # measurement to what it contributes
 
     def contributions(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return what each measurement of a row adds to the logarithm of the odds; 0 or less."""

@@ -15,12 +15,7 @@ from pano_mvs.scene import PointCloud
 
 # The nearest point of each cell and its neighbours hides points that are further away by more than this share.
 _CELLS, _HIDDEN = 200, 0.08
-_MIN_COSINE = 0.15
-# Colours fade in over this share of the shorter side, so that no edge of a photograph is seen.
-_BORDER = 0.06
 _MIN_POINTS = 200
-# Darker or brighter values are clipped or noisy.
-_DARKEST, _BRIGHTEST = 8.0, 247.0
 _EXPOSURE_ROUNDS, _EXPOSURE_SCALE = 8, 0.1
 _CORRELATED = (0.8, 0.95)
 _CONTRAST_BOUNDS, _GAIN_BOUNDS = (0.6, 1.6), (0.3, 3.0)
@@ -73,7 +68,8 @@ class PhotographColors:
         self._sums[seen] += weights[:, None] * corrected
         self._weights[seen] += weights
         to_border = np.minimum(pixels, np.array(size_hw[::-1]) - pixels).min(axis=1) / min(size_hw)
-        self._shares[seen] = np.maximum(self._shares[seen], np.clip(to_border / _BORDER, 0, 1))
+        # Colours fade in over this share of the shorter side, so that no edge of a photograph is seen.
+        self._shares[seen] = np.maximum(self._shares[seen], np.clip(to_border / 0.06, 0, 1))
         return len(seen)
 
     @property
@@ -109,7 +105,7 @@ def _visible(
     np.minimum.at(nearest, (row, column), distance.astype(np.float32))
     nearest = np.asarray(cv2.erode(nearest, np.ones((3, 3), np.uint8)), np.float32)
     cosine = (cloud.normals_in_world[inside] * view).sum(axis=1) / distance
-    open_to = (distance <= (1 + _HIDDEN) * nearest[row, column]) & (cosine > _MIN_COSINE)
+    open_to = (distance <= (1 + _HIDDEN) * nearest[row, column]) & (cosine > 0.15)
     weights = cosine * (camera.focal_px / distance) ** 2
     return inside[open_to], pixels[open_to], weights[open_to]
 
@@ -139,7 +135,8 @@ def _sampled(
 
 def _exposure(colors: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return gains and contrasts (3,) with own ≈ 255 gain (color / 255)^contrast, by a robust fit of the logarithms."""
-    usable = (np.minimum(colors, own).min(axis=1) > _DARKEST) & (np.maximum(colors, own).max(axis=1) < _BRIGHTEST)
+    # Darker or brighter values are clipped or noisy.
+    usable = (np.minimum(colors, own).min(axis=1) > 8.0) & (np.maximum(colors, own).max(axis=1) < 247.0)
     gains, contrasts = np.ones(3), np.ones(3)
     if usable.sum() < _MIN_POINTS:
         return gains, contrasts
@@ -171,9 +168,6 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 _ROUNDS = 50
 _ROWS_AT_ONCE = 64
-_MIN_SCALE = 0.5
-# The distortion moves directions beyond a radius back towards the centre; this share of the radius is used.
-_BEFORE_FOLD = 0.99
 
 
 def undistorted_photograph(
@@ -205,8 +199,9 @@ def undistorted_photograph(
 def _focal_px(half: NDArray[np.float64], focal_px: float, radial: float) -> float:
     """Return the focal length of the pinhole picture, by bisection: a longer one shows less."""
     diagonal = float(np.hypot(*half))
-    unfolded = diagonal * float(np.sqrt(3 * max(-radial, 0))) / _BEFORE_FOLD
-    low = max(_MIN_SCALE * focal_px, unfolded)
+    # The distortion moves directions beyond a radius back towards the centre; this share of the radius is used.
+    unfolded = diagonal * float(np.sqrt(3 * max(-radial, 0))) / 0.99
+    low = max(0.5 * focal_px, unfolded)
     high = max(focal_px * (1 + max(radial, 0) * (diagonal / focal_px) ** 2), low)
     if _is_inside(half / low, half / focal_px, radial):
         return low

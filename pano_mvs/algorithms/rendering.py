@@ -11,7 +11,6 @@ from pano_mvs.core.arrays import FloatArray
 
 _OUTSIDE_AZIMUTH_RAD, _OUTSIDE_ELEVATION_RAD = np.deg2rad(35.0), np.deg2rad(42.0)
 _OUTSIDE_FOV_DEG = 36.0
-_AWAY = -0.05  # cosine: surfaces seen nearly edge-on stay, because noisy normals would tear them
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,8 @@ def facing(points: NDArray[np.float32], normals: NDArray[np.float32], viewpoint:
     else:
         towards = viewpoint.eye.astype(np.float32) - points
     length = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
-    shown: NDArray[np.bool_] = np.einsum("ni,ni->n", towards, normals) >= _AWAY * length
+    # Cosine: surfaces seen nearly edge-on stay, because noisy normals would tear them.
+    shown: NDArray[np.bool_] = np.einsum("ni,ni->n", towards, normals) >= -0.05 * length
     return shown
 
 
@@ -92,7 +92,6 @@ def _inside(centers: FloatArray, middle: FloatArray, up: FloatArray, *, place: s
 
 
 _PAPER = (238, 241, 244)
-_MAX_POINT_PX = 5
 
 
 def draw_cloud(
@@ -116,7 +115,7 @@ def draw_cloud(
     # Far points first: of several writes to a pixel, the last one stays.
     order = np.argsort(-depth[inside], kind="stable")
     image = np.full((size_hw[0] * size_hw[1], 3), _PAPER, np.uint8)
-    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, _MAX_POINT_PX))
+    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, 5))
     nearest = np.full(image.shape[0], np.inf)
     nearest[pixel[order]] = depth[inside][order]
     image[pixel[order]] = colors_rgb[shown][inside][order]

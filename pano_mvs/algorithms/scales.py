@@ -25,16 +25,8 @@ from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
-# The contrast of the detail between two resolutions over that of the detail between the lower one and the next: 0.6 to
-# 0.9 for sharp pictures, 0.3 after a blur of a pixel. After more blur, noise hides that the finest detail is gone; but
-# then little is left of the next one, too.
-_LEAST_DETAIL, _LEAST_NEXT_DETAIL = 0.3, 0.4
 # Details are compared where the picture has most texture, because elsewhere they are noise.
 _BLOCK_PX, _TEXTURED_SHARE = 16, 0.25
-# The plainest blocks contain nothing but noise.
-_PLAIN_SHARE = 0.1
-# Panoramas are not reduced below this width.
-_MIN_WIDTH = 512
 _MAX_HALVINGS = 2
 # Pixels on one surface differ by less than this share of their range.
 _SURFACE_STEP = 0.025
@@ -58,8 +50,12 @@ def sharp_halvings(picture: Picture) -> int:
     contrast = [_relative_detail(fine, coarse) for fine, coarse in pairwise(details)]
     for halvings in range(_MAX_HALVINGS):
         factor = 2 << halvings
-        is_small = height % factor or width % (2 * factor) or width < factor * _MIN_WIDTH
-        if is_small or (contrast[halvings] >= _LEAST_DETAIL and contrast[halvings + 1] >= _LEAST_NEXT_DETAIL):
+        # Panoramas are not reduced below this width.
+        is_small = height % factor or width % (2 * factor) or width < factor * 512
+        # The contrast of the detail between two resolutions over that of the detail between the lower one and the next:
+        # 0.6 to 0.9 for sharp pictures, 0.3 after a blur of a pixel. After more blur, noise hides that the finest
+        # detail is gone; but then little is left of the next one, too.
+        if is_small or (contrast[halvings] >= 0.3 and contrast[halvings + 1] >= 0.4):
             return halvings
     return _MAX_HALVINGS
 
@@ -186,7 +182,8 @@ def _relative_detail(fine: FloatImage, coarse: FloatImage) -> float:
     finer, coarser = finer[: shape[0], : shape[1]], coarser[: shape[0], : shape[1]]
     textured = coarser >= np.quantile(coarser, 1 - _TEXTURED_SHARE)
     energy = float(coarser[textured].mean())
-    noise = float(np.quantile(finer, _PLAIN_SHARE))
+    # The plainest blocks contain nothing but noise.
+    noise = float(np.quantile(finer, 0.1))
     return float(np.sqrt(max(float(finer[textured].mean()) - noise, 0.0) / energy)) if energy > 0 else 1.0
 
 
@@ -197,9 +194,6 @@ def _energy(detail: FloatImage, side: int) -> FloatImage:
     return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
 
 
-# At fewer columns, a window of a few pixels spans several degrees: furniture melts into blobs.
-_MIN_COARSE_WIDTH = 1024
-_MAX_LEVELS = 3
 # Detail is measured within this many pixels; less than this multiple of the noise is noise.
 _RADIUS_PX, _DETAIL_OVER_NOISE = 7, 3.0
 # The plainest pixels contain only noise. Those with less, in grey levels, are overexposed or painted.
@@ -210,7 +204,8 @@ def coarser_levels(size_hw: tuple[int, int]) -> int:
     """Return how often a panorama can be halved to 1024 columns or more, at most three times."""
     height, width = size_hw
     levels = 0
-    while levels < _MAX_LEVELS and width >> (levels + 1) >= _MIN_COARSE_WIDTH and not (height | width) & (1 << levels):
+    # At fewer columns, a window of a few pixels spans several degrees: furniture melts into blobs.
+    while levels < 3 and width >> (levels + 1) >= 1024 and not (height | width) & (1 << levels):
         levels += 1
     return levels
 

@@ -14,8 +14,6 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import FisheyeLens, LensRig, ray_from_pixel, ray_grid
 
 _SIZE_HW = (128, 256)
-_DARK, _BRIGHT = 24, 40
-_MIN_DARK_SHARE = 0.97
 
 
 def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
@@ -32,13 +30,9 @@ def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
     inside, outside = np.tile(radius < 0.9, 2), np.tile(radius > 1.1, 2)
     upper, lower = outside.copy(), outside.copy()
     upper[_SIZE_HW[0] // 2 :] = lower[: _SIZE_HW[0] // 2] = False
-    dark = grey < _DARK
-    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _MIN_DARK_SHARE
-    return bool(is_dark_around and np.median(grey[inside]) > _BRIGHT)
-
-
-# Pictures with more pixels per radian than this times those of the panorama are reduced first, against aliasing.
-_MAX_DENSITY = 1.25
+    dark = grey < 24
+    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > 0.97
+    return bool(is_dark_around and np.median(grey[inside]) > 40)
 
 
 def stitch_lenses(
@@ -112,7 +106,8 @@ def lens_weights(margins_rad: FloatArray, *, blend_rad: float) -> FloatArray:
 def _reduced(picture: Picture, lens: FisheyeLens, width: int) -> tuple[Picture, FloatArray]:
     """Return the picture at about the resolution of the panorama, and its scale in x and y."""
     density = max(lens.focal_xy) / (width / (2 * np.pi))
-    if density <= _MAX_DENSITY:
+    # Pictures with more pixels per radian than this times those of the panorama are reduced first, against aliasing.
+    if density <= 1.25:
         return picture, np.ones(2)
     height, columns = (max(1, round(side / density)) for side in picture.shape[:2])
     reduced = np.asarray(cv2.resize(picture, (columns, height), interpolation=cv2.INTER_AREA), np.uint8)

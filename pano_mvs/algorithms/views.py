@@ -15,14 +15,10 @@ from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses, Views
 from pano_mvs.scene.pose_groups import split_groups
 
-# With fewer shared points than this, the overlap of two images cannot be judged.
-_MIN_SHARED = 8
 # Triangulation angles around this one have full weight; in MVS practice the best compromise between precision and
 # similarity is here (Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", 2016, use
 # similar limits).
 _BEST_ANGLE_DEG = 12.0
-# Centres closer than this share of the extent of the capture are at the same place.
-_SAME_PLACE = 1e-9
 
 
 @checks_settings
@@ -66,7 +62,8 @@ def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg
     scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
     preference = _distance_ranks(distances)
     extent = float(distances.max(initial=0.0))
-    apart = distances > _SAME_PLACE * max(extent, 1e-300)
+    # Centres closer than this share of the extent of the capture are at the same place.
+    apart = distances > 1e-9 * max(extent, 1e-300)
     neighbours: dict[str, tuple[str, ...]] = {}
     for idx, name in enumerate(poses.names):
         usable = np.flatnonzero(apart[idx])
@@ -103,7 +100,8 @@ def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: f
     np.add.at(scores, (image_a, image_b), weight)
     np.add.at(shared, (image_a, image_b), weight > 0)
     scores, shared = scores + scores.T, shared + shared.T
-    return np.where(shared >= _MIN_SHARED, scores, 0.0)
+    # With fewer shared points than this, the overlap of two images cannot be judged.
+    return np.where(shared >= 8, scores, 0.0)
 
 
 def _angle_weight(angle_deg: FloatArray, min_angle_deg: float, max_angle_deg: float) -> FloatArray:

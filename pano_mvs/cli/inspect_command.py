@@ -79,7 +79,14 @@ class _Found:
 def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
         raise UsageError(f"({wanted.x}, {wanted.y}) is not a pixel: give its column and row as numbers")
-    sweep = _sweep_stage(session, wanted.stage)
+    sweeps = [stage for stage in session.graph.order if isinstance(session.workflow.stages[stage].params, SweepParams)]
+    if not sweeps:
+        raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
+    if wanted.stage and wanted.stage not in sweeps:
+        raise UsageError(
+            f"{wanted.stage!r} is not a depth.sweep stage of this workflow, which has: {', '.join(sweeps)}"
+        )
+    sweep = wanted.stage or sweeps[0]
     store = Store(session.store_root, for_reading=True)
     found = _Found()
     plans = make_plan(session.workflow, session.graph, store, visit=found.look)
@@ -90,15 +97,6 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     stages = [units[image] for units in found.units.values() if image in units]
     truth = wanted.truth or _truth_of(session, image)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
-
-
-def _sweep_stage(session: Session, name: str) -> str:
-    sweeps = [stage for stage in session.graph.order if isinstance(session.workflow.stages[stage].params, SweepParams)]
-    if not sweeps:
-        raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
-    if name and name not in sweeps:
-        raise UsageError(f"{name!r} is not a depth.sweep stage of this workflow, which has: {', '.join(sweeps)}")
-    return name or sweeps[0]
 
 
 def _image(wanted: str, names: Sequence[str]) -> str:

@@ -17,17 +17,11 @@ _unavailable: dict[tuple[str, str], str] = {}
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """The name under which a plugin registered a function.
+    """The name under which a plugin registered a function."""
 
-    Attributes:
-        kind: what the registry holds, in words: "sweep cost".
-        name: by which users choose it.
-        origin: where the function is defined, `file:line`.
-    """
-
-    kind: str
-    name: str
-    origin: str
+    kind: str  # what the registry holds, in words: "sweep cost"
+    name: str  # by which users choose it
+    origin: str  # where the function is defined, `file:line`
 
 
 class NamedRegistry(Generic[Value]):

@@ -173,7 +173,16 @@ class RangeFile:
             if name is None:
                 raise InputError(f"{self.path}: an EXR file without channels. Write it again")
             return channels[name]
-        return _read_image(self.path)
+        try:
+            data = self.path.read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be read ({error.strerror}). Check that it exists and may be read"
+            ) from error
+        array = decode_picture(data, self.path, cv2.IMREAD_UNCHANGED)
+        if array is None:
+            raise InputError(f"{self.path}: not an image that can be decoded ({len(data)} bytes). Write it again")
+        return np.asarray(array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,17 +269,6 @@ def _only_key(path: Path) -> str:
             "or give this file itself instead of its folder"
         )
     return key
-
-
-def _read_image(path: Path) -> NDArray[Any]:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    array = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
-    if array is None:
-        raise InputError(f"{path}: not an image that can be decoded ({len(data)} bytes). Write it again")
-    return np.asarray(array)
 
 
 def _positive_or_nan(array: NDArray[Any], unit: float) -> NDArray[np.float32]:

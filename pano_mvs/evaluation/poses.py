@@ -185,8 +185,6 @@ def _row(label: str, values: NDArray[np.float64], form: str) -> tuple[str, ...]:
 
 
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
-# Centres closer than this share of the capture's extent coincide: an image that occurs twice.
-_COINCIDENT_SHARE = 1e-6
 _ROUNDING = 1e-12  # of a centre's coordinates
 
 
@@ -302,7 +300,8 @@ def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float |
     translations = np.einsum("pij,pj->pi", rotations[second], centers[first] - centers[second])
     lengths = np.linalg.norm(translations, axis=1)
     extent = float(lengths.max(initial=0)) if extent is None else extent
-    apart = lengths > max(_COINCIDENT_SHARE * extent, _ROUNDING * float(np.abs(centers).max()))
+    # Centres closer than this share of the capture's extent coincide: an image that occurs twice.
+    apart = lengths > max(1e-6 * extent, _ROUNDING * float(np.abs(centers).max()))
     return _RelativePoses(rotations[second] @ rotations[first].swapaxes(1, 2), translations, lengths, apart)
 
 
@@ -316,11 +315,6 @@ def _world_errors(found: _RelativePoses, true: _RelativePoses) -> tuple[FloatArr
     direction_deg[both] = np.rad2deg(angle_between(found.translations[both], true.translations[both]))
     rotation_deg = np.rad2deg(geodesic_angle(found.rotations, true.rotations))
     return np.stack([rotation_deg, direction_deg], axis=1), found.lengths[both] / true.lengths[both]
-
-
-# Weight of the cameras' orientations against the spread of their centres. Enough to fix the turn about a line on which
-# all centres lie; negligible elsewhere.
-_ORIENTATION_SHARE = 1e-6
 
 
 def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> Similarity3:
@@ -357,7 +351,9 @@ def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
             raise UsageError(f"the {what} centres of all {len(names)} images coincide, so no scale can be estimated")
     covariance = (target - aim).T @ (source - middle) / (spread * true_spread)
     turns = [truth[name].rotation.T @ estimated[name].rotation for name in names]
-    rotation = nearest_rotation(covariance + _ORIENTATION_SHARE * np.mean(turns, axis=0))
+    # Weight of the cameras' orientations against the spread of their centres. Enough to fix the turn about a line on
+    # which all centres lie; negligible elsewhere.
+    rotation = nearest_rotation(covariance + 1e-6 * np.mean(turns, axis=0))
     scale = float(np.trace(rotation.T @ covariance)) * true_spread / spread
     return Similarity3(scale, rotation, aim - scale * rotation @ middle)
 

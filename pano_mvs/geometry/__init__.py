@@ -34,6 +34,7 @@ from pano_mvs.geometry.lens_rig import FisheyeLens, LensRig
 from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import pad_panorama, roll_panorama, rotate_panorama, sample_panorama
 from pano_mvs.geometry.sphere import (
+    UP,
     angle_between,
     pixel_from_ray,
     pixel_solid_angle,
@@ -60,6 +61,7 @@ from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_be
 kernel_cache.use_kernel_cache()
 
 __all__ = [
+    "UP",
     "FisheyeLens",
     "LensRig",
     "PinholeView",

@@ -27,21 +27,13 @@ _EXACT = 1e-14
 
 @dataclass(frozen=True, slots=True)
 class FisheyeLens:
-    """A lens of the Kannala–Brandt model with its picture.
+    """A lens of the Kannala–Brandt model with its picture."""
 
-    Attributes:
-        size_hw: (height, width) of the picture.
-        focal_xy: (fx, fy) in pixels per radian at the axis.
-        principal_xy: (cx, cy), the pixel of the axis; (0, 0) is the upper-left corner of the picture.
-        distortion: k1, k2, k3, k4.
-        max_angle_rad: largest angle from the axis that the lens sees, half of its field of view.
-    """
-
-    size_hw: tuple[int, int]
-    focal_xy: tuple[float, float]
-    principal_xy: tuple[float, float]
-    distortion: tuple[float, float, float, float]
-    max_angle_rad: float
+    size_hw: tuple[int, int]  # (height, width) of the picture
+    focal_xy: tuple[float, float]  # (fx, fy) in pixels per radian at the axis
+    principal_xy: tuple[float, float]  # (cx, cy), the pixel of the axis; (0, 0) is the upper-left corner of the picture
+    distortion: tuple[float, float, float, float]  # k1, k2, k3, k4
+    max_angle_rad: float  # largest angle from the axis that the lens sees, half of its field of view
 
     def __post_init__(self) -> None:
         """Raise UsageError if the lens is impossible, or its pixels are not unique within the field of view."""
@@ -138,21 +130,15 @@ class FisheyeLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensRig:
-    """Two fisheye lenses that are fixed to each other, and the distance at which they are stitched.
-
-    Attributes:
-        lens_from_rig: pose of each lens, in metres; the mean of their centres is the origin of the rig.
-        stitch_distance_m: D, may be inf.
-        blend_deg: width of the strip around the seam in which the panorama mixes both pictures.
-        metric: whether the distance between the lenses was measured; if not, only its direction is known.
-    """
+    """Two fisheye lenses that are fixed to each other, and the distance at which they are stitched."""
 
     names: tuple[str, str]
     lenses: tuple[FisheyeLens, FisheyeLens]
+    # pose of each lens, in metres; the mean of their centres is the origin of the rig
     lens_from_rig: tuple[Rigid3, Rigid3]
-    stitch_distance_m: float = float("inf")
-    blend_deg: float = 2.0
-    metric: bool = True
+    stitch_distance_m: float = float("inf")  # D, may be inf
+    blend_deg: float = 2.0  # width of the strip around the seam in which the panorama mixes both pictures
+    metric: bool = True  # whether the distance between the lenses was measured; if not, only its direction is known
 
     @staticmethod
     def centred(

@@ -12,20 +12,13 @@ from pano_mvs.core.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PinholeView:
-    """A pinhole picture tangent to the sphere; "cam" is the panorama's camera frame.
+    """A pinhole picture tangent to the sphere; "cam" is the panorama's camera frame."""
 
-    Attributes:
-        view_from_cam: (3, 3) rotation; its rows are the view's x (right), y (down) and z (forward) axes in the
-            panorama's camera frame.
-        focal_px: focal length, the same in x and y; one radian at the centre.
-        principal_xy: (2,) pixel of the axis, (0, 0) the upper-left corner of the view.
-        size_hw: (height, width) of the view.
-    """
-
+    # (3, 3) rotation; its rows are the view's x (right), y (down) and z (forward) axes in the panorama's camera frame
     view_from_cam: FloatArray
-    focal_px: float
-    principal_xy: FloatArray
-    size_hw: tuple[int, int]
+    focal_px: float  # focal length, the same in x and y; one radian at the centre
+    principal_xy: FloatArray  # (2,) pixel of the axis, (0, 0) the upper-left corner of the view
+    size_hw: tuple[int, int]  # (height, width) of the view
 
     @property
     def calibration(self) -> FloatArray:

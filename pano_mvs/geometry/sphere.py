@@ -8,6 +8,9 @@ from numpy.typing import ArrayLike
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 
+UP = np.array([0.0, -1.0, 0.0])
+"""Up in the frame of a level camera and in a levelled world: y points down."""
+
 
 def ray_from_pixel(pixels_px: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:
     """Return the unit rays through pixels of a full equirectangular panorama.

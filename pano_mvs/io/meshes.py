@@ -50,7 +50,7 @@ def encoded_texture(texture: NDArray[np.uint8], form: TextureFormat, *, quality:
 
 
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-_FLOAT, _UINT32, _ARRAY_BUFFER, _ELEMENT_BUFFER = 5126, 5125, 34962, 34963
+FLOAT, _UINT32, ARRAY_BUFFER, _ELEMENT_BUFFER = 5126, 5125, 34962, 34963
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 # The colours of a photograph already contain the light of the place.
 _UNLIT = "KHR_materials_unlit"
@@ -64,7 +64,7 @@ def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: Texture
         np.ascontiguousarray(mesh.faces, "<u4").tobytes(),
         picture,
     ]
-    views = [{"target": target} for target in (_ARRAY_BUFFER, _ARRAY_BUFFER, _ELEMENT_BUFFER)] + [{}]
+    views = [{"target": target} for target in (ARRAY_BUFFER, ARRAY_BUFFER, _ELEMENT_BUFFER)] + [{}]
     write_glb_parts(path, _document(mesh, MIME_TYPES[form]), parts, views=views)
 
 
@@ -116,19 +116,19 @@ def _document(mesh: TexturedArrays, mime_type: str) -> dict[str, Any]:
         "accessors": [
             {
                 "bufferView": 0,
-                "componentType": _FLOAT,
+                "componentType": FLOAT,
                 "count": len(positions),
                 "type": "VEC3",
                 "min": positions.min(axis=0).tolist(),
                 "max": positions.max(axis=0).tolist(),
             },
-            {"bufferView": 1, "componentType": _FLOAT, "count": len(mesh.uv), "type": "VEC2"},
+            {"bufferView": 1, "componentType": FLOAT, "count": len(mesh.uv), "type": "VEC2"},
             {"bufferView": 2, "componentType": _UINT32, "count": mesh.faces.size, "type": "SCALAR"},
         ],
     }
 
 
-_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), _UINT32: np.dtype("<u4"), _FLOAT: np.dtype("<f4")}
+_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), _UINT32: np.dtype("<u4"), FLOAT: np.dtype("<f4")}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
 

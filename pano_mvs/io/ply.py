@@ -235,8 +235,9 @@ class PlyPoints:
         part = slice(None, None, step)
         return self._positions(part), self._normals(part)
 
-    def cloud_chunks(self, size: int = 1_000_000) -> Iterator[PointCloud]:
-        """Yield the points in the world with all that our own files hold, up to `size` at a time."""
+    def cloud_chunks(self) -> Iterator[PointCloud]:
+        """Yield the points in the world with all that our own files hold, up to a million at a time."""
+        size = 1_000_000
         for start in range(0, self.count, size):
             yield self.cloud(slice(start, min(start + size, self.count)))
 

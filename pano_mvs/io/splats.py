@@ -246,7 +246,20 @@ def manifest_document(
         "schema": 1,
         "program": "pano_mvs",
         "conventions": _CONVENTIONS,
-        "layers": _layers(depth_unit),
+        "layers": {
+            "depth": {"format": "16-bit PNG", "unit": depth_unit, "of": "scene units per step", "unknown": 0},
+            "normal": {
+                "format": "16-bit PNG, RGB",
+                "value": "(step - 1) / 65534 * 2 - 1 for x, y, z in the axes of the camera; towards the camera",
+                "unknown": [0, 0, 0],
+            },
+            "confidence": {
+                "format": "8-bit PNG",
+                "value": "1-63 filled in, 64-127 seen but not confirmed, 128-255 consistent with other views",
+                "unknown": 0,
+            },
+            "mask": {"format": "8-bit PNG", "used": 255, "ignored": 0},
+        },
         "groups": list(groups),
         "views": [_entry(view, masked) for view in views],
     }
@@ -255,23 +268,6 @@ def manifest_document(
             _photograph(photographs, idx, masked="faces" in masked) for idx in range(len(photographs))
         ]
     return document
-
-
-def _layers(depth_unit: float) -> dict[str, dict[str, Any]]:
-    return {
-        "depth": {"format": "16-bit PNG", "unit": depth_unit, "of": "scene units per step", "unknown": 0},
-        "normal": {
-            "format": "16-bit PNG, RGB",
-            "value": "(step - 1) / 65534 * 2 - 1 for x, y, z in the axes of the camera; towards the camera",
-            "unknown": [0, 0, 0],
-        },
-        "confidence": {
-            "format": "8-bit PNG",
-            "value": "1-63 filled in, 64-127 seen but not confirmed, 128-255 consistent with other views",
-            "unknown": 0,
-        },
-        "mask": {"format": "8-bit PNG", "used": 255, "ignored": 0},
-    }
 
 
 def _entry(view: BundleView, masked: Iterable[Variant]) -> dict[str, Any]:

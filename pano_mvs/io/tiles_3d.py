@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry.geodesy import earth_from_lla, earth_from_local
-from pano_mvs.io.meshes import write_glb_parts
+from pano_mvs.io.meshes import ARRAY_BUFFER, FLOAT, write_glb_parts
 from pano_mvs.scene import PointCloud
 
-_FLOAT, _UINT16, _POINTS, _ARRAY_BUFFER = 5126, 5123, 0, 34962
+_UINT16, _POINTS = 5123, 0
 _UNLIT = "KHR_materials_unlit"
 
 
@@ -118,7 +118,7 @@ def write_points_glb(path: Path, points: NDArray[np.float32], colors_rgb: NDArra
         "accessors": [
             {
                 "bufferView": 0,
-                "componentType": _FLOAT,
+                "componentType": FLOAT,
                 "count": len(points),
                 "type": "VEC3",
                 "min": positions.min(axis=0).tolist(),
@@ -127,5 +127,5 @@ def write_points_glb(path: Path, points: NDArray[np.float32], colors_rgb: NDArra
             {"bufferView": 1, "componentType": _UINT16, "normalized": True, "count": len(points), "type": "VEC4"},
         ],
     }
-    views = [{"target": _ARRAY_BUFFER}] * 2
+    views = [{"target": ARRAY_BUFFER}] * 2
     write_glb_parts(path, document, [positions.tobytes(), colors.tobytes()], views=views)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.core.arrays import Mask
@@ -88,7 +87,7 @@ def masked_areas(values: StoredValues, kept: EarlierPage) -> MaskedAreas:
     return MaskedAreas(tuple(counts), len(shares), len(names), tuple(shown))
 
 
-def chosen_pictures(shares: Mapping[str, Mapping[str, float]], most: int = MAX_PICTURES) -> list[str]:
+def chosen_pictures(shares: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Return the images to show: for each reason that with the largest share, then evenly spaced others."""
     masked = [name for name, found in shares.items() if found]
     first = [
@@ -96,9 +95,9 @@ def chosen_pictures(shares: Mapping[str, Mapping[str, float]], most: int = MAX_P
         for kind in KINDS
         if any(kind.name in shares[name] for name in masked)
     ]
-    chosen = dict.fromkeys(first[:most])
+    chosen = dict.fromkeys(first[:MAX_PICTURES])
     rest = [name for name in masked if name not in chosen]
-    chosen |= dict.fromkeys(evenly_spaced(rest, most - len(chosen)))
+    chosen |= dict.fromkeys(evenly_spaced(rest, MAX_PICTURES - len(chosen)))
     return [name for name in masked if name in chosen]
 
 
@@ -201,9 +200,6 @@ def _picture(values: StoredValues, kept: EarlierPage, name: str, *, masks: Stati
         return None
     for kind in KINDS:
         if kind.name in kinds:
-            _tint(image, _nearest(kinds[kind.name], (image.shape[0], image.shape[1])), kind.color_rgb)
+            pixels = _nearest(kinds[kind.name], (image.shape[0], image.shape[1]))
+            image[pixels] = 0.5 * image[pixels] + 0.5 * np.array(kind.color_rgb, np.float32)
     return picture(image.astype(np.uint8), width=_WIDTH, most_bytes=MAX_BYTES, key=key)
-
-
-def _tint(image: NDArray[np.float32], pixels: Mask, color_rgb: Sequence[int]) -> None:
-    image[pixels] = 0.5 * image[pixels] + 0.5 * np.array(color_rgb, np.float32)

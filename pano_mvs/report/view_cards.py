@@ -72,8 +72,6 @@ def fact_of(shares: Shares) -> list[float]:
 
 # Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
 UNCERTAINTY_LIMITS = 0.001, 0.2
-# A view has a scale of its own only if an end of it differs from the common scale by more than this factor.
-_SAME_SCALE = 1.1
 # Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
@@ -98,7 +96,8 @@ class RangeScales:
     def differ(self) -> bool:
         """Whether the view looks different on its own scale."""
         ratios = [a / b for a, b in zip(self.common, self.own or self.common, strict=True)]
-        return any(max(ratio, 1 / ratio) > _SAME_SCALE for ratio in ratios)
+        # A view has a scale of its own only if an end of it differs from the common scale by more than this factor.
+        return any(max(ratio, 1 / ratio) > 1.1 for ratio in ratios)
 
     @property
     def range_part(self) -> str:
@@ -175,17 +174,17 @@ class ViewCard:
         return "uncertainty" in self.pictures
 
 
-def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always: Collection[str] = ()) -> list[int]:
+def chosen_views(views: Sequence[ViewSummary], *, always: Collection[str] = ()) -> list[int]:
     """Return the positions of the views to show in full: all, or the least complete third and evenly spaced others.
 
     The views in `always` come first in that third, as far as there is room.
     """
     everything = list(range(len(views)))
-    if len(views) <= most:
+    if len(views) <= MAX_CARDS:
         return everything
     by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, _quality(views[idx]), idx))
-    worst, rest = by_quality[: most // 3], sorted(by_quality[most // 3 :])
-    return sorted({*worst, *evenly_spaced(rest, most - len(worst))})
+    worst, rest = by_quality[: MAX_CARDS // 3], sorted(by_quality[MAX_CARDS // 3 :])
+    return sorted({*worst, *evenly_spaced(rest, MAX_CARDS - len(worst))})
 
 
 def view_cards(

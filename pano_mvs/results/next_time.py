@@ -100,8 +100,6 @@ def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
 MIN_CAMERAS = 4
 """Spacing, links and confirmed shares are compared within a group only if it has at least this many cameras."""
 
-GAP = 2.0
-"""Cameras are far apart if their distance is more than this many times the median distance of neighbours."""
 
 LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 """Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
@@ -150,7 +148,12 @@ def suggestions(summary: RunSummary, coverage: Mapping[str, ViewCoverage] | None
         if group is None:
             continue
         _spacing(group, found)
-        _doubtful(group, found)
+        for idx, name in enumerate(group.names):
+            if name in group.poses.doubts:
+                reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
+                _stand_between(
+                    group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason
+                )
         _weak(group, summary, found)
         _loose(group, found)
         _lonely(group, found)
@@ -265,7 +268,8 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
     typical = median([length for _, _, length in edges]) or 0.0
     for first, second, length in edges if len(group.names) >= MIN_CAMERAS and typical > 0 else ():
         ranges = [known for idx in (first, second) if (known := group.typical_range(idx)) is not None]
-        if length > GAP * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
+        # Cameras are far apart if their distance is more than this many times the median distance of neighbours.
+        if length > 2.0 * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
             reason = (
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"
@@ -310,13 +314,6 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
     found.add(
         _Severity.SPACING, Suggestion(f"Take panoramas {low}–{high} {group.unit} apart.", (reason,), group.number)
     )
-
-
-def _doubtful(group: CameraGroup, found: _Collected) -> None:
-    for idx, name in enumerate(group.names):
-        if name in group.poses.doubts:
-            reason = f"the pose of {name} is doubtful: {group.poses.doubts[name]}"
-            _stand_between(group, found, (idx, int(group.nearest(idx)[0])), severity=_Severity.DOUBTFUL, reason=reason)
 
 
 def _weak(group: CameraGroup, summary: RunSummary, found: _Collected) -> None:

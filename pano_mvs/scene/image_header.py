@@ -182,7 +182,6 @@ def is_cut_short(data: bytes) -> bool:
     return scan is None or data.find(_END, scan.end) < 0
 
 
-_MAX_ENTRIES = 1000
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
 
@@ -209,7 +208,7 @@ class Tiff:
         head, row, wide = ("Q", "HHQ", 8) if self.is_big else ("H", "HHI", 4)
         (count,) = struct.unpack_from(self.order + head, self.data, offset)
         entries: dict[int, Entry] = {}
-        for idx in range(min(count, _MAX_ENTRIES)):
+        for idx in range(min(count, 1000)):
             at = offset + struct.calcsize("=" + head) + idx * (4 + 2 * wide)
             tag, kind, length = struct.unpack_from(self.order + row, self.data, at)
             size, start = _SIZES.get(kind, 1) * length, at + 4 + wide

@@ -18,9 +18,6 @@ from pano_mvs.io.images.metadata import camera_from_exif, read_container
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import decode_image
 
-ASSUMED_DISTANCE_M = 0.03
-"""Distance of the lenses in the file if it is not given: about that of cameras held in a hand."""
-
 _FIELDS_OF_VIEW_DEG = {"theta s": 202.0, "gear 360": 195.0}
 """Field of view of the image circles by parts of the camera's name in EXIF: start values."""
 
@@ -73,7 +70,8 @@ def calibrate_camera(
         )
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
-    length_m = ASSUMED_DISTANCE_M if distance_m is None else distance_m
+    # Distance of the lenses in the file if it is not given: about that of cameras held in a hand.
+    length_m = 0.03 if distance_m is None else distance_m
     second_from_first = Rigid3(found.second_from_first.rotation, length_m * found.second_from_first.translation)
     first_from_rig = Rigid3(rotation_from_rotvec([0.0, 0.0, QUARTER_TURNS[up] * np.pi / 2]), np.zeros(3))
     determined = bool(np.isfinite(found.offset_std))

@@ -66,11 +66,7 @@ class Execution:
 
 
 def _check_not_merged(out: Path) -> None:
-    """Check that a run does not replace the run.json and the report of merged blocks.
-
-    Raises:
-        UsageError: if the folder holds merged blocks.
-    """
+    """Check that a run does not replace the run.json and the report of merged blocks."""
     try:
         merged = RunSummary.read(out).merged
     except InputError:
@@ -123,7 +119,15 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
     started, run = datetime.now(UTC), None
     try:
-        run = _new_run(session, store, executor, observer=observer)
+        run = Run(
+            session.workflow,
+            session.graph,
+            store,
+            out=session.out,
+            observer=observer,
+            executor=executor,
+            options=session.run_options,
+        )
         with output_lock(session.out):
             log.open(session.out)
             if (forecast := forecast_run(run)) is not None:
@@ -139,18 +143,6 @@ def _run_and_report(session: Session, store: Store, executor: Executor, *, progr
         raise
     finally:
         report(replace(end, seconds=round(time.perf_counter() - clock, 3)))
-
-
-def _new_run(session: Session, store: Store, executor: Executor, *, observer: EventObserver) -> Run:
-    return Run(
-        session.workflow,
-        session.graph,
-        store,
-        out=session.out,
-        observer=observer,
-        executor=executor,
-        options=session.run_options,
-    )
 
 
 def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:

@@ -90,7 +90,9 @@ def measured_between(run: RunOutput, first: str, second: str, *, metres: float, 
         UsageError: if an end is neither, both are in one place, or images are in different groups.
         InputError: if the run has no poses.
     """
-    groups = _groups(run)
+    if run.poses is None or not run.poses.names:
+        raise InputError(f"{run.out}: the run has no poses. Look at its report.html")
+    groups = split_groups(run.poses)
     ends: list[NDArray[np.float64]] = []
     homes: set[int] = set()
     named = []
@@ -293,12 +295,6 @@ def _with_producers(names: list[str], graph: Graph) -> set[str]:
         if name in needed:
             needed.update(edge.producer for edge in graph.edges[name].values())
     return needed
-
-
-def _groups(run: RunOutput) -> list[Poses]:
-    if run.poses is None or not run.poses.names:
-        raise InputError(f"{run.out}: the run has no poses. Look at its report.html")
-    return split_groups(run.poses)
 
 
 def _camera(groups: list[Poses], text: str) -> tuple[int, str]:

@@ -208,7 +208,7 @@ def poses_summary(
                 metric=group.metric,
                 points=len(group.points_in_world),
                 up=_up(group),
-                z_up_from_world=_rows(z_up_from_world(world_up(group))),
+                z_up_from_world=tuple((float(x), float(y), float(z)) for x, y, z in z_up_from_world(world_up(group))),
                 camera_height=(heights or {}).get(number),
                 nearest_pair=nearest_pair(groups[0].names, group.names, links) if number else None,
             )
@@ -293,10 +293,6 @@ def _scale_notes(poses: PosesSummary) -> tuple[str, ...]:
     """Return what to say about the unit of the largest group: nothing if it is the metre or no floor is known."""
     height = poses.groups[0].camera_height if poses.groups else None
     return () if height is None or poses.metric else (height_note(height),)
-
-
-def _rows(matrix: NDArray[np.float64]) -> tuple[Direction, ...]:
-    return tuple((float(x), float(y), float(z)) for x, y, z in matrix)
 
 
 def _scores(run: Run) -> dict[str, ScoresSummary]:

@@ -34,8 +34,6 @@ from pano_mvs.session.progress import (
 
 _OVERDUE = 1.2  # a unit that takes longer than expected is expected to take this multiple of its time so far …
 _UNKNOWN = 2.0  # … and this one if nothing is known of its stage
-_START_S = 10.0
-"""A worker process starts within this time, which is not evidence that the units of its stage are slow."""
 
 _SPEED_PRIOR_S = 10.0
 _SPEED_LIMITS = 0.2, 5.0
@@ -92,7 +90,8 @@ class StageProgress:
         if not self.computed:
             if expected_s is None:
                 return _UNKNOWN * longest_s if self.running else None
-            return max(expected_s, _OVERDUE * (longest_s - _START_S))
+            # A worker process starts within this time, which is not evidence that the units of its stage are slow.
+            return max(expected_s, _OVERDUE * (longest_s - 10.0))
         known = 0 if expected_s is None else 1
         return ((expected_s or 0.0) + self.seconds) / (known + self.computed)
 

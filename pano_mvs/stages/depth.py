@@ -146,13 +146,8 @@ def sweep(
     return range_map
 
 
-@params_from(select_views)
-class NearestParams(Params):
-    """Settings of views.nearest."""
-
-
-@stage("views.nearest")
-def nearest(poses: One[Poses], params: NearestParams, ctx: Context) -> Views:
+@stage("views.nearest", settings=select_views)
+def nearest(poses: One[Poses], params: Params, ctx: Context) -> Views:
     """Choose images that see the same points from sufficiently different positions, best first."""
     views = select_views(poses, **arguments_from(select_views, params))
     for name in poses.names:

@@ -34,26 +34,16 @@ def sift_tangent(image: Each[Panorama], params: SiftParams, ctx: Context) -> Fea
     return features
 
 
-@params_from(extract_orb)
-class OrbParams(Params):
-    """Settings of features.orb_tangent."""
-
-
-@stage("features.orb_tangent")
-def orb_tangent(image: Each[Panorama], params: OrbParams, ctx: Context) -> Features:
+@stage("features.orb_tangent", settings=extract_orb)
+def orb_tangent(image: Each[Panorama], params: Params, ctx: Context) -> Features:
     """ORB on the overlapping tangent tiles of an icosahedron."""
     features = extract_orb(image.load(), image.load_mask(), **arguments_from(extract_orb, params))
     ctx.metric("keypoints", len(features))
     return features
 
 
-@params_from(extract_sphorb)
-class SphorbParams(Params):
-    """Settings of features.sphorb."""
-
-
-@stage("features.sphorb")
-def sphorb(image: Each[Panorama], params: SphorbParams, ctx: Context) -> Features:
+@stage("features.sphorb", settings=extract_sphorb)
+def sphorb(image: Each[Panorama], params: Params, ctx: Context) -> Features:
     """SPHORB: corners and binary descriptors on a geodesic grid of the sphere."""
     features = extract_sphorb(
         image.load(),

@@ -101,14 +101,9 @@ def sky(
     return result
 
 
-@params_from(find_structure)
-class ScenePlanesParams(Params):
-    """Settings of depth.scene_planes."""
-
-
-@stage("depth.scene_planes")
+@stage("depth.scene_planes", settings=find_structure)
 def scene_planes(
-    poses: One[Poses], ranges: All[RangeMap], images: All[Panorama], params: ScenePlanesParams, ctx: Context
+    poses: One[Poses], ranges: All[RangeMap], images: All[Panorama], params: Params, ctx: Context
 ) -> Structure:
     """Find the level and upright planes of a place in all range maps, and place them by the lines where they meet.
 
@@ -209,10 +204,6 @@ def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams,
     return result
 
 
-# Of what is above or below a camera, at least this share must have a range, or it is a sky or masked.
-_MIN_VALID = 0.5
-
-
 @params_from(median_range)
 class MedianParams(Params):
     """Settings of filters.median."""
@@ -235,36 +226,21 @@ def gaussian(range_map: Each[RangeMap], params: GaussianParams, ctx: Context) ->
     return _measured(gaussian_range(range_map, **arguments_from(gaussian_range, params)), ctx)
 
 
-@params_from(guided_range)
-class GuidedParams(Params):
-    """Settings of filters.guided."""
-
-
-@stage("filters.guided")
-def guided(range_map: Each[RangeMap], image: Each[Panorama], params: GuidedParams, ctx: Context) -> RangeMap:
+@stage("filters.guided", settings=guided_range)
+def guided(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
     """Smooth ranges by the guided filter, preserving edges of the panorama. Masked pixels get no range."""
     smoothed = guided_range(range_map, image.load(), **arguments_from(guided_range, params))
     return _measured(_unmasked(smoothed, image), ctx)
 
 
-@params_from(require_confidence)
-class ConfidenceParams(Params):
-    """Settings of filters.confidence."""
-
-
-@stage("filters.confidence")
-def confidence(range_map: Each[RangeMap], params: ConfidenceParams, ctx: Context) -> RangeMap:
+@stage("filters.confidence", settings=require_confidence)
+def confidence(range_map: Each[RangeMap], params: Params, ctx: Context) -> RangeMap:
     """Remove pixels of low confidence: by default all pixels that no other view confirms."""
     return _measured(require_confidence(range_map, **arguments_from(require_confidence, params)), ctx)
 
 
-@params_from(remove_speckles)
-class SpeckleParams(Params):
-    """Settings of filters.speckle."""
-
-
-@stage("filters.speckle")
-def speckle(range_map: Each[RangeMap], params: SpeckleParams, ctx: Context) -> RangeMap:
+@stage("filters.speckle", settings=remove_speckles)
+def speckle(range_map: Each[RangeMap], params: Params, ctx: Context) -> RangeMap:
     """Remove small isolated surfaces."""
     cleaned = remove_speckles(range_map, **arguments_from(remove_speckles, params))
     return _measured(cleaned, ctx)
@@ -307,18 +283,13 @@ def consistency(
     return _measured(checked, ctx)
 
 
-@params_from(respect_free_space)
-class FreeSpaceParams(Params):
-    """Settings of filters.free_space."""
-
-
-@stage("filters.free_space", memory=bytes_per_pixel(150, each_source=40))
+@stage("filters.free_space", settings=respect_free_space, memory=bytes_per_pixel(150, each_source=40))
 def free_space(
     range_map: Each[RangeMap],
     pose: Each[Pose],
     sources: Near[RangeMap],
     source_poses: Near[Pose],
-    params: FreeSpaceParams,
+    params: Params,
     ctx: Context,
 ) -> RangeMap:
     """Correct unconfirmed ranges by confirmed ones of other views: those behind a point, and those seen through.
@@ -353,15 +324,8 @@ def scale_ranges(range_map: Each[RangeMap], pose: Each[Pose], params: ScaleRange
     return _measured(replace(range_map, range=range_map.range * np.float32(params.factor)), ctx)
 
 
-@params_from(fast_bilateral_solver)
-class BilateralSolverParams(Params):
-    """Settings of filters.fast_bilateral_solver."""
-
-
-@stage("filters.fast_bilateral_solver", memory=bytes_per_pixel(190))
-def bilateral_solver(
-    range_map: Each[RangeMap], image: Each[Panorama], params: BilateralSolverParams, ctx: Context
-) -> RangeMap:
+@stage("filters.fast_bilateral_solver", settings=fast_bilateral_solver, memory=bytes_per_pixel(190))
+def bilateral_solver(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
     """Smooth ranges by the Fast Bilateral Solver, preserving edges of the panorama.
 
     Masked pixels get no range, even with `fill`.
@@ -370,13 +334,8 @@ def bilateral_solver(
     return _measured(_unmasked(solved, image), ctx)
 
 
-@params_from(fill_from_neighbours)
-class FillParams(Params):
-    """Settings of filters.fill."""
-
-
-@stage("filters.fill", memory=bytes_per_pixel(96))
-def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, ctx: Context) -> RangeMap:
+@stage("filters.fill", settings=fill_from_neighbours, memory=bytes_per_pixel(96))
+def fill(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
     """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 1–63).
 
     Masked pixels get no range.
@@ -385,13 +344,8 @@ def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, c
     return _measured(_unmasked(filled, image), ctx)
 
 
-@params_from(lay_planes)
-class PlanesParams(Params):
-    """Settings of filters.planes."""
-
-
-@stage("filters.planes", memory=bytes_per_pixel(170))
-def planes(range_map: Each[RangeMap], image: Each[Panorama], params: PlanesParams, ctx: Context) -> RangeMap:
+@stage("filters.planes", settings=lay_planes, memory=bytes_per_pixel(170))
+def planes(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
     """Fit planes to plain walls and ceilings, where nothing can be matched; use it after the bilateral solver.
 
     Masked pixels get no range.
@@ -414,6 +368,7 @@ def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:
     for side, rows in (("above", slice(0, quarter)), ("below", slice(-quarter, None))):
         weights = pixel_solid_angle(confirmed.shape)[rows, None]
         valid = float((range_map.valid[rows] * weights).mean())
-        if valid >= _MIN_VALID * float(weights.mean()):
+        # Of what is above or below a camera, at least this share must have a range, or it is a sky or masked.
+        if valid >= 0.5 * float(weights.mean()):
             ctx.metric(f"confirmed_{side}", float((confirmed[rows] * weights).mean()) / valid)
     return range_map

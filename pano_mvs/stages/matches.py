@@ -14,13 +14,8 @@ from pano_mvs.scene import WeakImages
 from pano_mvs.stages.features import NetworkParams
 
 
-@params_from(match_features, verify_pair)
-class BruteForceParams(Params):
-    """Settings of matches.brute_force."""
-
-
-@stage("matches.brute_force")
-def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context) -> TwoView:
+@stage("matches.brute_force", settings=(match_features, verify_pair))
+def brute_force(features: Near[Features], params: Params, ctx: Context) -> TwoView:
     """Match all descriptors (ratio and mutual test), then verify the matches by spherical RANSAC."""
     first, second = features
     candidates = match_features(first, second, **arguments_from(match_features, params))
@@ -55,13 +50,8 @@ def lightglue(features: Near[Features], params: LightGlueParams, ctx: Context) -
     return two_view
 
 
-@params_from(weak_images)
-class WeakParams(Params):
-    """Settings of matches.weak."""
-
-
-@stage("matches.weak", memory="600MB")
-def weak(features: All[Features], matches: All[TwoView], params: WeakParams, ctx: Context) -> WeakImages:
+@stage("matches.weak", settings=weak_images, memory="600MB")
+def weak(features: All[Features], matches: All[TwoView], params: Params, ctx: Context) -> WeakImages:
     """Find the images that their matches hardly connect with the rest, for which learned matches are worth their time.
 
     A pair in which a large share of the key points match connects its images well. The images outside of the largest

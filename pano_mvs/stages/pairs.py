@@ -105,14 +105,9 @@ def exhaustive(images: Names[Features]) -> Pairs:
     return exhaustive_pairs(images)
 
 
-@params_from(loop_closing_pairs)
-class SequentialParams(Params):
-    """Settings of pairs.sequential."""
-
-
-@stage("pairs.sequential")
+@stage("pairs.sequential", settings=loop_closing_pairs)
 def sequential(
-    images: Names[Features], descriptors: All[GlobalDescriptor] | None, params: SequentialParams, ctx: Context
+    images: Names[Features], descriptors: All[GlobalDescriptor] | None, params: Params, ctx: Context
 ) -> Pairs:
     """Match each image with the next ones in the order of the file names; for walks and video.
 
@@ -128,39 +123,22 @@ def sequential(
     return pairs
 
 
-@params_from(vlad_descriptor)
-class VladParams(Params):
-    """Settings of global.vlad."""
-
-
-@stage("global.vlad")
-def vlad(features: Each[Features], params: VladParams) -> GlobalDescriptor:
+@stage("global.vlad", settings=vlad_descriptor)
+def vlad(features: Each[Features], params: Params) -> GlobalDescriptor:
     """Compute a global descriptor of each panorama, for pairs.retrieval and loop closure."""
     return vlad_descriptor(features, **arguments_from(vlad_descriptor, params))
 
 
-@params_from(retrieval_pairs)
-class RetrievalParams(Params):
-    """Settings of pairs.retrieval."""
-
-
-@stage("pairs.retrieval")
-def retrieval(
-    images: Names[Features], descriptors: All[GlobalDescriptor], params: RetrievalParams, ctx: Context
-) -> Pairs:
+@stage("pairs.retrieval", settings=retrieval_pairs)
+def retrieval(images: Names[Features], descriptors: All[GlobalDescriptor], params: Params, ctx: Context) -> Pairs:
     """Match each image with the most similar ones; for hundreds of images without order."""
     pairs = retrieval_pairs(images, descriptors, **arguments_from(retrieval_pairs, params))
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
 
 
-@params_from(learned_pairs)
-class LearnedPairsParams(Params):
-    """Settings of pairs.learned."""
-
-
-@stage("pairs.learned", memory="600MB")
-def learned(features: All[Features], matches: All[TwoView] | None, params: LearnedPairsParams, ctx: Context) -> Pairs:
+@stage("pairs.learned", settings=learned_pairs, memory="600MB")
+def learned(features: All[Features], matches: All[TwoView] | None, params: Params, ctx: Context) -> Pairs:
     """Match each image that has key points of features.aliked with those whose learned key points are most similar.
 
     Pairs of such images that an earlier matcher has verified are matched again, too.

@@ -234,14 +234,9 @@ def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Conte
         ctx.note(f"{name} is not the image whose pose {path.name} records: the files differ")
 
 
-@params_from(triangulate_tracks)
-class TriangulateParams(Params):
-    """Settings of poses.triangulate."""
-
-
-@stage("poses.triangulate")
+@stage("poses.triangulate", settings=triangulate_tracks)
 def triangulate(
-    poses: One[Poses], features: All[Features], matches: All[TwoView], params: TriangulateParams, ctx: Context
+    poses: One[Poses], features: All[Features], matches: All[TwoView], params: Params, ctx: Context
 ) -> Poses:
     """Triangulate sparse points from known poses, which stay exactly as they are."""
     points = triangulate_tracks(poses, features, matches, **arguments_from(triangulate_tracks, params))

@@ -28,7 +28,7 @@ from pano_mvs.api import (
 )
 from pano_mvs.core.paths import is_folder
 from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
-from pano_mvs.io.images.copies import Copy, find_copies
+from pano_mvs.io.images.copies import find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
 from pano_mvs.io.images.tour_configurations import FACES
@@ -103,13 +103,13 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         if mask is not None:
             files["mask"] = mask
         if name in copies:
-            problem = _is_a_copy(copies[name])
+            copy = copies[name]
+            turned = f", turned by {copy.turn_deg:.0f}°" if copy.turn_deg else ""
+            problem = (
+                f"it is a copy of {copy.original}{turned}, which is used alone, as a copy adds nothing; "
+                "remove one of them"
+            )
         yield SourceItem(name, files, problem, (*unread, *_notes_on_masks(name, mask, params)))
-
-
-def _is_a_copy(copy: Copy) -> str:
-    turned = f", turned by {copy.turn_deg:.0f}°" if copy.turn_deg else ""
-    return f"it is a copy of {copy.original}{turned}, which is used alone, as a copy adds nothing; remove one of them"
 
 
 def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:

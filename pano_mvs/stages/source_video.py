@@ -205,7 +205,14 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
     The whole video is decoded once; the times are remembered among the user's caches.
     """
     settings = KeyframeSettings(params.motion_deg, params.min_s, params.max_s)
-    usable = _usable(path, info, params)
+    usable = Panorama(
+        image=FilePart(path),
+        size_hw=REDUCED_HW,
+        source_size_hw=info.size_hw,
+        mask_file=None if params.mask is None else FilePart(params.mask),
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+    ).load_mask()
     code = digest_from_file(Path(str(keyframes.__file__)))
     known = keyframe_file(
         path,
@@ -228,18 +235,6 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
         kept = np.linspace(0, len(times) - 1, params.max_frames).round().astype(int)
         times = [times[idx] for idx in kept]
     return times
-
-
-def _usable(path: Path, info: VideoInfo, params: VideoParams) -> NDArray[np.bool_]:
-    """Return the pixels of the reduced frames that no mask covers."""
-    return Panorama(
-        image=FilePart(path),
-        size_hw=REDUCED_HW,
-        source_size_hw=info.size_hw,
-        mask_file=None if params.mask is None else FilePart(params.mask),
-        nadir_deg=params.nadir_deg,
-        zenith_deg=params.zenith_deg,
-    ).load_mask()
 
 
 def _band(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

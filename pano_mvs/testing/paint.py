@@ -41,8 +41,6 @@ _HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
     "outdoor": ((0.25, 0.8),),
     "none": (),
 }
-# Mean wavelength of the noise in cells.
-_WAVELENGTH = 7.0
 
 
 def albedo_at(
@@ -71,7 +69,8 @@ def _octaves(
         return noise(points, cells=cells, seed=seed)
     total = np.zeros(len(points))
     for octave, (size, strength) in enumerate(cells):
-        left = np.exp(-((2 * footprint / (_WAVELENGTH * size)) ** 2))
+        # Mean wavelength of the noise in cells.
+        left = np.exp(-((2 * footprint / (7.0 * size)) ** 2))
         total += left * noise(points, cells=((size, strength),), seed=seed + 7919 * octave)
     return total
 

@@ -84,25 +84,28 @@ def _leaves(value: Any) -> Iterator[Any]:
         yield float(value) if isinstance(value, int | float) else str(value)
 
 
-def differences(before: Summary, now: Summary) -> list[str]:
+def differences(before: Summary, now: Summary, *, tolerance: float = TOLERANCE) -> list[str]:
     """Return what differs between two summaries by more than machines do, in words."""
     return [
         f"{name}: {before.get(name)} → {now.get(name)}"
         for name in sorted({*before, *now})
-        if not _alike(before.get(name), now.get(name))
+        if not _alike(before.get(name), now.get(name), tolerance)
     ]
 
 
-def _alike(before: Any, now: Any) -> bool:
+def _alike(before: Any, now: Any, tolerance: float) -> bool:
     if not isinstance(before, list) or not isinstance(now, list) or len(before) != len(now):
         return bool(before == now)
     # The quantiles of an array are compared by how far they lie apart, counts and single figures by their size.
     spread = max(before[-1] - before[-len(_QUANTILES)], 0.0) if len(before) == len(_QUANTILES) + 3 else 0.0
     return all(
-        abs(new - old) <= TOLERANCE * max(abs(old), spread) + (2 if idx < 2 and spread else 1e-6)
+        abs(new - old) <= tolerance * max(abs(old), spread) + (2 if idx < 2 and spread else 1e-6)
         for idx, (old, new) in enumerate(zip(before, now, strict=True))
     )
 
+
+BY_PROCESSOR = {"export.mesh_textured": 0.15}
+"""Tolerances of cases whose figures depend on the processor: xatlas cuts 195 charts on one and 185 on another."""
 
 PLACE = Path(__file__).with_name("stages.json")
 COMMAND = "python -m tests.golden"
@@ -176,7 +179,7 @@ def complaint(name: str, before: Golden | None, now: Golden) -> str:
     """Return what is wrong with a case; empty if nothing is."""
     if before is None:
         return f"{name} is not in stages.json yet: run `{COMMAND}`"
-    changes = differences(before.summary, now.summary)
+    changes = differences(before.summary, now.summary, tolerance=BY_PROCESSOR.get(name, TOLERANCE))
     if not changes:
         return ""
     if (before.code, before.libraries) == (now.code, now.libraries):

@@ -25,7 +25,6 @@ from pano_mvs.geometry import PinholeView, spiral_rays
 from pano_mvs.scene.files import FaceLayout
 
 _MARGIN = 0.17  # in units of the focal length; required by detectors and descriptors beyond the face
-_MIN_MARGIN_PX = 24
 
 
 @cache
@@ -75,7 +74,7 @@ def _tile(triangle: FloatArray, focal_px: float) -> PinholeView:
     tile_from_cam = np.array([np.cross(y, z), y, z])
     in_tile = triangle @ tile_from_cam.T
     plane = in_tile[:, :2] / in_tile[:, 2:]
-    margin = max(_MARGIN, _MIN_MARGIN_PX / focal_px)
+    margin = max(_MARGIN, 24 / focal_px)
     low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
     width, height = np.ceil((high - low) * focal_px).astype(int)
     return PinholeView(tile_from_cam, focal_px, -low * focal_px, (int(height), int(width)))
@@ -177,10 +176,6 @@ def _rotations(layout: FaceLayout) -> list[tuple[str, FloatArray]]:
     return [(f"tile{idx:02d}", upright_rotation(center)) for idx, center in enumerate(face_centers())]
 
 
-_SAMPLES = 64
-_MUCH_WORSE = 2.0  # between those of right and wrong cubes, see `arranged_faces`
-
-
 def arranged_faces(faces: Mapping[str, NDArray[np.uint8]]) -> tuple[dict[str, NDArray[np.uint8]], bool]:
     """Return the faces of a cube in the order and turns in which the picture continues across its twelve edges.
 
@@ -198,7 +193,8 @@ def arranged_faces(faces: Mapping[str, NDArray[np.uint8]]) -> tuple[dict[str, ND
     if any(face.shape != (side, side, 3) for face in faces.values()):
         return dict(faces), False
     ratio, order, turns = best_arrangement(faces)
-    if ratio < _MUCH_WORSE:
+    # Between those of right and wrong cubes, see `arranged_faces`.
+    if ratio < 2.0:
         return dict(faces), False
     names = list(CUBE)
     found = {name: np.rot90(faces[names[order[slot]]], turns[slot]) for slot, name in enumerate(names)}
@@ -232,7 +228,7 @@ def best_arrangement(
 def _borders(face: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the borders clockwise from the top, (4, samples, 3): averages of equal parts."""
     turned = [np.rot90(face, turn)[0] for turn in range(4)]  # a counter-clockwise turn brings the right side up
-    parts = np.linspace(0, len(face), min(_SAMPLES, len(face)) + 1).astype(int)[:-1]
+    parts = np.linspace(0, len(face), min(64, len(face)) + 1).astype(int)[:-1]
     return (
         np.stack([np.add.reduceat(row.astype(np.float64), parts, axis=0) for row in turned])
         / (np.diff(np.append(parts, len(face)))[None, :, None])

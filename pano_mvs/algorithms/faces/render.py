@@ -16,9 +16,6 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, pad_panorama, ray_from_pixel
 from pano_mvs.scene import RangeMap
 
-# Bicubic interpolation uses no pixel farther away than this from the one that contains the position.
-_REACH_PX = 2
-
 
 def face_image(panorama: NDArray[np.uint8], view: PinholeView) -> NDArray[np.uint8]:
     """Render the image of a face, (h, w, 3) uint8 RGB.
@@ -45,7 +42,8 @@ def face_mask(valid: NDArray[np.bool_], view: PinholeView) -> NDArray[np.bool_]:
     """
     if valid.all():
         return np.ones(view.size_hw, np.bool_)
-    reach = min(_REACH_PX, *valid.shape)
+    # Bicubic interpolation uses no pixel farther away than this from the one that contains the position.
+    reach = min(2, *valid.shape)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     padded = cv2.erode(pad_panorama(valid.astype(np.uint8), reach), window)
     clear = padded[reach:-reach, reach:-reach] > 0

@@ -10,21 +10,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.tangent import root_sift, sift_detector
 
-MAX_SIDE_PX = 1600
-"""Photographs are reduced to this size: panoramas have fewer pixels per degree anyway."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographKeypoints:
-    """Key points of a photograph, strongest first.
+    """Key points of a photograph, strongest first."""
 
-    Attributes:
-        pixels_px: (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner.
-        descriptors: (N, 128) float32, RootSIFT as in `extract_sift`.
-    """
-
-    pixels_px: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
+    pixels_px: NDArray[np.float64]  # (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner
+    descriptors: NDArray[np.float32]  # (N, 128) float32, RootSIFT as in `extract_sift`
 
 
 def photograph_keypoints(picture: NDArray[np.uint8], *, max_keypoints: int = 6000) -> PhotographKeypoints:
@@ -35,7 +27,8 @@ def photograph_keypoints(picture: NDArray[np.uint8], *, max_keypoints: int = 600
         max_keypoints: maximum number of key points.
     """
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
+    # Photographs are reduced to this size: panoramas have fewer pixels per degree anyway.
+    scale = min(1.0, 1600 / max(gray.shape))
     if scale < 1:
         size_xy = [max(1, round(side * scale)) for side in gray.shape[::-1]]
         gray = cv2.resize(gray, size_xy, interpolation=cv2.INTER_AREA)

@@ -42,14 +42,10 @@ class GeodesicGrid:
 
     A position is a face and lattice coordinates (u, v), with u, v >= 0 and u + v <= steps inside the face; cell (u, v)
     of face f is element [f, v + margin, u + margin] of an array (20, side, side).
-
-    Attributes:
-        steps: number of lattice steps along an edge.
-        margin: number of cells by which each lattice extends beyond its face.
     """
 
-    steps: int
-    margin: int
+    steps: int  # number of lattice steps along an edge
+    margin: int  # number of cells by which each lattice extends beyond its face
 
     @property
     def side(self) -> int:
@@ -141,7 +137,6 @@ def _sampling_maps(grid: GeodesicGrid, size_hw: tuple[int, int]) -> tuple[NDArra
 
 
 _SCALE = 1.2
-_MIN_STEPS = 24
 _PATCH_RADIUS = 15  # number of cells from the centre to the farthest test
 _TESTS = 256
 _MARGIN = 32  # at least _CLEARANCE lattice steps, stretched by 1.42, starting 5 cells beyond a face
@@ -217,7 +212,7 @@ def extract_sphorb(
 def grid_pyramid(width: int, levels: int) -> list[GeodesicGrid]:
     """Return geodesic grids for a panorama: cells of one pixel's area at the equator, then 1.2 times wider each."""
     finest = width / np.sqrt(10 * np.pi)
-    steps = [max(_MIN_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
+    steps = [max(24, round(finest / _SCALE**level)) for level in range(levels)]
     return [GeodesicGrid(n, _MARGIN) for n in dict.fromkeys(steps)]
 
 

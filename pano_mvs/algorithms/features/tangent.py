@@ -19,9 +19,8 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
-_ORB_SCALE, _ORB_LEVELS = 1.2, 8
+_ORB_SCALE = 1.2
 _ORB_SMOOTHING_PX = 1.2
-_EDGE_PX = 0.5
 # Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
 # slide.
 _SIFT_EDGE_RATIO = 20
@@ -116,7 +115,7 @@ def extract_orb(
     detector = cv2.ORB.create(
         nfeatures=max(500, max_keypoints // 5),
         scaleFactor=_ORB_SCALE,
-        nlevels=_ORB_LEVELS,
+        nlevels=8,
         edgeThreshold=24,
         fastThreshold=fast_threshold,
     )
@@ -196,7 +195,7 @@ def _owned(found: _Found, tile: PinholeView, tile_idx: int) -> _Found:
     Two tiles locate a key point on their common edge slightly differently, and each might assign it to the other. So
     each tile also keeps key points just beyond the edge, and the weaker duplicates are dropped later.
     """
-    return found[beyond_face_rad(tile.bearings_from_pixels(found.pixels_px), tile_idx) < _EDGE_PX / tile.focal_px]
+    return found[beyond_face_rad(tile.bearings_from_pixels(found.pixels_px), tile_idx) < 0.5 / tile.focal_px]
 
 
 def _angular_sizes(tile: PinholeView, found: _Found) -> NDArray[np.float64]:
@@ -272,7 +271,6 @@ def _parabola_top(
 _TILES = 20
 _PAD_PX = 4
 _MAX_WIDTH = 2560  # maximum width of panoramas whose maps are cached: 78 MB, 8 bytes a pixel plus one for the mask
-_OWNED_SLACK_PX = 2.0  # key points just beyond the edge are kept, and may be in a pixel with a more distant centre
 
 
 def sample_tile(panorama: NDArray[np.uint8], tile_idx: int) -> NDArray[np.uint8]:
@@ -314,6 +312,7 @@ def _owned_pixels(tile: PinholeView, tile_idx: int) -> NDArray[np.uint8]:
     for first in range(0, len(mask), 256):
         rays = tile.rays(slice(first, first + 256))
         bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        near = beyond_face_rad(bearings, tile_idx) < _OWNED_SLACK_PX / tile.focal_px
+        # Key points just beyond the edge are kept, and may be in a pixel with a more distant centre.
+        near = beyond_face_rad(bearings, tile_idx) < 2.0 / tile.focal_px
         mask[first : first + 256] = np.where(near, np.uint8(255), np.uint8(0))
     return mask

@@ -184,9 +184,6 @@ def _common_sides(
 # [1 2 1] along two spatial and three colour dimensions: the centre counts twice for each.
 _BLUR_CENTER = 10.0
 _BISTOCHASTIC_ITERATIONS = 10
-# Weight of a colour-blind initial guess for a pixel without range, so that a colour that only occurs inside a hole has
-# a value.
-_PRIOR_WEIGHT = 1e-4
 _TOLERANCE = 1e-4
 
 
@@ -293,7 +290,9 @@ def solve_bilateral(
 
     prior = _blind_guess(target, weight, cells)
     known = weight > 0
-    pull = np.where(known, weight, _PRIOR_WEIGHT)
+    # Weight of a colour-blind initial guess for a pixel without range, so that a colour that only occurs inside a hole
+    # has a value.
+    pull = np.where(known, weight, 1e-4)
     system = build_system(np.where(known, target, prior), pull, colors, cells=cells)
     count = len(system.mass)
     diagonal_gram = np.ascontiguousarray(np.einsum("eaa->ea", system.gram))

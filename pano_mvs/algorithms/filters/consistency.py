@@ -19,16 +19,11 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 _NEIGHBOURS = 4
-# Relative to the agreement of its neighbours. Cameras with true poses had 0.64 or more (rendered and synthetic rooms,
-# including plain ones; 4 to 9 views, 2 to 8 sources), lowest at the edge of a capture; cameras half a metre off had at
-# most 0.47.
-_MIN_SHARE_OF_NEIGHBOURS = 0.55
 # Cameras with true poses had at most 0.62, cameras half a metre off 0.63 or more. This is not sufficient alone: it
 # excludes views that agree little because their errors scatter.
 _MIN_ONE_WAY = 0.55
 # If neighbours agree with no view either, or little can be compared, nothing can be concluded.
 _MIN_AGREED, _MIN_COMPARED = 0.1, 0.2
-_MIN_VIEWS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +58,7 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
     one are not judged.
     """
     names = [name for name in agreements if name in centers and agreements[name].compared >= _MIN_COMPARED]
-    if len(names) < _MIN_VIEWS:
+    if len(names) < 3:
         return {}
     places = np.array([centers[name] for name in names])
     agreed = np.array([agreements[name].agreed for name in names])
@@ -71,7 +66,10 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
     for idx, (name, around) in enumerate(zip(names, nearest_views(places), strict=True)):
         usual = float(np.median(agreed[around]))
         one_way = agreements[name].one_way
-        if usual >= _MIN_AGREED and agreed[idx] < _MIN_SHARE_OF_NEIGHBOURS * usual and one_way >= _MIN_ONE_WAY:
+        # Relative to the agreement of its neighbours. Cameras with true poses had 0.64 or more (rendered and synthetic
+        # rooms, including plain ones; 4 to 9 views, 2 to 8 sources), lowest at the edge of a capture; cameras half a
+        # metre off had at most 0.47.
+        if usual >= _MIN_AGREED and agreed[idx] < 0.55 * usual and one_way >= _MIN_ONE_WAY:
             doubts[name] = (
                 f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: {100 * usual:.0f} "
                 f"%) and contradict {100 * one_way:.0f} % in one direction"
@@ -97,8 +95,6 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
         yield within[np.argsort(np.linalg.norm(places[within] - place, axis=1), kind="stable")[:count]]
 
 
-# Accuracy of range maps, as a fraction of a pixel.
-_PRECISION_PX = 0.2
 # Near a step like this, in ln range, it is uncertain to which side a pixel belongs.
 _DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
 # Of the sources that can compare a pixel, these must contradict it in one direction for it to count as contradicted.
@@ -197,7 +193,8 @@ def checked_with_agreement(
     )
     motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
     step = _step_around(reference.range)
-    grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
+    # Accuracy of range maps, as a fraction of a pixel.
+    grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + 0.2**2)
     grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
     low, high = CONSISTENT_CONFIDENCE
     graded = np.floor(low + (high - low) * grade).astype(np.uint8)

@@ -21,10 +21,6 @@ MaxHoleDeg: TypeAlias = Annotated[
 ]
 
 
-# Tuned on range maps of our sweep after the consistency check, of two scenes; any value from 0.03 to 0.003 works.
-_WEAK_WEIGHT, _FILLED_WEIGHT = 0.01, 0.0005
-
-
 def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the weight of the data term, in [0, 1], for each confidence c.
 
@@ -34,8 +30,9 @@ def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
     """
     filled, weak = FILLED_CONFIDENCE[1], WEAK_CONFIDENCE[1]
     c = confidence.astype(np.float64)
-    seen = np.where(confidence > weak, c / CONSISTENT_CONFIDENCE[1], _WEAK_WEIGHT * c / weak)
-    weight: NDArray[np.float64] = np.where(confidence > filled, seen, _FILLED_WEIGHT * c / filled)
+    # Tuned on range maps of our sweep after the consistency check, of two scenes; any value from 0.03 to 0.003 works.
+    seen = np.where(confidence > weak, c / CONSISTENT_CONFIDENCE[1], 0.01 * c / weak)
+    weight: NDArray[np.float64] = np.where(confidence > filled, seen, 0.0005 * c / filled)
     return weight
 
 

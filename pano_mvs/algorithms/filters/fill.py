@@ -73,10 +73,6 @@ def _distances(rays: NDArray[np.float64], goals: Mask, starts: Mask, *, reach: f
     return np.asarray(tree.query(rays[starts], distance_upper_bound=reach * (1 + 1e-12))[0], np.float64)
 
 
-# Neighbours with an inverse range larger than this times the background's belong to an occluder.
-_MAX_RATIO = 1.25
-
-
 @checks_settings
 def fill_from_neighbours(
     range_map: RangeMap,
@@ -112,7 +108,8 @@ def fill_from_neighbours(
     trusted = range_map.valid & (range_map.confidence >= min_confidence)
     known = 1 / range_map.range.astype(np.float64)
     columns = columns_per_step((height, width), steps=8)
-    inverse, distance = fill_holes(known, wanted, trusted, columns, min(max_distance_px, height), _MAX_RATIO)
+    # Neighbours with an inverse range larger than this times the background's belong to an occluder.
+    inverse, distance = fill_holes(known, wanted, trusted, columns, min(max_distance_px, height), 1.25)
     filled = distance > 0
     ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
     ranges[filled] = 1 / inverse[filled]

@@ -26,20 +26,12 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 _HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
-# Within a surface, colours change by less than this share from pixel to pixel.
-_COLOR_STEP, _DARKEST = 0.02, 20.0
-# Weight of pixels without texture relative to those of the outline.
-_BARE_WEIGHT = 0.1
 # The plane must be seen on most sides of the surface: extrapolation is unreliable.
 _SECTORS, _MIN_SECTORS = 8, 6
 _STEPS_BEYOND = 0.8, 1.3
-# Ranges within this many tolerances of the plane belong to it, but are imprecise.
-_SAME_SURFACE = 3.0
 # Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
 # has this share of the pixels of that one.
 _CLEAR_SHARE, _NEARLY = 0.8, 0.8
-# Pixels that see a parallel plane at a more grazing angle than this cosine say nothing about its distance.
-_GRAZING = 0.1
 
 
 @checks_settings
@@ -118,7 +110,8 @@ def lay_planes(
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.abs(1 / range_map.range[surface].astype(np.float64) / laid - 1)
             ranges[surface] = np.where(error <= max_relative_error, ranges[surface], 1 / laid)
-        far_off = ~(error <= _SAME_SURFACE * max_relative_error)
+        # Ranges within this many tolerances of the plane belong to it, but are imprecise.
+        far_off = ~(error <= 3.0 * max_relative_error)
         confidence[surface] = np.where(far_off, np.uint8(FILLED_CONFIDENCE[1]), confidence[surface])
     return with_ranges(range_map, ranges, confidence)
 
@@ -165,7 +158,8 @@ def _plane_fits(
     labels, bare = plain_surfaces(guide, contrast)
     area = np.broadcast_to(pixel_solid_angle((height, width))[:, None], (height, width))
     trusted = range_map.valid & (range_map.confidence >= min_confidence)
-    weight = np.where(bare, _BARE_WEIGHT, 1.0) * area
+    # Weight of pixels without texture relative to those of the outline.
+    weight = np.where(bare, 0.1, 1.0) * area
     margin = max(1, round(3 * height / 256))
     rays, inverse = ray_grid((height, width)), 1 / range_map.range.astype(np.float64)
     for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
@@ -190,7 +184,8 @@ def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: floa
     cosine = fit.rays @ normal
     if np.median(cosine) < 0:
         normal, cosine = -normal, -cosine
-    facing = cosine > _GRAZING
+    # Pixels that see a parallel plane at a more grazing angle than this cosine say nothing about its distance.
+    facing = cosine > 0.1
     if not facing.any():
         return replace(fit, on_plane=np.zeros_like(fit.on_plane))
     logs = np.sort(np.log(fit.inverse[facing] / cosine[facing]))
@@ -211,8 +206,9 @@ def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[n
     spread = largest_channel(cv2.dilate(smooth, window) - cv2.erode(smooth, window))
     inner = slice(4 * radius, -4 * radius)
     bare: Mask = spread[inner, inner] < contrast
-    luma = smooth[inner, inner].mean(axis=-1) + _DARKEST
-    labels = label_surfaces(np.where(bare, luma, np.float32(np.nan)).astype(np.float32), _COLOR_STEP)
+    # Within a surface, colours change by less than this share from pixel to pixel.
+    luma = smooth[inner, inner].mean(axis=-1) + 20.0
+    labels = label_surfaces(np.where(bare, luma, np.float32(np.nan)).astype(np.float32), 0.02)
     return labels.reshape(bare.shape), bare
 
 

@@ -16,10 +16,6 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
 _RADIUS = 2
-# Neighbours of one surface differ by less than this share of their range, and by fewer grey levels in every colour.
-_SAME_RANGE, _SAME_COLOR = 0.02, 20
-# Without as many grey levels between the darkest and the brightest pixel of the window, ranges agree by chance.
-_MIN_CONTRAST = 16
 
 
 def supported_pixels(range_map: RangeMap, guide: NDArray[np.uint8], *, min_confidence: int) -> Mask:
@@ -44,12 +40,15 @@ def supported_pixels(range_map: RangeMap, guide: NDArray[np.uint8], *, min_confi
     for row in range(2 * _RADIUS + 1):
         for column in range(2 * _RADIUS + 1):
             with np.errstate(invalid="ignore"):
-                same = np.abs(ranges[rows + row, columns + column] - own) < _SAME_RANGE * own
-            same &= largest_channel(np.abs(colors[rows + row, columns + column] - color)) < _SAME_COLOR
+                # Neighbours of one surface differ by less than this share of their range, and by fewer grey levels in
+                # every colour.
+                same = np.abs(ranges[rows + row, columns + column] - own) < 0.02 * own
+            same &= largest_channel(np.abs(colors[rows + row, columns + column] - color)) < 20
             supported[rows[same], columns[same]] = True
     return supported
 
 
 def has_texture(guide: NDArray[np.uint8]) -> Mask:
     """Return the pixels, (H, W), around which a colour has contrast."""
-    return contrast_around(guide, _RADIUS) >= _MIN_CONTRAST
+    # Without as many grey levels between the darkest and the brightest pixel of the window, ranges agree by chance.
+    return contrast_around(guide, _RADIUS) >= 16

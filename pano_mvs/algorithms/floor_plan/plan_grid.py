@@ -13,10 +13,8 @@ from pano_mvs.core.arrays import FloatArray
 
 _BINS = 400
 _SMOOTHING_BINS = 1.5
-_STRONG_SHARE = 0.25
 # A camera that is higher than this times the height of the lowest one above its floor stands on another floor.
 _SAME_STOREY = 2.0
-_MIN_POINTS = 50
 _QUANTILES = (0.005, 0.995)
 
 
@@ -95,14 +93,14 @@ def _with_ceiling(
 
 def _levels(heights: FloatArray, step: float) -> list[float]:
     """Return the heights of large level surfaces, in rising order."""
-    if len(heights) < _MIN_POINTS:
+    if len(heights) < 50:
         return []
     start = float(heights.min())
     counts = np.bincount(((heights - start) / step).astype(np.int64)).astype(np.float64)
     density = gaussian_filter1d(np.pad(counts, 4), _SMOOTHING_BINS, mode="constant")
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]))
-    strong = peaks[density[peaks] >= _STRONG_SHARE * density.max()]
+    strong = peaks[density[peaks] >= 0.25 * density.max()]
     middles = [start + (peak - 4 + 0.5) * step for peak in strong]
     return [float(np.median(heights[np.abs(heights - middle) < 3 * step])) for middle in middles]
 
@@ -111,10 +109,8 @@ LAYERS = 32
 """Number of layers between floor and ceiling in which walls are looked for."""
 
 _WALL_FROM, _WALL_TO = 0.08, 0.95
-_VERTICAL = 0.35
 _BELOW_FLOOR = 0.05
 _HEIGHT_BITS = 20
-_FILLED_PX = 6
 
 
 @dataclass(frozen=True)
@@ -208,7 +204,7 @@ class PlanGrid:
         distance, labels = cv2.distanceTransformWithLabels(
             (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
         )
-        near = distance <= _FILLED_PX
+        near = distance <= 6
         colors = np.zeros((int(labels.max()) + 1, 3), np.uint8)
         colors[labels[known]] = image[known]
         return np.where(near[..., None], colors[labels], np.uint8(0)), near
@@ -247,7 +243,7 @@ class PlanGrid:
     def _add_walls(self, points: FloatArray, normals: FloatArray) -> None:
         share = (points[:, 2] - self.storey.floor) / max(self.storey.height, 1e-12)
         index, inside = self.walls.cells(points[:, :2])
-        inside &= (share > _WALL_FROM) & (share < _WALL_TO) & (np.abs(normals[:, 2]) < _VERTICAL)
+        inside &= (share > _WALL_FROM) & (share < _WALL_TO) & (np.abs(normals[:, 2]) < 0.35)
         layer = ((share[inside] - _WALL_FROM) / (_WALL_TO - _WALL_FROM) * LAYERS).astype(np.uint32)
         chosen = index[inside]
         np.bitwise_or.at(self._layers, chosen, np.uint32(1) << np.minimum(layer, LAYERS - 1))
@@ -263,7 +259,7 @@ def _bits(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
 
 
 _PAPER, _INK, _CAMERA = (255, 255, 255), (24, 32, 56), (214, 72, 36)
-_STRIP_SHARE, _MIN_STRIP_PX = 0.06, 36
+_STRIP_SHARE = 0.06
 _BAR_SHARE = 0.25
 _SUBPIXEL_BITS = 4
 
@@ -281,7 +277,7 @@ def bar_length(width: float) -> float:
 
 def strip_px(size_hw: tuple[int, int]) -> int:
     """Return the rows of the strip for the scale bar below a plan of a size."""
-    return max(_MIN_STRIP_PX, round(_STRIP_SHARE * max(size_hw)))
+    return max(36, round(_STRIP_SHARE * max(size_hw)))
 
 
 def draw_plan(

@@ -17,25 +17,18 @@ from pano_mvs.algorithms.floor_plan.plan_grid import LAYERS, WallCells
 from pano_mvs.core.arrays import FloatArray
 
 _ANGLE_BINS = 180
-_MAX_LINES = 500
 # Cells belong to a line if they are this close, in cells, and their normals this similar.
 _NEAR_CELLS = 1.5
 _TAKEN_CELLS = 2.5
 _MAX_TURN_DEG = 25.0
 _CORNER_DEG = 20.0
-_PARALLEL_DEG = 3.0
-_MIN_FILLED = 0.4
-_FITS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Straight walls.
+    """Straight walls."""
 
-    Attributes:
-        ends_xy: (N, 2, 2) start and end of each; the side that was seen is on the left of the way from start to end.
-    """
-
+    # (N, 2, 2) start and end of each; the side that was seen is on the left of the way from start to end
     ends_xy: FloatArray
 
     @property
@@ -69,7 +62,7 @@ def wall_lines(cells: WallCells, *, min_share: float, min_length: float, max_gap
     origin = np.median(left.xy, axis=0)
     left = replace(left, xy=left.xy - origin)
     found: list[FloatArray] = []
-    for _ in range(_MAX_LINES):
+    for _ in range(500):
         line, support = _strongest(left)
         if line is None or support < 0.25 * min_share * LAYERS * min_length / cells.cell:
             break
@@ -110,7 +103,7 @@ def _of_line(line: _Line, cells: WallCells, *, within: float) -> NDArray[np.bool
 
 def _fitted(line: _Line, cells: WallCells) -> _Line:
     """Return the weighted total least-squares line of the cells near a line."""
-    for number in range(_FITS):
+    for number in range(3):
         near = cells.only(_of_line(line, cells, within=_NEAR_CELLS if number else _TAKEN_CELLS))
         if len(near.xy) < 3:
             return line
@@ -134,7 +127,7 @@ def _pieces(along: FloatArray, *, cell: float, max_gap: float, min_length: float
     for start, end in zip([0, *(breaks + 1)], [*breaks, len(ordered) - 1], strict=True):
         length = ordered[end] - ordered[start]
         filled = len(np.unique(np.floor((ordered[start : end + 1] - ordered[start]) / cell))) * cell
-        if length >= min_length and filled >= _MIN_FILLED * length:
+        if length >= min_length and filled >= 0.4 * length:
             # The mean position in the outermost cells is half a cell inside.
             pieces.append((float(ordered[start] - cell / 2), float(ordered[end] + cell / 2)))
     return pieces
@@ -159,7 +152,7 @@ def _union(first: FloatArray, second: FloatArray, *, near: float, max_gap: float
     length = float(np.linalg.norm(first[1] - first[0]))
     along = (first[1] - first[0]) / length
     direction = (second[1] - second[0]) / np.linalg.norm(second[1] - second[0])
-    if along @ direction < np.cos(np.deg2rad(_PARALLEL_DEG)):
+    if along @ direction < np.cos(np.deg2rad(3.0)):
         return None
     offset = second - first[0]
     if np.abs(offset @ [along[1], -along[0]]).max() > near:

@@ -30,10 +30,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 Grid = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-# If two views see a surface about equally well, the earlier one contributes it: it may be 5 % worse, and the later one
-# must be 3 % better. Points between these limits are written twice, so that small errors of the footprints leave no
-# gap.
-_EARLIER_MAY_BE_WORSE, _LATER_MUST_BE_BETTER = 1.05, 0.97
 _SUPPORT_RADIUS = 2
 _MAX_SUPPORT_STEP = 0.03
 
@@ -245,7 +241,10 @@ def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings)
 
 def _tie(*, is_earlier: bool) -> float:
     """Return the factor on the largest footprint ratio that breaks ties with an earlier or a later source."""
-    return _LATER_MUST_BE_BETTER if is_earlier else _EARLIER_MAY_BE_WORSE
+    # If two views see a surface about equally well, the earlier one contributes it: it may be 5 % worse, and the later
+    # one must be 3 % better. Points between these limits are written twice, so that small errors of the footprints
+    # leave no gap.
+    return 0.97 if is_earlier else 1.05
 
 
 def _normals_or_views(

@@ -19,15 +19,10 @@ IntArray = NDArray[np.int64]
 _PASSES = 2
 # Neighbours count within this many standard deviations of the point's position.
 _REACH = 2.0
-# Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
-_MOST_UNCERTAIN = 0.03
 _POINTS_PER_COLUMN = 12
-_POINTS_AT_ONCE = 1 << 14
 # Points that are sorted into cells together, and those that are moved together: they bound the memory.
 _POINTS_OF_SLAB, _POINTS_OF_PART = 2_000_000, 1_000_000
-# Points with a smaller standard deviation, relative to the same distance, stay where they are.
-_LEAST_UNCERTAIN = 0.005
-_MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
+_MAX_LEVELS = 16
 
 
 def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1) -> PointCloud:
@@ -48,8 +43,10 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     tree, distances = cKDTree(centers), np.empty(len(points), np.float32)
     for part in _parts(len(points)):
         distances[part] = tree.query(points[part])[0]
-    sigmas = np.maximum(np.minimum(cloud.uncertainty, _MOST_UNCERTAIN * distances), np.float32(1e-12))
-    chosen = sigmas >= _LEAST_UNCERTAIN * distances
+    # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
+    sigmas = np.maximum(np.minimum(cloud.uncertainty, 0.03 * distances), np.float32(1e-12))
+    # Points with a smaller standard deviation, relative to the same distance, stay where they are.
+    chosen = sigmas >= 0.005 * distances
     del distances
     for _ in range(_PASSES):
         heights = surface_heights(points, normals, sigmas, chosen=chosen, threads=threads)
@@ -104,7 +101,7 @@ def surface_heights(
             ) -> None:
                 find_heights(cloud, arrays[0], targets, cells, per_column, arrays[1], (first, first + count))
 
-            for_bands(find, len(targets), threads=threads, band_rows=_POINTS_AT_ONCE)
+            for_bands(find, len(targets), threads=threads, band_rows=1 << 14)
             heights[around] = np.where(own, found, heights[around])
     return heights
 
@@ -155,7 +152,7 @@ def _levels(
     radii = _REACH * sigmas[wanted].astype(np.float64)
     extent = float((grid[1] - grid[0]).max())
     most = float(radii.max()) / 2 ** (_MAX_LEVELS - 1)
-    least = max(float(np.quantile(radii, 0.3)), most, extent / _MAX_CELLS_PER_AXIS)
+    least = max(float(np.quantile(radii, 0.3)), most, extent / (1 << 20))
     del radii
     for part in _parts(len(sigmas)):
         level = np.ceil(np.log2(np.maximum(_REACH * sigmas[part].astype(np.float64) / least, 1))).astype(np.int8)

@@ -23,7 +23,6 @@ from pano_mvs.scene import Features
 # Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
 _RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
 _SHARE = 4  # times the mean number of key points of a view, at most
-_MOST_BY_COLMAP = 2048  # key points of a view that COLMAP's file describes, its own default
 
 
 @checks_settings
@@ -47,7 +46,6 @@ def extract_aliked(
         mask: (H, W) bool; masked (False) pixels have no key points.
         ups: directions (3,) in the camera frame that may be the zenith, at least one.
         max_keypoints: maximum number of key points for each of `ups`, spread evenly over the sphere.
-        threshold: minimum score.
         networks: the network files and what executes them.
 
     Raises:
@@ -132,8 +130,9 @@ def described_tile(
     """
     planes = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
     if extractor := networks.of_colmap("extractor"):
+        # Key points of a view that COLMAP's file describes, its own default.
         places, found, strengths = extractor(
-            image=planes, max_keypoints=np.array(_MOST_BY_COLMAP), min_score=np.array(threshold, np.float32)
+            image=planes, max_keypoints=np.array(2048), min_score=np.array(threshold, np.float32)
         )
         # -1 … 1 between the centres of the outermost pixels.
         pixels = (places[0].astype(np.float64) + 1) * ((TILE_PX - 1) / 2)

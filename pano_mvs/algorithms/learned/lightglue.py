@@ -41,7 +41,6 @@ def match_learned(
     Args:
         first: key points of the first image; only the learned ones are matched.
         second: key points of the second image.
-        min_score: minimum probability of a match.
         max_views: how many of the 256 or more pairs of views are compared, those with the most similar descriptors.
         networks: the network files and what executes them.
 
@@ -149,17 +148,11 @@ def _matched_by_colmap(
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """The learned key points of a panorama in its level views, for each direction that may be up.
+    """The learned key points of a panorama in its level views, for each direction that may be up."""
 
-    Attributes:
-        descriptors: (N, 128) whole numbers, of length `DESCRIPTOR_NORM`.
-        places: (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them.
-        ups: number of directions that may be up.
-    """
-
-    descriptors: Array
-    places: Array
-    ups: int
+    descriptors: Array  # (N, 128) whole numbers, of length `DESCRIPTOR_NORM`
+    places: Array  # (V, N, 2) positions in the views, −1 … 1 from edge to edge; NaN outside of them
+    ups: int  # number of directions that may be up
 
     @classmethod
     def of(cls, features: Features) -> Side:

@@ -54,15 +54,11 @@ _PROVIDERS: Mapping[Provider, str] = {
 
 @dataclass(frozen=True)
 class Networks:
-    """Where the networks are read from and what executes them.
+    """Where the networks are read from and what executes them."""
 
-    Attributes:
-        models: folder with one's own files, named as in `DIGESTS`, or with COLMAP's; None takes those of the package.
-        provider: what ONNX Runtime executes them with.
-    """
-
+    # folder with one's own files, named as in `DIGESTS`, or with COLMAP's; None takes those of the package
     models: Path | None = None
-    provider: Provider = "cpu"
+    provider: Provider = "cpu"  # what ONNX Runtime executes them with
 
     def load(self, file: str) -> Network:
         """Return a network, loaded once per process.
@@ -170,7 +166,6 @@ class Network:
     """
 
     def __init__(self, session: Any) -> None:
-        """Wrap a session of ONNX Runtime."""
         self._session = session
 
     @property

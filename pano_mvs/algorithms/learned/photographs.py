@@ -19,27 +19,18 @@ _THRESHOLD, _MIN_SCORE = 0.01, 0.1  # of key points and matches, as in `extract_
 
 @dataclass(frozen=True, eq=False)
 class PhotographView:
-    """The learned key points of a photograph, strongest first.
+    """The learned key points of a photograph, strongest first."""
 
-    Attributes:
-        pixels_px: (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner.
-        descriptors: (N, 128) float32 whole numbers, of length `DESCRIPTOR_NORM`.
-        places: (N, 2) float32 positions in the square picture that the network saw, −1 … 1 from edge to edge.
-    """
-
-    pixels_px: NDArray[np.float64]
-    descriptors: Array
-    places: Array
+    pixels_px: NDArray[np.float64]  # (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner
+    descriptors: Array  # (N, 128) float32 whole numbers, of length `DESCRIPTOR_NORM`
+    places: Array  # (N, 2) float32 positions in the square picture that the network saw, −1 … 1 from edge to edge
 
 
-def view_of_photograph(
-    picture: NDArray[np.uint8], *, max_keypoints: int = 1500, networks: Networks = PACKAGED
-) -> PhotographView:
-    """Return the strongest ALIKED key points of a photograph, which is reduced or enlarged to 512 pixels.
+def view_of_photograph(picture: NDArray[np.uint8], *, networks: Networks = PACKAGED) -> PhotographView:
+    """Return the 1,500 strongest ALIKED key points of a photograph, which is reduced or enlarged to 512 pixels.
 
     Args:
         picture: (H, W, 3) uint8 RGB.
-        max_keypoints: maximum number of key points.
         networks: the network files and what executes them.
     """
     scale = TILE_PX / max(picture.shape[:2])
@@ -52,7 +43,7 @@ def view_of_photograph(
     def strongest(pixels: NDArray[np.float64], scores: Array) -> NDArray[np.intp]:
         order = np.argsort(-scores, kind="stable")
         x, y = pixels[order].astype(int).T
-        return np.asarray(order[inside[y, x]][:max_keypoints])
+        return np.asarray(order[inside[y, x]][:1500])
 
     tile = described_tile(square, strongest, threshold=_THRESHOLD, networks=networks)
     pixels = tile.pixels_px
@@ -62,14 +53,13 @@ def view_of_photograph(
 
 
 def match_photograph(
-    photograph: PhotographView, panorama: Features, *, max_views: int = 4, networks: Networks = PACKAGED
+    photograph: PhotographView, panorama: Features, *, networks: Networks = PACKAGED
 ) -> NDArray[np.int32]:
-    """Match the learned key points of a photograph and a panorama by LightGlue.
+    """Match the learned key points of a photograph and the four most similar level views of a panorama by LightGlue.
 
     Args:
         photograph: its key points.
         panorama: key points of the panorama, of which only the learned ones are matched.
-        max_views: number of level views of the panorama that are compared, those most alike.
         networks: the network files and what executes them.
 
     Returns:
@@ -83,7 +73,7 @@ def match_photograph(
     glue = LightGlue(networks)
     seen = photograph.descriptors / np.float32(DESCRIPTOR_NORM), photograph.places
     found = [np.zeros((0, 2), np.int64)]
-    for view in np.argsort(-counts, kind="stable")[:max_views].tolist():
+    for view in np.argsort(-counts, kind="stable")[:4].tolist():
         idx, *shown = side.inside(view)
         matches, _ = glue.match(seen, shown, min_score=_MIN_SCORE)
         found.append(np.stack([matches[:, 0], idx[matches[:, 1]] + len(panorama) - panorama.learned], axis=1))

@@ -28,10 +28,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 Output: TypeAlias = Literal["range", "inverse_range"]
 
-_ITERATIONS = 20
-_LEAST_ERROR = 1e-3  # relative errors below this weigh the same
-_NORMAL = 1.4826  # standard deviations of a normal distribution per median absolute deviation
-
 
 @checks_settings
 def network_values(
@@ -54,8 +50,6 @@ def network_values(
         network: with one input (1, 3, h, w) float32 and a first output of h' × w' values, at any resolution.
         picture: (H, W, 3) RGB panorama.
         width: columns of the panorama that the network gets, with half as many rows, where the file leaves them open.
-        mean: of the network's training pictures, subtracted from red, green and blue in [0, 1].
-        std: what the differences are divided by.
 
     Raises:
         UsageError: if the network has another input or output, or a divisor is not positive.
@@ -93,9 +87,7 @@ def fill_from_prior(
         range_map: (H, W) with even W, the full sphere.
         guide: (H, W, 3) RGB panorama.
         prior: (H, W) the network's values; NaN where it has none.
-        output: "range": values proportional to the range; "inverse_range": a linear function of 1/range.
         valid: (H, W) pixels that may have a range; None: all.
-        block_deg: side of the areas that are left out in turn to measure the error.
 
     Returns:
         The range map and the relative standard deviation of the network's ranges: their deviation from confirmed ranges
@@ -117,7 +109,8 @@ def fill_from_prior(
         error = np.abs(np.log(aligned / range_map.range[part]))
         errors.append(np.where(np.isfinite(error), error, np.inf))
         constants.append(np.abs(np.log(range_map.range[part] / np.median(range_map.range[other]))))
-    sigma, constant = (_NORMAL * float(np.median(np.concatenate(each))) for each in (errors, constants))
+    # Standard deviations of a normal distribution per median absolute deviation.
+    sigma, constant = (1.4826 * float(np.median(np.concatenate(each))) for each in (errors, constants))
     if not sigma < constant:
         return range_map, float("inf")
     laid = _aligned(range_map, guide, prior, weight=np.where(known, weight, 0), output=output)
@@ -146,10 +139,11 @@ def _aligned(
     relative = np.stack([own, np.full_like(own, inverse)], axis=-1) / target[:, None]
     scale = shift = 0.0
     robust: FloatArray = weight[known]
-    for _ in range(_ITERATIONS):  # of least absolute relative errors, by weighted squares
+    for _ in range(20):  # of least absolute relative errors, by weighted squares
         root = np.sqrt(robust)
         scale, shift = np.linalg.lstsq(relative * root[:, None], root, rcond=None)[0]
-        robust = weight[known] / np.maximum(np.abs(relative @ np.array([scale, shift]) - 1), _LEAST_ERROR)
+        # Relative errors below this weigh the same.
+        robust = weight[known] / np.maximum(np.abs(relative @ np.array([scale, shift]) - 1), 1e-3)
     values = prior * scale + shift
     inside = (values >= target.min()) & (values <= target.max())
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,8 +14,6 @@ from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Pairs, TwoView, WeakImages
 
-_SAMPLE = 1000
-
 
 @checks_settings
 def weak_images(
@@ -36,11 +34,9 @@ def weak_images(
     Args:
         features: key points of all images, in the capture's order.
         matches: the verified pairs.
-        learned: which images count as weak.
         min_share: number of matches by which a pair connects its images well, as a share of the key points of the image
             that has fewer. In dense captures, the least share that connects all images is .02 to .15, in tours .005 to
             .012.
-        partners: number of other images for each weak one, the most similar by their descriptors.
     """
     names = list(features)
     if learned != "auto":
@@ -78,10 +74,9 @@ def learned_pairs(
     Args:
         features: key points of all images, in the capture's order.
         matches: pairs that were compared without a network.
-        neighbours: number of images for each.
     """
     descriptors = {
-        name: vlad_descriptor(one.only_learned(), sample=_SAMPLE) for name, one in features.items() if one.learned
+        name: vlad_descriptor(one.only_learned(), sample=1000) for name, one in features.items() if one.learned
     }
     found = retrieval_pairs(list(descriptors), descriptors, neighbours=neighbours)
     verified = {pair for pair, view in (matches or {}).items() if view and descriptors.keys() >= {*pair}}

@@ -19,38 +19,24 @@ INTRINSICS = 7  # f, cx, cy, k1, k2, k3, k4
 RIG = slice(2 * INTRINSICS, 2 * INTRINSICS + 6)
 CAMERAS = RIG.stop
 _FIRST_DAMPING = 1e-4
-_CONVERGED = 1e-5
 _GAUGE_WEIGHT = 1e8
 _LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class RigBundle:
-    """Lenses, cameras, points and observations.
+    """Lenses, cameras, points and observations."""
 
-    Attributes:
-        lenses: (2, 7) f, cx, cy, k1, k2, k3, k4 of each lens, in pixels.
-        turn: (3, 3) rotation of second_lens_from_first.
-        offset: (3,) its translation, in units of the world.
-        rotations: (N, 3, 3) of first_lens_from_world of each camera; the first camera is held.
-        translations: (N, 3).
-        points: (P, 3) in the world.
-        pixels: (M, 2) observed.
-        lens_idx: (M,) lens of each observation: 0 or 1.
-        camera_idx: (M,) its camera.
-        point_idx: (M,) its point.
-    """
-
-    lenses: FloatArray
-    turn: FloatArray
-    offset: FloatArray
-    rotations: FloatArray
-    translations: FloatArray
-    points: FloatArray
-    pixels: FloatArray
-    lens_idx: NDArray[np.intp]
-    camera_idx: NDArray[np.intp]
-    point_idx: NDArray[np.intp]
+    lenses: FloatArray  # (2, 7) f, cx, cy, k1, k2, k3, k4 of each lens, in pixels
+    turn: FloatArray  # (3, 3) rotation of second_lens_from_first
+    offset: FloatArray  # (3,) its translation, in units of the world
+    rotations: FloatArray  # (N, 3, 3) of first_lens_from_world of each camera; the first camera is held
+    translations: FloatArray  # (N, 3)
+    points: FloatArray  # (P, 3) in the world
+    pixels: FloatArray  # (M, 2) observed
+    lens_idx: NDArray[np.intp]  # (M,) lens of each observation: 0 or 1
+    camera_idx: NDArray[np.intp]  # (M,) its camera
+    point_idx: NDArray[np.intp]  # (M,) its point
 
     def only(self, keep: NDArray[np.bool_]) -> RigBundle:
         """Return the bundle with some of its observations, and the points that two or more of them see."""
@@ -69,16 +55,12 @@ class RigBundle:
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """What is adjusted, and what is known about it before.
+    """What is adjusted, and what is known about it before."""
 
-    Attributes:
-        sigmas: (20,) standard deviations of f, cx, cy and k1 to k4 of both lenses, the rotation (radians) and the
-            offset of the second lens about their start values; 0 holds a value, inf leaves it free.
-        start: (20,) the start values; those of the rotation are 0.
-    """
-
+    # (20,) standard deviations of f, cx, cy and k1 to k4 of both lenses, the rotation (radians) and the offset of the
+    # second lens about their start values; 0 holds a value, inf leaves it free
     sigmas: FloatArray
-    start: FloatArray
+    start: FloatArray  # (20,) the start values; those of the rotation are 0
 
 
 def residuals_px(bundle: RigBundle) -> FloatArray:
@@ -113,7 +95,7 @@ def adjust_rig(
             continue
         gained = (system.cost - trial.cost) / system.cost
         bundle, turned, system, damping = moved, more, trial, max(damping / 5, 1e-9)
-        if gained < _CONVERGED:
+        if gained < 1e-5:
             break
     return bundle, system.covariance()
 

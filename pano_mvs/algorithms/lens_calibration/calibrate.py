@@ -45,7 +45,6 @@ from pano_mvs.scene.pose_groups import split_groups
 View = tuple[int, int]
 """Number of a capture, and of a lens: 0 or 1."""
 
-_MAX_WIDTH = 2560
 # All key points are matched between the rims, some of them between captures, and some of the tracks are adjusted.
 _KEYPOINTS, _BETWEEN_CAPTURES, _MAX_POINTS = 6000, 2500, 2500
 # The edge of the circle is blurred: key points and the field of view end at this share of its radius.
@@ -56,51 +55,34 @@ _SIGMA_FOCAL, _SIGMA_CENTER = 0.2, 0.05
 _SIGMA_DISTORTION = (0.1, 0.05, 0.02, 0.005)
 _SIGMA_TURN_RAD = float(np.radians(10))
 
-_RIM_DEG = 75.0
 _RIM_SCALES = np.arange(0.85, 1.151, 0.01)
 _RIM_MIN, _RIM_THRESHOLD_DEG = 12, 1.5
-_MAX_TILT_DEG = 15.0
 
 # Maximum error of a match in each round, and whether the offset of the second lens is adjusted.
 _ROUNDS = ((1.0, False), (0.3, True), (0.15, True))
 _MIN_ANGLE_DEG = 1.0
 _MIN_OBSERVATIONS = 300
 _MAX_RAY_STD_DEG = 0.1
-_MAX_OFFSET_STD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The lenses of a camera, as found in a capture.
+    """The lenses of a camera, as found in a capture."""
 
-    Attributes:
-        lenses: both lenses.
-        second_from_first: pose of the second lens; the translation has length 1, or 0 if it is not determined.
-        offset_std: standard deviation of the offset, relative to its length; NaN if it is not determined.
-        turn_std_deg: standard deviation of the rotation about its least certain axis.
-        focal_std_px: of each lens.
-        principal_std_px: of each lens, in its less certain direction.
-        ray_std_deg: (2,) standard deviation of the angle from the axis, the largest in the field that was observed.
-        observed_deg: angle from the axis within which 99 % of the observations of each lens lie.
-        residual_px: median distance of an observation from the projection of its point.
-        captures: number of captures with a pose.
-        observations: number of observations.
-        circles: the image circle of each lens.
-        rim_matches: matches between the rims of both lenses that determined the start values; 0 if too few were found.
-    """
-
-    lenses: tuple[FisheyeLens, FisheyeLens]
-    second_from_first: Rigid3
-    offset_std: float
-    turn_std_deg: float
-    focal_std_px: tuple[float, float]
-    principal_std_px: tuple[float, float]
+    lenses: tuple[FisheyeLens, FisheyeLens]  # both lenses
+    second_from_first: Rigid3  # pose of the second lens; the translation has length 1, or 0 if it is not determined
+    offset_std: float  # standard deviation of the offset, relative to its length; NaN if it is not determined
+    turn_std_deg: float  # standard deviation of the rotation about its least certain axis
+    focal_std_px: tuple[float, float]  # of each lens
+    principal_std_px: tuple[float, float]  # of each lens, in its less certain direction
+    # (2,) standard deviation of the angle from the axis, the largest in the field that was observed
     ray_std_deg: tuple[float, float]
-    observed_deg: tuple[float, float]
-    residual_px: float
-    captures: int
-    observations: int
-    circles: tuple[ImageCircle, ImageCircle]
+    observed_deg: tuple[float, float]  # angle from the axis within which 99 % of the observations of each lens lie
+    residual_px: float  # median distance of an observation from the projection of its point
+    captures: int  # number of captures with a pose
+    observations: int  # number of observations
+    circles: tuple[ImageCircle, ImageCircle]  # the image circle of each lens
+    # matches between the rims of both lenses that determined the start values; 0 if too few were found
     rim_matches: int
 
 
@@ -177,7 +159,7 @@ def calibrate_lenses(
     offset_std = np.nan
     if length > 0:
         offset_std = float(np.sqrt(np.linalg.eigvalsh(covariance[RIG, RIG][3:, 3:])[-1])) / length
-    if length > 0 and not offset_std < _MAX_OFFSET_STD:
+    if length > 0 and not offset_std < 0.2:
         bundle, covariance = _adjusted(
             seen, state, _freedom(state, centers, with_offset=False), threshold_deg=2 * _ROUNDS[-1][0]
         )
@@ -208,7 +190,7 @@ def _observed(
 ) -> _Seen:
     """Return key points, found in panoramas of one lens each, and their matches."""
     features, pixels, matches = {}, {}, {}
-    width = min(_MAX_WIDTH, round(2 * np.pi * max(lens.focal_xy[0] for lens in lenses)) // 4 * 4)
+    width = min(2560, round(2 * np.pi * max(lens.focal_xy[0] for lens in lenses)) // 4 * 4)
     for capture, lens_idx in product(range(count), (0, 1)):
         if lens_idx == 0:
             progress(f"finding key points, capture {capture + 1} of {count}")
@@ -234,7 +216,7 @@ def _observed(
 
 
 def _rim(features: Features) -> NDArray[np.intp]:
-    return np.flatnonzero(features.bearings[:, 2] < np.cos(np.radians(_RIM_DEG)))
+    return np.flatnonzero(features.bearings[:, 2] < np.cos(np.radians(75.0)))
 
 
 def _part(features: Features, chosen: NDArray[np.intp]) -> Features:
@@ -253,7 +235,7 @@ def _start_rigs(
     p, q = (
         np.concatenate(
             [
-                seen.features[capture, lens].bearings[_rim_matches(seen, capture)[:, lens]]
+                seen.features[capture, lens].bearings[seen.matches[(capture, 0), (capture, 1)][:, lens]]
                 for capture in range(seen.count)
             ]
         )
@@ -265,7 +247,7 @@ def _start_rigs(
             _scaled(p, scale), _scaled(q, scale), rng=rng, threshold_rad=float(np.radians(_RIM_THRESHOLD_DEG))
         )
         tilt = np.degrees(np.arccos(np.clip(-rotation[2, 2], -1, 1)))
-        if tilt < _MAX_TILT_DEG and inliers.sum() > best.sum():
+        if tilt < 15.0 and inliers.sum() > best.sum():
             best_rotation, best_scale, best = rotation, float(scale), inliers
     if best.sum() >= _RIM_MIN:
         # Opposite lenses see a point at angles from their axes that sum to 180°; a tilt cancels over the circumference.
@@ -275,10 +257,6 @@ def _start_rigs(
         return [_State(known, Rigid3(best_rotation, np.zeros(3)), {})], int(best.sum())
     turns = [rotation_from_rotvec(np.array([0.0, 0.0, quarter * np.pi / 2])) for quarter in range(4)]
     return [_State(lenses, Rigid3(turn @ halfway, np.zeros(3)), {}) for turn in turns], 0
-
-
-def _rim_matches(seen: _Seen, capture: int) -> NDArray[np.int32]:
-    return seen.matches[(capture, 0), (capture, 1)]
 
 
 def _scaled(bearings: FloatArray, scale: float) -> FloatArray:

@@ -13,29 +13,16 @@ from scipy.optimize import least_squares
 from pano_mvs.core.arrays import FloatArray, Picture
 
 _DIRECTIONS = 720
-_SEARCHED_PX = 1000
-# A pixel belongs to the circle if it is brighter than the surround by this share of the brightness inside.
-_EDGE_SHARE = 0.12
-_MIN_CONTRAST = 12.0
-# A circle that the border of the picture cuts must be seen along a third of its circumference.
-_MIN_SEEN = 1 / 3
-_MAX_RESIDUAL = 0.01
 
 
 @dataclass(frozen=True)
 class ImageCircle:
-    """The image circle of a lens.
+    """The image circle of a lens."""
 
-    Attributes:
-        center_xy: its centre in pixels.
-        residual_px: median distance of the edge from the circle.
-        seen: share of the circumference where the edge was found.
-    """
-
-    center_xy: tuple[float, float]
+    center_xy: tuple[float, float]  # its centre in pixels
     radius_px: float
-    residual_px: float
-    seen: float
+    residual_px: float  # median distance of the edge from the circle
+    seen: float  # share of the circumference where the edge was found
 
 
 def brightest(pictures: Iterable[Picture]) -> NDArray[np.uint8]:
@@ -58,7 +45,7 @@ def find_circle(brightness: NDArray[np.uint8]) -> ImageCircle | None:
         brightness: (H, W) uint8, see `brightest`.
     """
     height, width = brightness.shape
-    scale = min(1.0, _SEARCHED_PX / max(height, width))
+    scale = min(1.0, 1000 / max(height, width))
     size_xy = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = cv2.resize(brightness, size_xy, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.5).astype(np.float64)
@@ -72,11 +59,13 @@ def find_circle(brightness: NDArray[np.uint8]) -> ImageCircle | None:
     line = cv2.remap(smooth, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = np.median(line[: int(0.3 * min(size_xy))])
     dark = float(np.percentile(_corners(smooth), 50))
-    level = dark + max(_MIN_CONTRAST, _EDGE_SHARE * (inside - dark))
+    # A pixel belongs to the circle if it is brighter than the surround by this share of the brightness inside.
+    level = dark + max(12.0, 0.12 * (inside - dark))
     bright = (line > level) & (steps[:, None] <= reach)
     last = len(steps) - 1 - np.argmax(bright[::-1], axis=0)
     found = bright.any(axis=0) & (last < reach - 2) & (inside > level)
-    if found.mean() < _MIN_SEEN:
+    # A circle that the border of the picture cuts must be seen along a third of its circumference.
+    if found.mean() < 1 / 3:
         return None
     columns = np.flatnonzero(found)
     before, after = line[last[columns], columns], line[last[columns] + 1, columns]
@@ -85,7 +74,7 @@ def find_circle(brightness: NDArray[np.uint8]) -> ImageCircle | None:
     start = np.array([*middle, np.median(edge)])
     fit = least_squares(_distances, start, args=(points,), loss="cauchy", f_scale=0.5)
     residual = float(np.median(np.abs(_distances(fit.x, points))))
-    if residual > _MAX_RESIDUAL * fit.x[2]:
+    if residual > 0.01 * fit.x[2]:
         return None
     x, y, radius = fit.x / scale
     return ImageCircle((float(x), float(y)), float(radius), residual / scale, float(found.mean()))

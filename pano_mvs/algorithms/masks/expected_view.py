@@ -23,9 +23,6 @@ Plane = NDArray[np.float32]
 _SAME = 0.06
 # The ground is a plane through points this far below the horizon, as flat as this.
 _GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
-_GROUND_TRIALS = 60
-# Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
-_AROUND_DEG = 1.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,22 +41,15 @@ class OtherView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """What other views expect of a panorama, (H, W) each.
+    """What other views expect of a panorama, (H, W) each."""
 
-    Attributes:
-        ranges: where they put the nearest surface; NaN if they do not know.
-        ground: whether that is the ground.
-        difference: by how many grey levels the panorama's colour differs from all that the views show there and around
-            it, NaN unless two of them see the surface.
-        ratio: (H, W, 3) the panorama's colours on the ground divided by the median of theirs; NaN elsewhere.
-        height: the camera's height above the ground, in scene units; NaN if it is not known.
-    """
-
-    ranges: Plane
-    ground: Mask
+    ranges: Plane  # where they put the nearest surface; NaN if they do not know
+    ground: Mask  # whether that is the ground
+    # by how many grey levels the panorama's colour differs from all that the views show there and around it, NaN unless
+    # two of them see the surface
     difference: Plane
-    ratio: Plane
-    height: float
+    ratio: Plane  # (H, W, 3) the panorama's colours on the ground divided by the median of theirs; NaN elsewhere
+    height: float  # the camera's height above the ground, in scene units; NaN if it is not known
 
 
 def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherView]) -> Expected:
@@ -112,7 +102,7 @@ def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
     points = points[rng.permutation(len(points))[:3000]]
     best: FloatArray | None = None
     most = _MIN_GROUND_POINTS
-    for _ in range(_GROUND_TRIALS):
+    for _ in range(60):
         plane = _plane_through(points[rng.choice(len(points), 3, replace=False)])
         if plane is None:
             continue
@@ -235,7 +225,8 @@ def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp]
 def _colors_around(picture: Picture) -> Plane:
     """Return the darkest, the mean and the lightest colours around each pixel, (3, 3, H W): which, colour and pixel."""
     smooth = mean_around(picture)
-    around = max(1, round(_AROUND_DEG * len(picture) / 180))
+    # Views differ by a pixel or two where poses or ranges are not exact: colours within this angle count as well.
+    around = max(1, round(1.4 * len(picture) / 180))
     window = square_window(around)
     darkest, lightest = (
         filtered(smooth, around, lambda padded, extreme=extreme: extreme(padded, window))  # type: ignore[misc]

@@ -33,24 +33,18 @@ MAX_OTHERS = 6
 
 # Differences of colour, in grey levels, from which an area is changed, and at least somewhere in it.
 _CHANGED, _CERTAIN = 10.0, 24.0
-_MIN_CERTAIN_SHARE = 0.15
 # The operator reaches to within this angle of straight down. What touches the operator's mask is within the other.
 _NADIR_DEG, _REACH_DEG = 30.0, 75.0
 # The mean probability of a person, by the network: of an area below the camera, where an operator is expected, and of
 # others. Furniture that the other views hide can have 0.77, and has 0.00 below the camera.
 _OPERATOR, _PERSON = 0.04, 0.85
-# As far around an area, the network's pixels belong to the person.
-_PERSON_REACH_DEG = 4.0
 # A vehicle's length, height and distance, in heights of the camera; it fills much of its outline.
 _VEHICLE_LENGTH, _VEHICLE_HEIGHT = (0.8, 4.5), (0.35, 1.5)
-_MIN_FILLED = 0.55
 # There are no vehicles in rooms: below a surface that other views see over this share of what is within an angle of
 # straight up, in the median at most this many heights of the camera away.
 _CEILING_DEG, _MIN_CEILING_SHARE, _MAX_CEILING = 45.0, 0.5, 4.0
-_MIN_ON_GROUND, _MIN_ENDS_ON_GROUND = 0.15, 0.5
 # A shadow is at least this bright, at most that bright, and changes the channels alike.
 _SHADOW, _MAX_TINT = (0.28, 0.88), 0.13
-_BESIDE_MASK = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +127,7 @@ def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask
     certain = opened & (np.nan_to_num(expected.difference) > _CERTAIN)
     share = np.bincount(labels[certain], weights[certain], labels.size) / np.maximum(sizes, 1e-9)
     least = min_area_deg2 / SQUARE_DEG_OF_SPHERE * weights.sum()
-    return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= _MIN_CERTAIN_SHARE))]
+    return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= 0.15))]
 
 
 def _extends_mask(area: Mask, masked: Mask) -> bool:
@@ -145,7 +139,7 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
     if weights[within].sum() < 0.9 * weights[area].sum():
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
-    return bool(border_shares(labels, dilated(masked, 1))[0] > _BESIDE_MASK)
+    return bool(border_shares(labels, dilated(masked, 1))[0] > 0.15)
 
 
 def _person_in(seen: SeenPanorama, area: Mask, *, passers_by: bool) -> Mask:
@@ -156,7 +150,8 @@ def _person_in(seen: SeenPanorama, area: Mask, *, passers_by: bool) -> Mask:
         return nobody
     probability, pixels = person_at(seen, area, least=_OPERATOR if below else _PERSON)
     if passers_by and probability >= _PERSON:
-        reach = max(1, round(_PERSON_REACH_DEG * len(area) / 180))
+        # As far around an area, the network's pixels belong to the person.
+        reach = max(1, round(4.0 * len(area) / 180))
         return area | (pixels & dilated(area, reach))
     return area if below and probability >= _OPERATOR else nobody
 
@@ -167,7 +162,7 @@ def _is_vehicle(area: Mask, expected: Expected) -> bool:
         return False
     # It hides the ground, and ends on it.
     below = np.roll(area, 2, axis=0) & ~area
-    if expected.ground[area].mean() < _MIN_ON_GROUND or expected.ground[below].mean() < _MIN_ENDS_ON_GROUND:
+    if expected.ground[area].mean() < 0.15 or expected.ground[below].mean() < 0.5:
         return False
     rays = ray_grid((area.shape[0], area.shape[1]))
     elevation = np.arcsin(-rays[..., 1])[area]
@@ -182,7 +177,7 @@ def _is_vehicle(area: Mask, expected: Expected) -> bool:
     length = 2 * distance * np.tan(min(width / 2, 1.3))
     filled = area.sum() / max((top - bottom) * width * (area.shape[0] / np.pi) ** 2, 1)
     inside = _VEHICLE_LENGTH[0] < length < _VEHICLE_LENGTH[1] and _VEHICLE_HEIGHT[0] < height < _VEHICLE_HEIGHT[1]
-    return bool(inside and filled > _MIN_FILLED)
+    return bool(inside and filled > 0.55)
 
 
 def _has_ceiling(expected: Expected) -> bool:

@@ -28,17 +28,9 @@ _DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 # Fields of view, and the rotations of each.
 _NARROW_DEG, _NARROW_ROLLS_DEG = 90.0, (0.0, 90.0, 180.0, 270.0)
 _WIDE_DEG, _WIDE_ROLLS_DEG = 120.0, (0.0, 90.0)
-# A person reaches to within this angle of the nadir.
-_REACH_DEG = 30.0
-_BELONGS_BELOW = 0.5
-# What the narrow views give for the pixels of a person: on average, and at least. Furniture fails in some rotation.
-# What contains the nadir itself, such as a rig, may fail in one, but has to be outlined in all views.
-_MIN_PROBABILITY, _MIN_ONE_PROBABILITY = 0.75, 0.5
-_AT_NADIR_DEG, _MIN_PROBABILITY_AT_NADIR = 2.0, 0.6
+_AT_NADIR_DEG = 2.0
 # How much of a person all views outline: the narrow ones, all, all without anybody detected.
 _MIN_NARROW_OUTLINE, _MIN_OUTLINE, _CERTAIN_OUTLINE = 0.65, 0.75, 0.85
-# The wide views may fail if one of the views shows a person for certain.
-_MIN_WIDE_PROBABILITY, _MIN_PRESENCE_BELOW, _CERTAIN_PRESENCE = 0.6, 0.5, 0.9
 
 
 def people_below(seen: SeenPanorama, min_area_deg2: float) -> Mask:
@@ -71,9 +63,11 @@ def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline
     found = _means(probable[: len(_NARROW_ROLLS_DEG)], area)
     if np.mean(_means(outlined, area)) < min_outline:
         return False
-    if off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG and np.mean(found) >= _MIN_PROBABILITY_AT_NADIR:
+    if off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG and np.mean(found) >= 0.6:
         return True
-    return bool(np.mean(found) >= _MIN_PROBABILITY and min(found) >= _MIN_ONE_PROBABILITY)
+    # What the narrow views give for the pixels of a person: on average, and at least. Furniture fails in some rotation.
+    # What contains the nadir itself, such as a rig, may fail in one, but has to be outlined in all views.
+    return bool(np.mean(found) >= 0.75 and min(found) >= 0.5)
 
 
 def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, area: Mask) -> bool:
@@ -81,16 +75,18 @@ def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, a
     at_nadir = off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG
     if at_nadir and np.mean(_means(outlined, area)) >= _CERTAIN_OUTLINE:
         return True
-    wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= _MIN_WIDE_PROBABILITY
-    least = _MIN_PRESENCE_BELOW if at_nadir or wide_agree else _CERTAIN_PRESENCE
+    # The wide views may fail if one of the views shows a person for certain.
+    wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= 0.6
+    least = 0.5 if at_nadir or wide_agree else 0.9
     narrow, wide = _looks()
     return any(seen.presence(each) >= least for each in narrow + wide)
 
 
 def _areas_below(mean: Map, min_area_deg2: float) -> list[Mask]:
     """Return the connected areas near the nadir that are probable and large enough."""
-    labels, weights = area_labels(mean > _BELONGS_BELOW), pixel_weights(MAP_HW)
-    near = np.unique(labels[(off_nadir_deg(MAP_HW) < _REACH_DEG) & (labels >= 0)])
+    labels, weights = area_labels(mean > 0.5), pixel_weights(MAP_HW)
+    # A person reaches to within this angle of the nadir.
+    near = np.unique(labels[(off_nadir_deg(MAP_HW) < 30.0) & (labels >= 0)])
     least = min_area_deg2 / SQUARE_DEG_OF_SPHERE * weights.sum()
     areas = (labels == label for label in near)
     return [area for area in areas if weights[area].sum() >= least]
@@ -118,15 +114,7 @@ def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
     return narrow, wide
 
 
-# An area is seen again in the middle of views of its own, this many times as wide.
-_VIEW_OF_EXTENT = 2.4
-_MIN_FOV_DEG, _MAX_FOV_DEG = 40.0, 110.0
 _ROLLS_DEG = (-12.0, 12.0)
-# There is no upright direction within this angle of the nadir, so people there are not seen as the networks know them.
-_NADIR_DEG = 15.0
-_MIN_PRESENCE = 0.6
-# The mean probability of the pixels of a person.
-_BELONGS = 0.6
 
 
 @checks_settings
@@ -178,12 +166,13 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
         return 0.0, np.zeros_like(area)
     looks = _views_of(reduced)
     first = looks[0].on_map(seen.probability(looks[0]))
-    if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= _MIN_PRESENCE for each in looks):
+    if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= 0.6 for each in looks):
         return 0.0, np.zeros_like(area)
     maps = [first, *(each.on_map(seen.probability(each)) for each in looks[1:])]
     maps += [each.on_map(seen.probability(each, mirrored=True)) for each in looks]
     mean = _at_size(np.asarray(np.mean(maps, axis=0), np.float32), size_hw)
-    return _mean_in(mean, area), mean > _BELONGS
+    # The mean probability of the pixels of a person.
+    return _mean_in(mean, area), mean > 0.6
 
 
 def _mean_in(probability: Map, area: Mask) -> float:
@@ -196,8 +185,11 @@ def _views_of(area: Mask) -> list[Look]:
     center = weights @ rays
     center /= np.linalg.norm(center)
     extent_deg = float(np.degrees(np.percentile(np.arccos(np.clip(rays @ center, -1, 1)), 95)))
-    fov_deg = float(np.clip(_VIEW_OF_EXTENT * extent_deg, _MIN_FOV_DEG, _MAX_FOV_DEG))
-    if center[1] > np.cos(np.radians(_NADIR_DEG)):
+    # An area is seen again in the middle of views of its own, this many times as wide.
+    fov_deg = float(np.clip(2.4 * extent_deg, 40.0, 110.0))
+    # There is no upright direction within this angle of the nadir, so people there are not seen as the networks know
+    # them.
+    if center[1] > np.cos(np.radians(15.0)):
         return [look(rolled(_DOWN, roll), fov_deg) for roll in np.radians([0, 90, 180, 270])]
     return [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in _ROLLS_DEG]
 

@@ -16,32 +16,15 @@ from pano_mvs.core.arrays import FloatArray, Mask
 
 # The views in which people are looked for.
 _RING, _RING_FOV_DEG, _RING_ELEVATION_DEG = 8, 85.0, -12.0
-# What is in the middle of a view is looked for with this standard deviation.
-_MIDDLE_PX = 55.0
-_MIN_TILE_PX = 100
-# A candidate is seen again in views this many times as wide.
-_VIEW_OF_EXTENT, _MIN_FOV_DEG, _MAX_FOV_DEG = 1.8, 30.0, 165.0
-_ROUNDS, _GROWS = 3, 1.25
 # Rolls in degrees, whether mirrored, how much wider, and by which share of its height lower, of the views that have to
 # agree; and of views in which somebody who is seen down to the waist is detected, since that is what they are lower by.
 _AGAIN = ((0.0, False, 1.0, 0.0), (12.0, True, 1.0, 0.0), (-12.0, False, 1.2, 0.0))
 _TO_THE_WAIST = ((0.0, False, 1.33, 0.5), (0.0, True, 1.33, 0.5), (0.0, False, 1.67, 0.5), (0.0, True, 1.67, 0.5))
 # The probability of a person: in the first view of a candidate, and of a person.
 _MIN_FIRST, _MIN_PROBABILITY = 0.1, 0.65
-# A person is detected in most of the views.
-_MIN_PRESENCE, _MAY_MISS = 0.5, 1
-_MIN_PROBABILITY_TO_THE_WAIST = 0.75
 # People are taller than wide; tables and benches are not.
 _MIN_FIRST_ASPECT, _MIN_ASPECT = 0.5, 1.15
-_MIN_OVERLAP = 0.72
 _BELONGS = 0.5
-# Time is limited: at most this many candidates are looked at.
-_MAX_CANDIDATES = 8
-# People stand on the ground: their heads are not much farther above the horizon than their feet are below it.
-# Those beside the camera may be taller than it, and may be seen in part.
-_MAX_HEAD_TO_FEET, _HEAD_ABOVE_DEG, _NEAR_DEG = 0.8, 4.0, -30.0
-# The feet of the operator are at least so far below the horizon.
-_OPERATOR_DEG = -40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +65,8 @@ def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, pas
     candidates = [_candidate(seen.outline(each), each) for each in _ring()]
     possible = [each for each in candidates if each is not None and _may_be_person(each, _MIN_FIRST_ASPECT)]
     tried: list[_Candidate] = []
-    for each in sorted(possible, key=lambda candidate: -candidate.score)[:_MAX_CANDIDATES]:
+    # Time is limited: at most this many candidates are looked at.
+    for each in sorted(possible, key=lambda candidate: -candidate.score)[:8]:
         if (
             each.area_deg2 < min_area_deg2 / 2
             or found[pixels_containing(each.rays, MAP_HW)].mean() > 0.5
@@ -102,7 +86,7 @@ def _candidate(outline: Map, view: Look) -> _Candidate | None:
     scores[0] = 0
     best = int(scores.argmax())
     area = labels == best
-    if best == 0 or area.sum() < _MIN_TILE_PX:
+    if best == 0 or area.sum() < 100:
         return None
     rays, solid_angles = _geometry(view)
     inside, weights = rays[area], solid_angles[area]
@@ -116,19 +100,20 @@ def _candidate(outline: Map, view: Look) -> _Candidate | None:
 def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, tried: list[_Candidate]) -> Mask:
     """Return the pixels, `MAP_HW`, of a person; none if the views of a candidate do not agree that it is one."""
     nobody = np.zeros(MAP_HW, np.bool_)
-    for idx in range(_ROUNDS):
+    for idx in range(3):
         view = _look_at(candidate)
         if idx == 0 and _probability_in(candidate, seen.probability(view), view) < _MIN_FIRST:
             return nobody
         again = _candidate(seen.outline(view), view)
         if again is None or not _may_be_person(again, _MIN_FIRST_ASPECT):
             return nobody
-        grows = again.extent_deg > _GROWS * candidate.extent_deg
+        grows = again.extent_deg > 1.25 * candidate.extent_deg
         candidate = again
         if not grows:
             break
     tried.append(candidate)
-    if not _may_be_person(candidate, _MIN_ASPECT) or (not passers_by and candidate.span_deg[0] > _OPERATOR_DEG):
+    # The feet of the operator are at least so far below the horizon.
+    if not _may_be_person(candidate, _MIN_ASPECT) or (not passers_by and candidate.span_deg[0] > -40.0):
         return nobody
     mean = _seen_again(seen, candidate)
     if mean is None:
@@ -145,7 +130,7 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
     if probability < _MIN_PROBABILITY:
         return None
     if not _is_present(seen, candidate, _AGAIN) and (
-        probability < _MIN_PROBABILITY_TO_THE_WAIST or not _is_present(seen, candidate, _TO_THE_WAIST)
+        probability < 0.75 or not _is_present(seen, candidate, _TO_THE_WAIST)
     ):
         return None
     outlines = []
@@ -154,7 +139,7 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
         outlines.append(view.on_map(seen.outline(view, mirrored=mirrored)))
     mean = np.asarray(np.mean(outlines, axis=0), np.float32)
     overlaps = [_overlap(each > _BELONGS, mean > _BELONGS) for each in outlines]
-    return mean if np.mean(overlaps) >= _MIN_OVERLAP else None
+    return mean if np.mean(overlaps) >= 0.72 else None
 
 
 def _is_present(seen: SeenPanorama, candidate: _Candidate, views: tuple[tuple[float, bool, float, float], ...]) -> bool:
@@ -162,15 +147,17 @@ def _is_present(seen: SeenPanorama, candidate: _Candidate, views: tuple[tuple[fl
     missed = 0
     for roll_deg, mirrored, wider, lower in views:
         view = _look_at(candidate, roll_deg, wider, lower=lower)
-        missed += seen.presence(view, mirrored=mirrored) < _MIN_PRESENCE
-        if missed > _MAY_MISS:
+        # A person is detected in most of the views.
+        missed += seen.presence(view, mirrored=mirrored) < 0.5
+        if missed > 1:
             return False
     return True
 
 
 def _look_at(candidate: _Candidate, roll_deg: float = 0.0, wider: float = 1.0, *, lower: float = 0.0) -> Look:
     """Return a view with a candidate in its middle, or lower by a share of its height."""
-    fov_deg = float(np.clip(_VIEW_OF_EXTENT * wider * candidate.extent_deg, _MIN_FOV_DEG, _MAX_FOV_DEG))
+    # A candidate is seen again in views this many times as wide.
+    fov_deg = float(np.clip(1.8 * wider * candidate.extent_deg, 30.0, 165.0))
     upright = upright_rotation(candidate.center)
     feet_deg, head_deg = candidate.span_deg
     turn = np.radians(lower * (head_deg - feet_deg))
@@ -188,7 +175,9 @@ def _probability_in(candidate: _Candidate, probability: Map, view: Look) -> floa
 def _may_be_person(candidate: _Candidate, min_aspect: float) -> bool:
     """Return whether a candidate is upright and stands on the ground, and is not furniture or a part of a facade."""
     feet_deg, head_deg = candidate.span_deg
-    stands = feet_deg < _NEAR_DEG or head_deg < _HEAD_ABOVE_DEG - _MAX_HEAD_TO_FEET * feet_deg
+    # People stand on the ground: their heads are not much farther above the horizon than their feet are below it. Those
+    # beside the camera may be taller than it, and may be seen in part.
+    stands = feet_deg < -30.0 or head_deg < 4.0 - 0.8 * feet_deg
     return stands and candidate.aspect >= min_aspect
 
 
@@ -214,7 +203,8 @@ def _geometry(view: Look) -> tuple[FloatArray, FloatArray]:
 @cache
 def _middle() -> Map:
     offsets = np.arange(SIDE_PX) - (SIDE_PX - 1) / 2
-    falloff = np.exp(-(offsets**2) / (2 * _MIDDLE_PX**2))
+    # What is in the middle of a view is looked for with this standard deviation.
+    falloff = np.exp(-(offsets**2) / (2 * 55.0**2))
     return np.asarray(falloff[:, None] * falloff, np.float32)
 
 

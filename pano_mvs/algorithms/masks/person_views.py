@@ -82,11 +82,7 @@ MAP_HW = (256, 512)
 WIDTH = 1024
 """Columns of the panorama in which people are looked for, and of the result; smaller ones are used as they are."""
 
-# Towards the border of a view, where a person is cut off, its probabilities count less.
-_BORDER_PX = 40
 _PAD_PX = 2
-# Views at least this wide are sampled from a panorama of half the size, so that fine texture does not alias.
-_WIDE_DEG = 85.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +113,15 @@ class StereographicView:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A square view, and where its pixels and those of a map of directions lie in one another.
+    """A square view, and where its pixels and those of a map of directions lie in one another."""
 
-    Attributes:
-        view: its geometry.
-    """
-
-    view: PinholeView | StereographicView
+    view: PinholeView | StereographicView  # its geometry
 
     @property
     def wide(self) -> bool:
         """Whether its pixels are larger than those of a panorama of `WIDTH` columns."""
-        return self.view.focal_px <= SIDE_PX / 2 / float(np.tan(np.radians(_WIDE_DEG) / 2))
+        # Views at least this wide are sampled from a panorama of half the size, so that fine texture does not alias.
+        return self.view.focal_px <= SIDE_PX / 2 / float(np.tan(np.radians(85.0) / 2))
 
     @cached_property
     def from_sphere(self) -> Map:
@@ -146,7 +139,8 @@ class Look:
     def weight(self) -> Map:
         """The weight of each direction of the map: 1 in the middle of the view, 0 outside."""
         inside = np.minimum(self.pixels, SIDE_PX - 1 - self.pixels).min(axis=-1) + np.float32(0.5)
-        return np.asarray(np.clip(inside / np.float32(_BORDER_PX), 0, 1), np.float32)
+        # Towards the border of a view, where a person is cut off, its probabilities count less.
+        return np.asarray(np.clip(inside / np.float32(40), 0, 1), np.float32)
 
     def on_map(self, tile: Map) -> Map:
         """Return the values (256, 256) of a view's pixels in the directions of the map; 0 outside of the view."""

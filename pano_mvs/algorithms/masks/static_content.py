@@ -31,13 +31,10 @@ _Compared: TypeAlias = "tuple[Plane, Plane, Plane]"
 
 _RADIUS = 3
 _PAD = 8
-_FAR_STEP = 3
 # At most this many pairs are compared, spread over all of them.
 _MAX_PAIRS = 24
 # The share of pairs that may disagree, such as those of a view in which a hand was elsewhere.
 _DISAGREEING = 0.2
-# Beyond this elevation, windows are compared in a chart whose poles lie on the horizon of the first.
-_CHART_LIMIT = np.pi / 4
 _TILT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _AROUND = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x)
 
@@ -66,7 +63,8 @@ def frame_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
     upright = _chart_agreement(pictures)
     tilted = _chart_agreement([rotate_panorama(picture, _TILT) for picture in pictures])
     size_hw = (pictures[0].shape[0], pictures[0].shape[1])
-    polar = np.abs(ray_grid(size_hw)[..., 1]) > np.sin(_CHART_LIMIT)
+    # Beyond this elevation, windows are compared in a chart whose poles lie on the horizon of the first.
+    polar = np.abs(ray_grid(size_hw)[..., 1]) > np.sin(np.pi / 4)
     return FrameAgreement(
         *(
             np.where(polar, rotate_panorama(getattr(tilted, field.name), _TILT.T), getattr(upright, field.name))
@@ -100,7 +98,7 @@ def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
         here = _zncc(compared[first], compared[second])
         same.append(here)
         sharper.append(here - _best_around(compared[first], compared[second], step=1))
-        still.append(np.maximum(here, _best_around(compared[first], compared[second], step=_FAR_STEP)))
+        still.append(np.maximum(here, _best_around(compared[first], compared[second], step=3)))
     inner = (slice(_PAD, -_PAD), slice(_PAD, -_PAD))
     variance = np.median([variance for _, _, variance in compared], axis=0)
     return FrameAgreement(
@@ -144,21 +142,8 @@ MAX_VIEWS = 12
 """More views than this add nothing; give an evenly spread choice."""
 
 _MIN_WIDTH = 128
-# A window has structure from this standard deviation on, in grey levels.
-_MIN_CONTRAST = 4.0
 _SEED_AGREEMENT, _SEED_SHARPNESS = 0.7, 0.03
 _GROWN_AGREEMENT, _GROWN_SHARPNESS = 0.5, -0.02
-_MOVED = 0.75
-# The share of the sphere that has to move between the views, or they may all be of one place.
-_MIN_MOVED_SHARE = 0.03
-_MIN_SEED_PX = 12
-# How much colours may differ: in grey levels, and as a share of the brightness.
-_MAX_DIFFERENCE, _MAX_CHANGE = 8.0, 0.05
-# Around content that moves with the camera, at least this share of the structure moves.
-_RING_PX, _MIN_RING_MOVED, _MIN_RING_STRUCTURE = 6, 0.35, 0.1
-# A part belongs to the content beside it if this share of its border lies on it, or on an outline.
-_MIN_ENCLOSED = 0.5
-_MIN_EDGE = 12
 _CLOSING_PX, _OVERHANG_PX = 2, 3
 
 
@@ -210,9 +195,11 @@ def static_content(
     usable = np.ones(size_hw, np.bool_)
     if valid is not None and not all(mask.all() for mask in valid):  # windows that are not masked anywhere
         usable = ~dilated(~np.logical_and.reduce(list(valid)), 4)
-    structure = (agreement.contrast >= _MIN_CONTRAST) & usable
-    moved = structure & (agreement.still < _MOVED)
-    if share_of_sphere(moved) < _MIN_MOVED_SHARE:
+    # A window has structure from this standard deviation on, in grey levels.
+    structure = (agreement.contrast >= 4.0) & usable
+    moved = structure & (agreement.still < 0.75)
+    # The share of the sphere that has to move between the views, or they may all be of one place.
+    if share_of_sphere(moved) < 0.03:
         return StaticContent(nothing, "the panoramas do not differ enough: are they all of one place?")
     core = _grown(agreement, structure, moved)
     if not core.any():
@@ -228,16 +215,14 @@ def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:
     seeds = structure & (agreement.agreement >= _SEED_AGREEMENT) & (agreement.sharpness >= _SEED_SHARPNESS)
     labels = area_labels(agrees | seeds)
     weights = pixel_weights(seeds.shape)
-    enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= _MIN_SEED_PX
+    enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= 12
     found = np.zeros_like(seeds)
     for label in np.flatnonzero(enough):
         area = labels == label
-        ring = dilated(area, _RING_PX) & ~dilated(area, 1)
+        # Around content that moves with the camera, at least this share of the structure moves.
+        ring = dilated(area, 6) & ~dilated(area, 1)
         structured = float(weights[ring & structure].sum())
-        if (
-            structured >= _MIN_RING_STRUCTURE * weights[ring].sum()
-            and weights[ring & moved].sum() >= _MIN_RING_MOVED * structured
-        ):
+        if structured >= 0.1 * weights[ring].sum() and weights[ring & moved].sum() >= 0.35 * structured:
             found |= area
     return found
 
@@ -249,10 +234,11 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     as the outline of a hand before a moving world. A plain floor has no such outline.
     """
     brightness = np.median([largest_channel(picture) for picture in pictures], axis=0)
-    alike = color_difference(pictures, _gains(pictures, core)) <= _MAX_DIFFERENCE + _MAX_CHANGE * brightness
+    # How much colours may differ: in grey levels, and as a share of the brightness.
+    alike = color_difference(pictures, _gains(pictures, core)) <= 8.0 + 0.05 * brightness
     closed = closed_areas(core, _CLOSING_PX)
     # Beside which three fifths of the views have an edge.
-    edges = np.quantile([contrast_around(picture, 1) for picture in pictures], 0.4, axis=0) >= _MIN_EDGE
+    edges = np.quantile([contrast_around(picture, 1) for picture in pictures], 0.4, axis=0) >= 12
     outline = closed | edges
     parts = opened_areas((alike | plain) & ~closed, 1)
     labels, weights = area_labels(parts), pixel_weights(core.shape)
@@ -260,7 +246,8 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     for label in np.unique(labels[parts & dilated(closed, 1)]):
         area = labels == label
         border = dilated(area, 1) & ~area
-        if weights[border & outline].sum() >= _MIN_ENCLOSED * weights[border].sum():
+        # A part belongs to the content beside it if this share of its border lies on it, or on an outline.
+        if weights[border & outline].sum() >= 0.5 * weights[border].sum():
             result |= area
     result = _without_pinholes(result)
     # Windows that agree reach over the outline by most of their radius.

@@ -31,7 +31,6 @@ def match_features(
         first: key points of the first image.
         second: key points of the second image, with descriptors of the same kind.
         ratio: in (0, 1]; 1 keeps every nearest neighbour.
-        mutual: whether both must be each other's nearest; matches are then one to one.
 
     Returns:
         (M, 2) int32 positions in the first and second image, by ascending position in the first.

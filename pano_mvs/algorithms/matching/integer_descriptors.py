@@ -44,21 +44,13 @@ def nearest_two_integers(first: NDArray[np.generic], second: NDArray[np.generic]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedDescriptors:
-    """Descriptors in the memory layout of the compiled comparison, to be compared with many others.
+    """Descriptors in the memory layout of the compiled comparison, to be compared with many others."""
 
-    Attributes:
-        count: number of descriptors, N.
-        rows: (padded N, padded D) int16.
-        columns: the same in blocks of columns, with pairs of components together.
-        row_squares: (padded N,) int32 squared lengths.
-        column_squares: likewise, for the padded number of columns.
-    """
-
-    count: int
-    rows: NDArray[np.int16]
-    columns: NDArray[np.int16]
-    row_squares: NDArray[np.int32]
-    column_squares: NDArray[np.int32]
+    count: int  # number of descriptors, N
+    rows: NDArray[np.int16]  # (padded N, padded D) int16
+    columns: NDArray[np.int16]  # the same in blocks of columns, with pairs of components together
+    row_squares: NDArray[np.int32]  # (padded N,) int32 squared lengths
+    column_squares: NDArray[np.int32]  # likewise, for the padded number of columns
 
     @classmethod
     def of(cls, descriptors: NDArray[np.generic]) -> PackedDescriptors:

@@ -12,19 +12,12 @@ _BLOCK_ROWS = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestTwo:
-    """The nearest neighbours of N descriptors of one image among M of another, with squared distances.
+    """The nearest neighbours of N descriptors of one image among M of another, with squared distances."""
 
-    Attributes:
-        nearest: (N,) position of the nearest one; the first of equally near ones.
-        squared: (N,) float32, to the nearest one.
-        next_squared: (N,) float32, to the second nearest one.
-        squared_back: (M,) float32, from each descriptor of the other image to its nearest one.
-    """
-
-    nearest: NDArray[np.intp]
-    squared: NDArray[np.float32]
-    next_squared: NDArray[np.float32]
-    squared_back: NDArray[np.float32]
+    nearest: NDArray[np.intp]  # (N,) position of the nearest one; the first of equally near ones
+    squared: NDArray[np.float32]  # (N,) float32, to the nearest one
+    next_squared: NDArray[np.float32]  # (N,) float32, to the second nearest one
+    squared_back: NDArray[np.float32]  # (M,) float32, from each descriptor of the other image to its nearest one
 
 
 def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:

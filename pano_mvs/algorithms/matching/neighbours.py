@@ -43,9 +43,6 @@ def position_pairs(
     Args:
         names: image names in the capture's order.
         positions: image name to position, (2,) or (3,), all in one frame and unit; some may be missing.
-        neighbours: number of nearest images for each image.
-        window: an image without position is paired with this number of images before and after it in the capture's
-            order.
 
     Raises:
         UsageError: if a number of neighbours is less than 1.
@@ -82,7 +79,6 @@ def retrieval_pairs(
     Args:
         names: image names in the capture's order.
         descriptors: image name to its global descriptor; images without one are not paired.
-        neighbours: number of most similar images for each image.
 
     Raises:
         UsageError: if the number of neighbours is less than 1.
@@ -110,9 +106,6 @@ def loop_closing_pairs(
     Args:
         names: image names in the order in which they were taken.
         descriptors: image name to its global descriptor.
-        window: each image is paired with this number of following images.
-        loop: whether the first image follows the last one.
-        loop_closure: number of similar images beyond the window to pair each image with.
 
     Raises:
         UsageError: if the window is less than 1.
@@ -310,10 +303,6 @@ def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:
     return Pairs(tuple((names[first], names[second]) for first, second in sorted(links)))
 
 
-_MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR = 300, 10
-_RATIO = 0.8  # threshold of the ratio test of Lowe 2004, section 7.1
-
-
 def sample_matches(
     samples: Sequence[NDArray[np.int16]], dissimilarities: NDArray[np.float64], *, neighbours: int
 ) -> NDArray[np.float64]:
@@ -332,7 +321,7 @@ def sample_matches(
         (N, N) symmetric; zero for pairs on no shortlist and on the diagonal.
     """
     count = len(samples)
-    length = min(count, max(_MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR * neighbours))
+    length = min(count, max(300, 10 * neighbours))
     listed = np.zeros((count, count), np.bool_)
     np.put_along_axis(listed, np.argsort(dissimilarities, axis=1, kind="stable")[:, :length], values=True, axis=1)
     listed = np.triu(listed | listed.T, 1)
@@ -340,7 +329,11 @@ def sample_matches(
     compare = _comparison(samples)
     for first, second in np.argwhere(listed).tolist():
         if _comparable(samples[first], samples[second]):
-            matches[first, second] = _count_matches(compare(first, second))
+            found = compare(first, second)
+            distinct = found.squared < np.float32(0.8**2) * found.next_squared
+            matches[first, second] = int(
+                np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest]))
+            )
     return matches + matches.T
 
 
@@ -355,9 +348,3 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
 def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
     """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
     return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
-
-
-def _count_matches(found: NearestTwo) -> int:
-    """Return the number of mutual nearest neighbours that pass the ratio test."""
-    distinct = found.squared < np.float32(_RATIO**2) * found.next_squared
-    return int(np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest])))

@@ -15,7 +15,6 @@ from pano_mvs.scene import Features, GlobalDescriptor
 _CELL_BITS = 4
 _RESIDUAL_SIZE = 128
 _LENGTH = 1024.0
-_CODEBOOK_SEED = 20261121  # arbitrary but fixed, so that images can be compared
 
 
 @checks_settings
@@ -39,7 +38,6 @@ def vlad_descriptor(
 
     Args:
         features: key points, strongest first, with either kind of descriptor.
-        strongest: number of key points in the vector.
         sample: number of key points, those of the coarsest scales, whose descriptors are kept unchanged. Key points of
             coarse scales are the ones most likely found from other positions (Wu, "Towards linear-time incremental
             structure from motion", 2013, section 3.1).
@@ -82,7 +80,7 @@ def _whole(features: Features, chosen: NDArray[np.intp]) -> FloatArray:
 def _turned(vectors: FloatArray) -> FloatArray:
     """Return the vectors in randomly rotated axes, exactly: signs, a Hadamard matrix, a permutation; integers."""
     size = 1 << max(vectors.shape[1] - 1, 1).bit_length()
-    rng = np.random.default_rng(_CODEBOOK_SEED)
+    rng = np.random.default_rng(20261121)  # arbitrary but fixed, so that images can be compared
     signs = rng.choice([-1.0, 1.0], size)[: vectors.shape[1]]
     rows = hadamard(size, dtype=np.float64)[: vectors.shape[1]]
     turned: FloatArray = (vectors * signs) @ rows[:, rng.permutation(size)]

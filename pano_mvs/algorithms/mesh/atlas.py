@@ -8,8 +8,6 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-# Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
-PADDING_PX = 4
 _EXPECTED_UTILIZATION = 0.75
 # Time grows with the square of the number of charts of a part: 100,000 triangles of a room take 10 CPU-s in 64 parts
 # (706 charts), 28 in 4 parts (632 charts), and over 97 as a whole.
@@ -65,7 +63,8 @@ def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels
     for part, used, local in parts:
         atlas.add_mesh(vertices[used].astype(np.float32), local.reshape(len(part), 3).astype(np.uint32))
     options = xatlas.PackOptions()
-    options.padding, options.texels_per_unit = PADDING_PX, float(min(texels_per_unit, most))
+    # Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
+    options.padding, options.texels_per_unit = 4, float(min(texels_per_unit, most))
     atlas.generate(pack_options=options)
     made = [atlas.get_mesh(number) for number in range(len(parts))]
     of_atlas, first = np.empty_like(faces, np.int32), 0

@@ -22,23 +22,15 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 _NEIGHBOURS = 6
-# Otherwise a stray point, far from all others, would keep a large bubble around it.
-_MAX_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles with coloured corners.
+    """Triangles with coloured corners."""
 
-    Attributes:
-        vertices_in_world: (V, 3) float32, scene units.
-        colors_rgb: (V, 3) uint8.
-        faces: (F, 3) int32 vertex positions, counter-clockwise as seen from the side that was seen.
-    """
-
-    vertices_in_world: NDArray[np.float32]
-    colors_rgb: NDArray[np.uint8]
-    faces: NDArray[np.int32]
+    vertices_in_world: NDArray[np.float32]  # (V, 3) float32, scene units
+    colors_rgb: NDArray[np.uint8]  # (V, 3) uint8
+    faces: NDArray[np.int32]  # (F, 3) int32 vertex positions, counter-clockwise as seen from the side that was seen
 
 
 def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -49,7 +41,8 @@ def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:
     count = min(_NEIGHBOURS + 1, len(points))
     distances, _ = cKDTree(points).query(points, k=count)
     spacings: NDArray[np.float64] = np.median(np.asarray(distances)[:, 1:], axis=1)
-    return np.asarray(np.minimum(spacings, _MAX_SPACING * np.median(spacings)))
+    # Otherwise a stray point, far from all others, would keep a large bubble around it.
+    return np.asarray(np.minimum(spacings, 10.0 * np.median(spacings)))
 
 
 def trimmed_mesh(mesh: Mesh, points: NDArray[np.float32], *, max_spacings: float) -> Mesh:
@@ -109,8 +102,6 @@ def decimated(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, triang
 
 
 MIN_POINTS = 100
-_SHALLOWEST, _DEEPEST = 5, 12
-_TOLD = 300
 
 # The solver crashes on some clouds, so it runs in a separate process. One cause is its own trimming, which is off. With
 # several threads, the order of its sums is undefined, and the same cloud would give different bytes.
@@ -132,7 +123,7 @@ def poisson_depth(points: NDArray[np.float32], spacing: float) -> int:
     """
     extent = float((points.max(axis=0) - points.min(axis=0)).max())
     cells = max(1.1 * extent / max(spacing, 1e-12), 1.0)  # the solver's cube is a tenth wider than the cloud
-    return int(np.clip(np.ceil(np.log2(cells)), _SHALLOWEST, _DEEPEST))
+    return int(np.clip(np.ceil(np.log2(cells)), 5, 12))
 
 
 def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: float) -> Path:
@@ -149,7 +140,7 @@ def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: f
     command = [sys.executable, "-c", _SOLVE, str(cloud_file), str(target), str(depth), str(point_weight)]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603  # our own
     if done.returncode or not is_file(target):
-        said = (done.stderr or done.stdout).strip()[-_TOLD:]
+        said = (done.stderr or done.stdout).strip()[-300:]
         raise InputError(
             f"the Poisson solver ended with code {done.returncode} at depth {depth}: try another `depth`, or fewer "
             f"points by `max_points`. Its message: {said or 'none'}"
@@ -159,14 +150,12 @@ def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: f
 
 # Ranges of one surface differ by less than this share; beyond the second share, the panorama sees something behind it.
 _CONFIRMS, _SEES_THROUGH = 0.03, 0.08
-_MIN_VIEWS = 2
 
 
 class FreeSpace:
     """Counts how many panoramas confirm each vertex of a mesh, and how many look through it."""
 
     def __init__(self, vertices_in_world: NDArray[np.float32]) -> None:
-        """Start without panoramas."""
         self._vertices = vertices_in_world
         self._confirmed = np.zeros(len(vertices_in_world), np.uint8)
         self._through = np.zeros(len(vertices_in_world), np.uint8)
@@ -196,4 +185,4 @@ class FreeSpace:
 
     def free(self) -> NDArray[np.bool_]:
         """Return the vertices (V,) that no panorama confirms, and that two look through or one sees as sky."""
-        return np.asarray((self._confirmed == 0) & ((self._through >= _MIN_VIEWS) | self._sky))
+        return np.asarray((self._confirmed == 0) & ((self._through >= 2) | self._sky))

@@ -112,13 +112,6 @@ def _links(faces: NDArray[np.int32], count: int) -> csr_array:
     return links
 
 
-_ROUNDS = 30
-# Darker or brighter values are clipped or noisy.
-_DARKEST, _BRIGHTEST = 8.0, 247.0
-# A gain from few points is uncertain: as if this many further points had seen no difference.
-_PRIOR_POINTS = 30.0
-# Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
-_MAX_RESIDUAL = 0.15
 _GAIN_LIMITS = 0.4, 2.5
 
 
@@ -132,7 +125,8 @@ def view_gains(colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Flo
     `colors`: (V, P, 3) colours of points as each panorama sees them, 0 to 255. `weights`: (V, P) weights, 0 where a
     panorama does not see the point.
     """
-    usable = (weights > 0) & (colors.min(axis=-1) > _DARKEST) & (colors.max(axis=-1) < _BRIGHTEST)
+    # Darker or brighter values are clipped or noisy.
+    usable = (weights > 0) & (colors.min(axis=-1) > 8.0) & (colors.max(axis=-1) < 247.0)
     usable &= usable.sum(axis=0) > 1
     gains = np.ones((len(colors), 3))
     shared = usable.any(axis=0)
@@ -148,23 +142,21 @@ def view_gains(colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Flo
 def _log_exposures(logs: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
     exposure = np.zeros(len(logs))
     robust = seen.astype(np.float64)
-    for _ in range(_ROUNDS):
+    for _ in range(30):
         surface = ((logs - exposure[:, None]) * robust).sum(axis=0) / robust.sum(axis=0)
         differences = logs - surface
-        exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + _PRIOR_POINTS)
+        # A gain from few points is uncertain: as if this many further points had seen no difference.
+        exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + 30.0)
         exposure -= exposure.mean()
-        residuals = (differences - exposure[:, None]) / _MAX_RESIDUAL
+        # Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
+        residuals = (differences - exposure[:, None]) / 0.15
         robust = seen / (1 + residuals**2)
     return exposure
 
 
 Loader = Callable[[int], PaintView]
 
-# Standard deviation, as a share of a panorama's width, of the Gaussian that separates detail from larger scales.
-_DETAIL_SCALE = 1 / 400
 _TEXELS_AT_ONCE = 1 << 13  # of a band; `for_bands` joins 32 of them
-_SAMPLES, _SAMPLE_WIDTH = 20_000, 512
-_LEAST_SHARPNESS = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,7 +193,6 @@ class Surface:
     """A mesh with what its painting needs."""
 
     def __init__(self, vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-        """Prepare the normals."""
         self.vertices_in_world, self.faces = vertices_in_world, faces
         self.normals = vertex_normals(vertices_in_world, faces)
 
@@ -214,7 +205,9 @@ class Surface:
         size_hw = view.valid.shape[0], view.valid.shape[1]
         pose = view.cam_from_world
         ranges = surface_view(self.vertices_in_world, self.faces, pose, size_hw=size_hw, threads=threads).ranges
-        sigma = size_hw[1] * _DETAIL_SCALE
+        # Standard deviation, as a share of a panorama's width, of the Gaussian that separates detail from larger
+        # scales.
+        sigma = size_hw[1] * (1 / 400)
         quality = pixel_quality(view, ranges, feather_px=2.0 * sigma)
         margin = min(int(np.ceil(3 * sigma)), size_hw[0])
         side = 2 * margin + 1
@@ -260,7 +253,7 @@ def balanced_views(
         distance = np.linalg.norm(middles - view.cam_from_world.center, axis=1)
         pixels = view.picture.shape[1] / (2 * np.pi * np.maximum(distance, 1e-12))
         density = np.maximum(density, np.where(weights[idx] > 0, pixels, 0))
-    worths = np.clip(sharp / max(float(np.median(sharp)), 1e-12), _LEAST_SHARPNESS, 1.0) if views else sharp
+    worths = np.clip(sharp / max(float(np.median(sharp)), 1e-12), 0.25, 1.0) if views else sharp
     seen = density[density > 0]
     return ViewBalance(view_gains(colors, weights), worths, float(np.quantile(seen, 0.75)) if len(seen) else 0.0)
 
@@ -340,13 +333,13 @@ class _Painting:
 
 def _triangle_centers(count: int) -> Texels:
     """Return the centres of evenly spread triangles as if they were texels."""
-    triangle = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).astype(np.int32))
+    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
     return Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
 
 
 def _reduced(view: PaintView) -> PaintView:
     """Return a panorama of at most 512 columns, without its ranges."""
-    width = min(_SAMPLE_WIDTH, view.picture.shape[1])
+    width = min(512, view.picture.shape[1])
     size = width, width // 2
     picture = cv2.resize(view.picture, size, interpolation=cv2.INTER_AREA)
     valid = cv2.resize(view.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) == 1

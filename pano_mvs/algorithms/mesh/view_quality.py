@@ -16,15 +16,10 @@ from pano_mvs.geometry import Rigid3, pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
-# The second difference of 1 / range, relative to it, at the border of a surface; on a plane it is 0.
-_BORDER_STEP = 0.03
-# Near a border, the pixel may show the other surface, but it is better than none.
-_LEAST_FEATHER = 1e-3
 _CONSISTENT, _WEAK, _FILLED, _UNKNOWN = 1.0, 0.6, 0.4, 0.3
 # The panorama measured something in front of the mesh, or behind it, by more than this share of the range.
 _MAX_DIFFERENCE = 0.1
 _OCCLUDED, _CARVED = 0.02, 0.2
-_SMOOTH_PX = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +58,8 @@ def pixel_quality(view: PaintView, surface_ranges: FloatImage, *, feather_px: fl
             raise UsageError(f"ranges of {view.range_map.range.shape} for a picture of {shape}")
         worth = _range_worth(view.range_map, surface_ranges)
     near = _distance_px(border | ~view.valid, limit=int(np.ceil(feather_px)) + 1)
-    feather = np.maximum(np.square(np.minimum(near / feather_px, 1)), _LEAST_FEATHER)
+    # Near a border, the pixel may show the other surface, but it is better than none.
+    feather = np.maximum(np.square(np.minimum(near / feather_px, 1)), 1e-3)
     return np.where(view.valid, worth * feather, np.float32(0)).astype(np.float32)
 
 
@@ -73,7 +69,8 @@ def surface_borders(ranges: FloatImage) -> Mask:
     here = inverse[1:-1, 1:-1]
     along = np.abs(inverse[1:-1, :-2] - 2 * here + inverse[1:-1, 2:])
     across = np.abs(inverse[:-2, 1:-1] - 2 * here + inverse[2:, 1:-1])
-    return np.asarray(np.maximum(along, across) > _BORDER_STEP * here)
+    # The second difference of 1 / range, relative to it, at the border of a surface; on a plane it is 0.
+    return np.asarray(np.maximum(along, across) > 0.03 * here)
 
 
 def _range_worth(range_map: RangeMap, surface_ranges: FloatImage) -> FloatImage:
@@ -86,7 +83,7 @@ def _range_worth(range_map: RangeMap, surface_ranges: FloatImage) -> FloatImage:
         ratio = range_map.range / surface_ranges
         worth[ratio < 1 - _MAX_DIFFERENCE] *= np.float32(_OCCLUDED)
         worth[ratio > 1 + _MAX_DIFFERENCE] *= np.float32(_CARVED)
-    margin = min(_SMOOTH_PX, len(worth))
+    margin = min(5, len(worth))
     blurred = filtered(worth, margin, lambda padded: cv2.blur(padded, (2 * margin + 1, 2 * margin + 1)))
     return np.asarray(np.minimum(blurred, np.maximum(worth, 2 * _OCCLUDED)))
 

@@ -35,8 +35,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 _WINDOW, _SIGMA_COLOR, _NOISE = 5, 25.0, 0.4
 # The sources that match best decide; of those that agree, more than this many say no more.
 _BEST, _MOST_AGREEING = 2, 3
-# Surfaces that are seen at a more grazing angle than this cosine are matched as if they faced the camera.
-_GRAZING = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +268,8 @@ def surface_planes(
     """
     normal = np.full_like(rays, np.nan) if normals is None else normals.astype(np.float64)
     cosine = np.sum(normal * rays, axis=-1)
-    steep = np.abs(cosine) >= _GRAZING  # False for NaN
+    # Surfaces that are seen at a more grazing angle than this cosine are matched as if they faced the camera.
+    steep = np.abs(cosine) >= 0.1  # False for NaN
     normal, cosine = np.where(steep[:, None], normal, rays), np.where(steep, cosine, 1.0)
     return np.ascontiguousarray((normal / (cosine * ranges)[:, None]).T, np.float32)
 
@@ -286,10 +285,6 @@ def _check(range_map: RangeMap, reference: Picture, sources: Sequence[SourceView
         shape = source.range_map.range.shape
         if source.picture.shape != (*shape, 3) or (source.mask is not None and source.mask.shape != shape):
             raise UsageError(f"source {idx}: image, mask and range map differ in size; give all of them in one size")
-
-
-# A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
-_SAME_RAY_DEG = 0.7
 
 
 @checks_settings
@@ -365,12 +360,13 @@ def _seen_through(
     max_relative_error: float,
 ) -> Mask:
     """Return where more sources see through a point than agree with it, (H, W)."""
+    # A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
     comparison = compare_with_sources(
         ranges,
         sources,
         source_from_reference,
         # A source contradicts from twice this error on.
         max_relative_error=max_relative_error / 2,
-        max_angle=np.radians(_SAME_RAY_DEG),
+        max_angle=np.radians(0.7),
     )
     return np.asarray(comparison.contradicting > comparison.agreeing)

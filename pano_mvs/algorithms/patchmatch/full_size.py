@@ -29,8 +29,6 @@ if TYPE_CHECKING:  # kernels compile on import
 STRIP_ROWS = 128
 """Rows that are refined together."""
 
-# Sizes differ by this factor or more.
-_LEAST_STEP = 1.5
 # Detail is measured up to this many rows away, in pictures that are halved.
 _DETAIL_MARGIN = 16
 # Noise is measured at every such row and column.
@@ -43,7 +41,8 @@ def widths_between(width: int, full: int) -> list[int]:
     while full > width:
         found.insert(0, full)
         full = full // 8 * 4
-        if full < _LEAST_STEP * width:
+        # Sizes differ by this factor or more.
+        if full < 1.5 * width:
             break
     return found
 

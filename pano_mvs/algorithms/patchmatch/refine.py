@@ -43,8 +43,6 @@ if TYPE_CHECKING:  # kernels compile on import
     from pano_mvs.algorithms.patchmatch.kernels_refine import Numbers
 
 
-# Standard deviation of the correlation, from 1, of a source that sees the surface.
-_SIGMA = 0.3
 # Pixels on either side of a pixel whose matches count for it.
 _RADIUS = 2
 # Share of the rounds before in what is known after a round.
@@ -73,7 +71,8 @@ class ViewWeights:
         if not self.known:
             self._match = np.empty_like(self.views)
         for idx, correlation in enumerate(self.views):
-            match = _mean_around(np.exp(-(((1 - correlation) / _SIGMA) ** 2) / 2) * (correlation > -1.5))
+            # Standard deviation of the correlation, from 1, of a source that sees the surface.
+            match = _mean_around(np.exp(-(((1 - correlation) / 0.3) ** 2) / 2) * (correlation > -1.5))
             self._match[idx] = _MEMORY * self._match[idx] + (1 - _MEMORY) * match if self.known else match
         best = np.maximum(self._match.max(axis=0), np.float32(1e-6))
         np.square(self._match / best, out=self.views)
@@ -97,12 +96,8 @@ def _mean_around(picture: FloatImage) -> FloatImage:
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 # Maximum of a refined range, relative to the farthest swept one.
 _BEYOND = 1.5
-# Samples of a window are neighbours, and not independent: 25 samples count as this many.
-_SAMPLES = 10.0
 # Maximum step, in pixels of the reference at the widest baseline: beyond it, images are not linear.
 _MAX_STEP_PX = 0.5
-# Maximum relative difference in range of neighbours on a plane per radian: the tangent of a slant of 58°.
-_MAX_SLOPE = 1.6
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
 # A window extends two pixels per sample from its centre, and one and a half times as far in a source that is nearer.
@@ -185,12 +180,13 @@ class WindowSettings:
         """Return the kernel's numbers, see `refine_rows`, for a reference of this width."""
         # The change of inverse range that moves a point by one pixel at the widest baseline.
         pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
+        # Samples of a window are neighbours, and not independent: 25 samples count as this many.
         return (
             np.float32(1 / self.sigma_color),
             np.float32(self.noise**2),
             (self.prior_px * pixel_q) ** -2,
             (self.prior_slope * pixel_q) ** -2,
-            _SAMPLES,
+            10.0,
             np.float32(_MAX_STEP_PX * pixel_q),
         )
 
@@ -235,7 +231,8 @@ def refine_part(
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
     planes = np.empty((3, rows_here, width), np.float32)
-    max_step = _MAX_SLOPE * 2 * np.pi / width
+    # Maximum relative difference in range of neighbours on a plane per radian: the tangent of a slant of 58°.
+    max_step = 1.6 * 2 * np.pi / width
 
     def lay(first: int, rows: int) -> None:
         kernels_refine.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes, part)
@@ -354,10 +351,6 @@ def _check(
         raise UsageError("all sources were taken from the same place as the reference, so ranges cannot be measured")
 
 
-# After the reduced size, rounds at the panorama's own size place the edges.
-_FINAL_ROUNDS = 2
-
-
 def refine_at_scale(
     range_map: RangeMap,
     reference: Picture,
@@ -388,7 +381,8 @@ def refine_at_scale(
         small, valid = reduced(pictures, masks, halvings=level)
         start, count = reduced_range_map(range_map, halvings=level) if level else range_map, rounds
         if found is not None and level < halvings:
-            start, count = _continued(found, start), min(rounds, _FINAL_ROUNDS)
+            # After the reduced size, rounds at the panorama's own size place the edges.
+            start, count = _continued(found, start), min(rounds, 2)
         fine = refine_range(start, small[0], small[1:], source_masks=valid[1:], rounds=count, **settings)
         if found is not None and level < levels:
             fine = replace(with_coarser(fine, found, small[0]), confidence=fine.confidence)

@@ -14,25 +14,17 @@ NODE_POINTS = 30_000
 """Largest number of points that a node adds."""
 
 _SMALL_CHILD = 500
-_MAX_DEPTH = 20
 _SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
 class OctreeNode:
-    """A cube of the octree.
+    """A cube of the octree."""
 
-    Attributes:
-        name: "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z.
-        lower: (3,) float64, the cube's corner with the smallest coordinates.
-        size: length of its edges.
-        chosen: (K,) int64, the points that this node adds, in no order.
-    """
-
-    name: str
-    lower: NDArray[np.float64]
-    size: float
-    chosen: NDArray[np.int64]
+    name: str  # "r" for the root; a child's name is its parent's and its octant's number, bit 0 for x, 1 for y, 2 for z
+    lower: NDArray[np.float64]  # (3,) float64, the cube's corner with the smallest coordinates
+    size: float  # length of its edges
+    chosen: NDArray[np.int64]  # (K,) int64, the points that this node adds, in no order
 
 
 def octree(
@@ -55,7 +47,7 @@ def octree(
     pending = [("r", lower, size, order)]
     while pending:
         name, lower, size, inside = pending.pop(0)
-        if len(inside) <= node_points + _SMALL_CHILD or len(name) > _MAX_DEPTH:
+        if len(inside) <= node_points + _SMALL_CHILD or len(name) > 20:
             nodes.append(OctreeNode(name, lower, size, inside))
             continue
         half = size / 2

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import UsageError
 
-_STEPS = 24
 _EXCESS = 0.02
 # Ratio of points after voxel selection, and number of a point's neighbours to examine for discs: points are on
 # surfaces, where no more fit around one.
@@ -51,7 +50,7 @@ def spread_points(
 
 def _widest(low: float, high: float, wanted: int, *, left: Callable[[float], int]) -> float:
     """Return the largest width between two limits, to about 2 %, that leaves enough points; `left` is decreasing."""
-    for _ in range(_STEPS):
+    for _ in range(24):
         middle = float(np.sqrt(low * high))
         found = left(middle)
         if found < wanted:

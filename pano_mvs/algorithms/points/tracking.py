@@ -60,14 +60,6 @@ def sample_surface(
     )
 
 
-# Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So the
-# distance of neighbouring points is proportional to the square root of the distance to the nearest camera.
-_SPACING_POWER = 0.5
-# Factor on the number of points that are tested for visibility, since some fail.
-_SURPLUS = 1.3
-_MAX_CANDIDATES = 12_000_000
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidates:
     """Points of all views: in the world (M, 3), index of the source view (M,), colour (M, 3)."""
@@ -182,8 +174,11 @@ def _track_group(
         return _tracked(names, candidates, _joined([]), kept=np.zeros(0, np.intp))
     centers = poses.centers[pose_idx]
     tree = cKDTree(centers)
-    spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** _SPACING_POWER
-    few = spread_points(candidates.points, spacing, int(np.ceil(_SURPLUS * count)), rng=rng)
+    # Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So
+    # the distance of neighbouring points is proportional to the square root of the distance to the nearest camera.
+    spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** 0.5
+    # Factor on the number of points that are tested for visibility, since some fail.
+    few = spread_points(candidates.points, spacing, int(np.ceil(1.3 * count)), rng=rng)
     chosen, spacing = candidates[few], spacing[few]
     asked = _asked(tree, chosen, min(neighbours, len(names)))
     limits = np.array([max_relative_error, MAX_SURFACE_STEP, float(min_confidence)])
@@ -215,7 +210,7 @@ def _candidates(
     rng: np.random.Generator,
 ) -> _Candidates:
     """Return the samples of all views in the world, thinned at random if there are too many."""
-    share = min(1.0, _MAX_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
+    share = min(1.0, 12_000_000 / max(sum(len(samples[name]) for name in names), 1))
     points, homes, colors = [np.zeros((0, 3))], [np.zeros(0, np.int32)], [np.zeros((0, 3), np.uint8)]
     for idx, name in enumerate(names):
         view = samples[name]

@@ -23,42 +23,29 @@ from pano_mvs.algorithms.poses.verification.camera_checks import (
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_FULL_PARALLAX_DEG = 10.0
-_SEEDS = 12  # number of seeds whose support by third images is computed
-_THIRDS = 8
 _MAX_GROWN = 3  # number of seeds from which models are grown
-_ADJUST_GROWTH = 1.25  # all cameras are adjusted each time their number has grown by this factor
 _LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
-_MIN_SHARE = 0.5  # share of an image's pairs, by weight, that must agree with a clear placement
 _CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
 _CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
-_SATISFYING = 0.85  # the first model is accepted if it explains this share of the pairs
-_CERTAIN = 0.97  # the images are not consulted if the model explains this share of the pairs
 _RIVALS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class GrownModel:
-    """A model, and the images that could not be added to it.
+    """A model, and the images that could not be added to it."""
 
-    Attributes:
-        model: the cameras.
-        refused: position of each image that could not be added, to the reason.
-        checks: result of the check against the images; None if the images were not consulted.
-        aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
-    """
-
-    model: PlacedModel
-    refused: dict[int, str]
-    checks: CameraChecks | None
-    aliased: bool = False
+    model: PlacedModel  # the cameras
+    refused: dict[int, str]  # position of each image that could not be added, to the reason
+    checks: CameraChecks | None  # result of the check against the images; None if the images were not consulted
+    aliased: bool = False  # whether runner-up geometries of several pairs suggest the same move of a block of cameras
 
     def is_satisfactory(self) -> bool:
         """Return whether no other model needs to be tried."""
         if self.refused or self.aliased:
             return False
         if self.checks is None:
-            return self.model.explained_share() > _SATISFYING
+            # The first model is accepted if it explains this share of the pairs.
+            return self.model.explained_share() > 0.85
         return not self.checks.doubts and not self.checks.removed
 
     def rank(self) -> tuple[float, float]:
@@ -127,7 +114,7 @@ def ranked_seeds(
 
     def quality(edge: Edge, rank: int) -> float:
         geometry = pairs.geometries[edge][rank]
-        return geometry.weight**2 * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
+        return geometry.weight**2 * min(geometry.parallax_deg / 10.0, 1.0)
 
     seeds = [
         (edge, rank)
@@ -137,7 +124,7 @@ def ranked_seeds(
         if (edge, rank) not in without
     ]
     seeds.sort(key=lambda seed: (-quality(*seed), seed))
-    seeds = seeds[:_SEEDS]
+    seeds = seeds[:12]  # number of seeds whose support by third images is computed
     support = {seed: _support(pairs, *seed) for seed in seeds}
     most = max((quality(*seed) for seed in seeds), default=1.0)
     return sorted(seeds, key=lambda seed: (-support[seed] * np.sqrt(quality(*seed) / most), -quality(*seed), seed))
@@ -147,7 +134,7 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
     """Return the support of a seed by third images: the weight of the placements on which both cameras agree."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
-    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:_THIRDS]
+    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:8]
     total = 0.25
     for image in thirds:
         _, found = model.place(image)
@@ -164,22 +151,8 @@ def _grown(
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
-    weights: dict[int, float] = {}
-    for image in edge:
-        _count_pairs(pairs, image, left, weights=weights)
-    if not adjust:
-        model.adjust(cameras=False)
-    adjusted = 2
-    reasons: dict[int, str] = {}
-    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
-        image, pose = step
-        model.add(image, pose)
-        left.discard(image)
-        del weights[image]
-        _count_pairs(pairs, image, left, weights=weights)
-        if not adjust or len(model.cameras) > _ADJUST_GROWTH * adjusted:
-            model.adjust(cameras=adjust)
-            adjusted = len(model.cameras)
+    reasons = add_images(model, left, adjust=adjust, confirmation=confirmation)
+    left -= model.cameras.keys()
     for image in edge:
         if image in model.cameras and (reason := _unsupported(model, image)):
             for other in model.held_by([image]):
@@ -190,12 +163,45 @@ def _grown(
             left.add(image)
             reasons[image] = reason
     settle(model, adjust=adjust)
-    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
+    refused = {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
-    if left or aliased or model.explained_share() < _CERTAIN:
+    # The images are not consulted if the model explains this share of the pairs.
+    if left or aliased or model.explained_share() < 0.97:
         checks = check_cameras(model, confirmation)
     return GrownModel(model, refused, checks, aliased)
+
+
+def add_images(
+    model: PlacedModel, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
+) -> dict[int, str]:
+    """Add images one at a time, the clearest first, while any can be added; return why others could not be.
+
+    Args:
+        model: two or more registered cameras.
+        images: those to add.
+        adjust: whether all cameras are adjusted at intervals; if False, the cameras stay as they were added.
+        confirmation: decides between rival placements by the images; None if the pairs alone decide.
+    """
+    left = set(images)
+    weights: dict[int, float] = {}
+    for image in model.cameras:
+        _count_pairs(model.pairs, image, left, weights=weights)
+    if not adjust:
+        model.adjust(cameras=False)
+    adjusted = len(model.cameras)
+    reasons: dict[int, str] = {}
+    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
+        image, pose = step
+        model.add(image, pose)
+        left.discard(image)
+        del weights[image]
+        _count_pairs(model.pairs, image, left, weights=weights)
+        # All cameras are adjusted each time their number has grown by this factor.
+        if not adjust or len(model.cameras) > 1.25 * adjusted:
+            model.adjust(cameras=adjust)
+            adjusted = len(model.cameras)
+    return {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
 
 
 def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:
@@ -244,7 +250,8 @@ def _next(
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
-            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
+            # Share of an image's pairs, by weight, that must agree with a clear placement.
+            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
             if clear and (pose := _accepted(model, image, evidence, placement=found[0], reasons=reasons)):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))

@@ -19,24 +19,14 @@ Pair = tuple[str, str]
 # that have at least this number of images, in which most consecutive images are paired and most pairs are in sequence.
 _WINDOW, _MIN_IMAGES = 10, 20
 _CONSECUTIVE_SHARE, _SEQUENCE_SHARE = 0.8, 0.5
-# A closure contradicts the path if its points are farther apart than this share of the path between both images, and
-# than this number of steps.
-_DRIFT_SHARE, _DRIFT_STEPS = 0.02, 2.0
-_MIN_POINTS = 8
-_SAME_RAD = 1e-5
 
 
 @dataclass(frozen=True)
 class FalseClosure:
-    """A loop closure that contradicts the path.
+    """A loop closure that contradicts the path."""
 
-    Attributes:
-        pair: the images.
-        steps: distance between the two places of the same points, in median steps of the path.
-    """
-
-    pair: Pair
-    steps: float
+    pair: Pair  # the images
+    steps: float  # distance between the two places of the same points, in median steps of the path
 
 
 def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pair, TwoView]) -> list[FalseClosure]:
@@ -74,8 +64,10 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
             continue
         apart = known.distances(pair, two_views[pair])
         step = along.step[poses.groups[first]]
-        allowed = max(_DRIFT_STEPS * step, _DRIFT_SHARE * abs(along.at[first] - along.at[second]))
-        if len(apart) >= _MIN_POINTS and float(np.median(apart)) > allowed:
+        # A closure contradicts the path if its points are farther apart than this share of the path between both
+        # images, and than this number of steps.
+        allowed = max(2.0 * step, 0.02 * abs(along.at[first] - along.at[second]))
+        if len(apart) >= 8 and float(np.median(apart)) > allowed:
             found.append(FalseClosure(pair, float(np.median(apart)) / step))
     return found
 
@@ -168,7 +160,7 @@ class _KnownPoints:
             found = np.full(len(bearings), -1, np.intp)
             if len(own) and len(bearings):
                 distance, nearest = cKDTree(self.poses.track_bearings[own]).query(bearings)
-                is_same = np.asarray(distance) < _SAME_RAD
+                is_same = np.asarray(distance) < 1e-5
                 found[is_same] = self.poses.track_point_idx[own[np.asarray(nearest)[is_same]]]
             self._points[name] = found
         return self._points[name]

@@ -23,29 +23,18 @@ from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
 from pano_mvs.core.errors import UsageError
 
 _MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
-_KEPT_PANORAMAS = 10
 # Levels of the panoramas in each round: coarse patches are aligned from further away.
 _ROUNDS = (1, 0, 0)
-# With fewer patches than these, the pose is wrong.
-_MIN_SIGHTINGS, _MIN_SEEN_SHARE = 12, 0.03
-_CONFIRMED_STD = 3.0
-_SIGNIFICANT_STD = 4.0
 
 
 class Aligned(NamedTuple):
-    """A camera after alignment.
+    """A camera after alignment."""
 
-    Attributes:
-        camera: the camera.
-        confirmed: number of points that the photograph shows where the camera predicts them.
-        tested: number of points that it could show.
-        off_center: distance of the optical centre from the middle of the photograph, as a share of the longer side;
-            0 if it is not significant.
-    """
-
-    camera: PhotographCamera
-    confirmed: int
-    tested: int
+    camera: PhotographCamera  # the camera
+    confirmed: int  # number of points that the photograph shows where the camera predicts them
+    tested: int  # number of points that it could show
+    # distance of the optical centre from the middle of the photograph, as a share of the longer side; 0 if it is not
+    # significant
     off_center: float = 0.0
 
     @property
@@ -70,7 +59,7 @@ class PanoramaPatches:
     def levels(self, name: str) -> list[NDArray[np.float32]]:
         """Return the `panorama_levels` of a panorama."""
         if name not in self._held:
-            while len(self._held) >= _KEPT_PANORAMAS:
+            while len(self._held) >= 10:
                 self._held.popitem(last=False)
             self._held[name] = panorama_levels(_reduced(self._load(name), _MAX_PANORAMA_PX), max(_ROUNDS) + 1)
         self._held.move_to_end(name)
@@ -114,29 +103,27 @@ class PhotographPatches:
             raise UsageError(f"the photograph, reduced to {self._gray.shape}, is smaller than a patch")
         chosen, sightings = list(names), Sightings.joined([])
         for level in _ROUNDS:
-            sightings = self._sightings(camera, chosen, level)
-            if len(sightings.pixels_px) < max(_MIN_SIGHTINGS, _MIN_SEEN_SHARE * sightings.tested):
+            sightings = Sightings.joined(
+                [
+                    sight_points(
+                        self._panoramas.surface(name),
+                        self._panoramas.levels(name)[level],
+                        self._levels,
+                        camera=camera,
+                        size_hw=self._size_hw,
+                    )
+                    for name in chosen
+                ]
+            )
+            # With fewer patches than these, the pose is wrong.
+            if len(sightings.pixels_px) < max(12, 0.03 * sightings.tested):
                 return Aligned(camera, 0, sightings.tested)
             camera = refine_by_sightings(camera, sightings, size_hw=self._size_hw, prior=prior)
         errors = np.linalg.norm(sightings.errors(camera, self._size_hw), axis=1)
         offset, stds = optical_center_offset(camera, sightings, size_hw=self._size_hw, prior=prior)
-        significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > _SIGNIFICANT_STD
+        significant = float(np.linalg.norm(offset / np.maximum(stds, 1e-9))) > 4.0
         off_center = float(np.linalg.norm(offset)) if significant else 0.0
-        return Aligned(camera, int((errors < _CONFIRMED_STD).sum()), sightings.tested, off_center)
-
-    def _sightings(self, camera: PhotographCamera, names: Iterable[str], level: int) -> Sightings:
-        return Sightings.joined(
-            [
-                sight_points(
-                    self._panoramas.surface(name),
-                    self._panoramas.levels(name)[level],
-                    self._levels,
-                    camera=camera,
-                    size_hw=self._size_hw,
-                )
-                for name in names
-            ]
-        )
+        return Aligned(camera, int((errors < 3.0).sum()), sightings.tested, off_center)
 
 
 def _reduced(picture: NDArray[np.uint8], max_px: int) -> NDArray[np.uint8]:

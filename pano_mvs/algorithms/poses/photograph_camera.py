@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 
-_ROUNDS, _MIN_POINTS = 4, 6
 # Typical changes of rotation, translation, log focal length and distortion.
 _STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
 _RADIAL_STD = 0.1
@@ -22,19 +21,12 @@ _ROBUST = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Where a photograph shows points.
+    """Where a photograph shows points."""
 
-    Attributes:
-        pixels_px: (N, 2) float64.
-        points_in_world: (N, 3) float64.
-        whitening: (N, 2, 2) matrices W that turn errors in pixels into independent ones with a deviation of 1.
-        tested: number of points that could have been seen.
-    """
-
-    pixels_px: FloatArray
-    points_in_world: FloatArray
-    whitening: FloatArray
-    tested: int
+    pixels_px: FloatArray  # (N, 2) float64
+    points_in_world: FloatArray  # (N, 3) float64
+    whitening: FloatArray  # (N, 2, 2) matrices W that turn errors in pixels into independent ones with a deviation of 1
+    tested: int  # number of points that could have been seen
 
     @staticmethod
     def joined(parts: Sequence[Sightings]) -> Sightings:
@@ -53,30 +45,19 @@ class Sightings:
 
 
 class FocalPrior(NamedTuple):
-    """What is known about a focal length.
+    """What is known about a focal length."""
 
-    Attributes:
-        focal_px: the expected focal length.
-        log_std: standard deviation of its natural logarithm.
-    """
-
-    focal_px: float
-    log_std: float
+    focal_px: float  # the expected focal length
+    log_std: float  # standard deviation of its natural logarithm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographCamera:
-    """The camera of a photograph; see `Photographs` for the projection.
+    """The camera of a photograph; see `Photographs` for the projection."""
 
-    Attributes:
-        cam_from_world: the pose.
-        focal_px: focal length.
-        radial: coefficient of the distortion.
-    """
-
-    cam_from_world: Rigid3
-    focal_px: float
-    radial: float
+    cam_from_world: Rigid3  # the pose
+    focal_px: float  # focal length
+    radial: float  # coefficient of the distortion
 
     def fov_deg(self, size_hw: tuple[int, int]) -> float:
         """Return the angle that the longer side of a photograph covers, without the distortion."""
@@ -120,10 +101,10 @@ def refine_camera(
         prior: what is known about the focal length.
         max_error: the largest error of an inlier, in radians at the centre.
     """
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         errors = camera.errors(pixels_px, points_in_world, size_hw)
         inliers = errors < camera.focal_px * max_error
-        if inliers.sum() < _MIN_POINTS:
+        if inliers.sum() < 6:
             break
         scale_px = max(0.1, _ROBUST * float(np.median(errors[inliers])))
         camera = _adjusted(

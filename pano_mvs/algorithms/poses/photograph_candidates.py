@@ -14,11 +14,6 @@ from pano_mvs.algorithms.matching.integer_descriptors import (
 )
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 
-# VLAD vectors hardly separate the panoramas of a photograph's place from others, because a panorama's describes the
-# whole sphere (docs/benchmarks.md). The strongest key points do, with a fraction of the comparisons.
-_SAMPLE = 300
-_RATIO = 0.8  # threshold of the ratio test of Lowe 2004, section 7.1
-
 
 def similar_panoramas(
     photographs: Sequence[NDArray[np.generic]], panoramas: Iterable[tuple[str, NDArray[np.generic]]], *, count: int
@@ -34,7 +29,9 @@ def similar_panoramas(
         panoramas: the name and the (M, 128) descriptors of each panorama.
         count: number of panoramas; all are returned if there are no more than these, or if it is 0.
     """
-    samples = [_Sample(descriptors[:_SAMPLE]) for descriptors in photographs]
+    # VLAD vectors hardly separate the panoramas of a photograph's place from others, because a panorama's describes the
+    # whole sphere (docs/benchmarks.md). The strongest key points do, with a fraction of the comparisons.
+    samples = [_Sample(descriptors[:300]) for descriptors in photographs]
     names: list[str] = []
     matches: list[list[int]] = []
     for name, descriptors in panoramas:
@@ -65,7 +62,8 @@ def _count_matches(sample: _Sample, known: _Sample) -> int:
     if min(len(sample.descriptors), len(known.descriptors)) < 2:
         return 0
     found = _nearest_two(sample, known)
-    kept = found.squared < np.float32(_RATIO**2) * found.next_squared
+    # Threshold of the ratio test of Lowe 2004, section 7.1.
+    kept = found.squared < np.float32(0.8**2) * found.next_squared
     kept &= found.squared <= found.squared_back[found.nearest]
     return len(np.unique(found.nearest[kept]))
 

@@ -27,7 +27,6 @@ _MIN_CORRELATION, _MAX_SHIFT = 0.8, 3.0
 _FLOOR = 0.05
 _ROUNDNESS = 1.0
 _NOISE_FACTOR = 4.0
-_MAX_LEVELS = 7
 
 
 def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -37,7 +36,7 @@ def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
     """
     levels: list[NDArray[np.float32]] = []
     reduced = gray.astype(np.float32)
-    while len(levels) < _MAX_LEVELS and min(reduced.shape) >= MIN_SIDE_PX:
+    while len(levels) < 7 and min(reduced.shape) >= MIN_SIDE_PX:
         levels.append(np.asarray(cv2.GaussianBlur(reduced, (0, 0), _SMOOTHING), np.float32))
         size_xy = [max(1, round(side / 2 ** len(levels))) for side in gray.shape[::-1]]
         reduced = np.asarray(cv2.resize(reduced, size_xy, interpolation=cv2.INTER_AREA), np.float32)

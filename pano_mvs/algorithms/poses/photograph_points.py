@@ -10,30 +10,21 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3, pixel_from_ray
 from pano_mvs.scene import Features, RangeMap
 
-_SIFT_LENGTH = 128
-# Ranges are used where the surface is continuous: the relative difference to the pixels beside it.
-_MAX_STEP = 0.03
 _BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownPoints:
-    """The key points of a panorama whose position is known.
+    """The key points of a panorama whose position is known."""
 
-    Attributes:
-        descriptors: (N, D).
-        points_in_world: (N, 3) float64.
-        keypoints_idx: (N,) their positions among all key points of the panorama.
-    """
-
-    descriptors: NDArray[np.generic]
-    points_in_world: NDArray[np.float64]
-    keypoints_idx: NDArray[np.intp]
+    descriptors: NDArray[np.generic]  # (N, D)
+    points_in_world: NDArray[np.float64]  # (N, 3) float64
+    keypoints_idx: NDArray[np.intp]  # (N,) their positions among all key points of the panorama
 
 
 def has_sift(features: Features) -> bool:
     """Return whether key points can be compared with those of photographs."""
-    return features.metric == "l2" and features.descriptors.shape[1] == _SIFT_LENGTH
+    return features.metric == "l2" and features.descriptors.shape[1] == 128
 
 
 def known_points(
@@ -55,7 +46,8 @@ def known_points(
     ranges = range_map.range[y, x].astype(np.float64)
     beside = np.stack([range_map.range[np.clip(y + dy, 0, height - 1), (x + dx) % width] for dx, dy in _BESIDE])
     with np.errstate(invalid="ignore"):
-        smooth = (np.abs(beside - ranges) <= _MAX_STEP * ranges).all(axis=0)
+        # Ranges are used where the surface is continuous: the relative difference to the pixels beside it.
+        smooth = (np.abs(beside - ranges) <= 0.03 * ranges).all(axis=0)
     keep = smooth & np.isfinite(ranges) & (range_map.confidence[y, x] >= min_confidence)
     points = cam_from_world.inverse().apply(features.bearings[keep] * ranges[keep, None])
     return KnownPoints(features.descriptors[keep], points, np.flatnonzero(keep))

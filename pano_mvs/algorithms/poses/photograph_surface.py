@@ -14,28 +14,18 @@ from pano_mvs.scene import Features, RangeMap
 
 # A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
 _OFFSETS_PX = (-4, -2, 0, 2, 4)
-_PLANAR_SHARE, _PLANAR = 0.8, 0.02
-_MIN_COSINE = 0.1
 _STD, _STD_BOUNDS = 0.005, (0.003, 0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Points of surfaces that a panorama sees.
+    """Points of surfaces that a panorama sees."""
 
-    Attributes:
-        cam_from_world: the panorama's pose.
-        bearings: (N, 3) float64 unit, in its camera frame.
-        ranges: (N,) float64.
-        normals_in_cam: (N, 3) float64 unit, towards the camera.
-        range_stds: (N,) float64 standard deviations of the logarithms of the ranges.
-    """
-
-    cam_from_world: Rigid3
-    bearings: FloatArray
-    ranges: FloatArray
-    normals_in_cam: FloatArray
-    range_stds: FloatArray
+    cam_from_world: Rigid3  # the panorama's pose
+    bearings: FloatArray  # (N, 3) float64 unit, in its camera frame
+    ranges: FloatArray  # (N,) float64
+    normals_in_cam: FloatArray  # (N, 3) float64 unit, towards the camera
+    range_stds: FloatArray  # (N,) float64 standard deviations of the logarithms of the ranges
 
     @property
     def points_in_world(self) -> FloatArray:
@@ -77,8 +67,8 @@ def surface_points(
     heights = (normals * centers).sum(axis=1) * range_map.range[y, x]
     slopes = (normals * bearings).sum(axis=1)
     with np.errstate(invalid="ignore"):
-        flat = _planar_share(range_map.range, (x, y), (normals, heights)) >= _PLANAR_SHARE
-        keep = flat & (slopes < -_MIN_COSINE)
+        flat = _planar_share(range_map.range, (x, y), (normals, heights)) >= 0.8
+        keep = flat & (slopes < -0.1)
     stds = np.full(len(good), _STD)
     if range_map.uncertainty is not None:
         stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), *_STD_BOUNDS)
@@ -102,5 +92,5 @@ def _planar_share(
             column = (x + np.rint(across * stretch).astype(np.intp)) % width
             rays = ray_from_pixel(np.stack([column + 0.5, row + 0.5], axis=-1), (height, width))
             on_plane = heights / (normals * rays).sum(axis=1)
-            share += np.abs(ranges[row, column] / on_plane - 1) < _PLANAR
+            share += np.abs(ranges[row, column] / on_plane - 1) < 0.02
     return share / len(_OFFSETS_PX) ** 2

@@ -50,7 +50,6 @@ def solve_scaled_translation(
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
         scale_estimator: see `estimate_scale`; "kappa" is the paper's.
-        kappa: the paper's κ.
         adjust: whether to adjust all cameras and points together at intervals, which keeps errors from accumulating. If
             False, the poses are those of the chain, as in the paper.
         load: returns the panorama and the mask of an image by its name; None leaves every decision to the pairs.

@@ -30,23 +30,14 @@ def pixels_containing(rays: FloatArray, size_hw: tuple[int, ...]) -> tuple[NDArr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Agreement of all sources with each pixel, (H, W) each.
+    """Agreement of all sources with each pixel, (H, W) each."""
 
-    Attributes:
-        agreeing: number of sources that agree.
-        contradicting: number of sources that see through it.
-        hiding: number of sources that see something nearer.
-        support: sum of the supports of the agreeing sources.
-        motion: sum of their supports times their squared motions, in rad².
-        squared_error: sum of their supports times their squared reprojection errors, in rad².
-    """
-
-    agreeing: NDArray[np.uint16]
-    contradicting: NDArray[np.uint16]
-    hiding: NDArray[np.uint16]
-    support: NDArray[np.float64]
-    motion: NDArray[np.float64]
-    squared_error: NDArray[np.float64]
+    agreeing: NDArray[np.uint16]  # number of sources that agree
+    contradicting: NDArray[np.uint16]  # number of sources that see through it
+    hiding: NDArray[np.uint16]  # number of sources that see something nearer
+    support: NDArray[np.float64]  # sum of the supports of the agreeing sources
+    motion: NDArray[np.float64]  # sum of their supports times their squared motions, in rad²
+    squared_error: NDArray[np.float64]  # sum of their supports times their squared reprojection errors, in rad²
 
 
 def compare_with_sources(

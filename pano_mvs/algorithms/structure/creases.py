@@ -37,22 +37,14 @@ _AZIMUTHS_RAD = np.radians(np.arange(0.0, 360.0, 0.7))
 _COARSE_STEPS = 2
 # The planes must be seen on their sides of the crease, this far from it.
 _BESIDE_RAD = np.radians([2.0, 3.5])
-_LEAST_COSINE = 0.08
-_MIN_SAMPLES = 6
 
 # Standard deviations of the shift and the turn of planes that were fitted to precise points, and to others.
 _PRECISE_STDS, _PLAIN_STDS = np.array([0.002, np.radians(0.1)]), np.array([0.02, np.radians(0.7)])
-# The same of the height of level planes, relative to that above or below the cameras.
-_PRECISE_LEVEL_STD, _PLAIN_LEVEL_STD = 0.001, 0.005
 # The loss of a shift by one standard deviation, as a share of the contrast across the crease.
 _LOSS = 0.025
-_MIN_SHARE = 0.25
-# Standard deviation of ranges on planes that creases placed.
-_CREASE_UNCERTAINTY = 0.004
 _COARSE_SHIFTS, _COARSE_TURNS_RAD = np.linspace(-0.06, 0.06, 25), np.radians(np.linspace(-1, 1, 5))
 _FINE_SHIFTS, _FINE_TURNS_RAD = np.linspace(-0.004, 0.004, 9), np.radians(np.linspace(-0.3, 0.3, 5))
 _HEIGHT_SHIFTS = np.linspace(-0.01, 0.01, 21)
-_ROUNDS = 3
 
 
 def placed_by_creases(
@@ -71,12 +63,12 @@ def placed_by_creases(
     levels = sorted(
         (idx for idx, plane in enumerate(planes) if plane.is_level), key=lambda idx: -planes[idx].precise_support
     )
-    for round_number in range(_ROUNDS):
+    for round_number in range(3):
         for placement in placed.values():
             placement.move(heights, _FINE_SHIFTS / (1 + round_number), _FINE_TURNS_RAD / (1 + round_number), fine=True)
         for level in levels[1:]:
             heights[level] = _best_height(planes[level], level, heights, placed=list(placed.values()))
-    clear = {idx: placement for idx, placement in placed.items() if placement.share >= _MIN_SHARE}
+    clear = {idx: placement for idx, placement in placed.items() if placement.share >= 0.25}
     return [
         replace(plane, offset=float(heights[idx] * plane.normal[1]))
         if plane.is_level
@@ -164,7 +156,8 @@ class _Placement:
         (x, z), offset = self._moved(self.turn, self.shift)
         uncertainty = self.plane.uncertainty
         if self.plane.support:  # ranges and creases agree
-            uncertainty = min(uncertainty, _CREASE_UNCERTAINTY)
+            # Standard deviation of ranges on planes that creases placed.
+            uncertainty = min(uncertainty, 0.004)
         return replace(self.plane, normal=np.array([x, 0.0, z]), offset=offset, uncertainty=uncertainty)
 
     def _moved(self, turn: float, shift: float) -> tuple[FloatArray, float]:
@@ -180,7 +173,9 @@ def _best_height(plane: ScenePlane, level: int, heights: FloatArray, *, placed: 
         return float(heights[level])
     middle = np.concatenate([placement.creases.center[:, 1] for placement in meeting]).mean()
     samples = sum(len(placement.creases.azimuth) for placement in meeting)
-    std = plane.precise_share * _PRECISE_LEVEL_STD + (1 - plane.precise_share) * _PLAIN_LEVEL_STD
+    # Standard deviations of the height of level planes that were fitted to precise points, and to others, relative to
+    # that above or below the cameras.
+    std = plane.precise_share * 0.001 + (1 - plane.precise_share) * 0.005
     best, found = -np.inf, float(heights[level])
     for shift in _HEIGHT_SHIFTS:
         tried = heights.copy()
@@ -262,7 +257,7 @@ def _profiles(
     cosine, height = across @ upright.normal[[0, 2]], upright.offset - center @ upright.normal
     if height >= 0:
         return None
-    seen = cosine < -_LEAST_COSINE
+    seen = cosine < -0.08
     azimuth = _AZIMUTHS_RAD[seen]
     dip = np.arctan2(level_y - center[1], height / cosine[seen])
     outward = -np.sign(level_y - center[1])  # towards the horizon, where the upright plane is
@@ -271,7 +266,7 @@ def _profiles(
         on_upright = _value_at(sides[0], view, rays=world_rays(azimuth, dip + outward * beside))
         on_level = _value_at(sides[1], view, rays=world_rays(azimuth, dip - outward * beside))
         shown |= on_upright & on_level
-    if shown.sum() < _MIN_SAMPLES:
+    if shown.sum() < 6:
         return None
     azimuth, dip = azimuth[shown], dip[shown]
     steps = STEP_RAD * np.arange(-_REACH - HALF_DIFFERENCE, _REACH + HALF_DIFFERENCE + 1)

@@ -28,17 +28,9 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 
-# What a pixel without a plane costs, where 1 is a range that is not on the plane.
-_NO_PLANE = 0.6
 # Weights of the own ranges of precise, confirmed, weak and filled pixels.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
-# The weight of the outline of the room where nothing is confirmed.
-_OUTLINE_WEIGHT = 0.2
-# Planes with less of the sphere are not laid.
-_MIN_AREA = 0.003
 _SOURCES = 4
-# A floor that slopes by this angle must not be taken for the level one: nearer the horizon, nothing is moved up to it.
-_SLOPE_RAD = np.radians(1.0)
 
 
 @checks_settings
@@ -150,7 +142,9 @@ def _below(floor: FloatArray, range_map: RangeMap, *, error: float, cosine: Floa
 
     `floor`: (H, W) ranges on it. `error`: relative, of a range on it. `cosine`: of the angle between ray and vertical.
     """
-    steep = np.isfinite(floor) & (cosine > _SLOPE_RAD / error)
+    # A floor that slopes by this angle must not be taken for the level one: nearer the horizon, nothing is moved up to
+    # it.
+    steep = np.isfinite(floor) & (cosine > np.radians(1.0) / error)
     with np.errstate(invalid="ignore"):
         on_it, below = np.abs(range_map.range / floor - 1) < error, ~(range_map.range <= floor * (1 + error))
     confirmed = range_map.confidence >= CONSISTENT_CONFIDENCE[0]
@@ -174,14 +168,17 @@ def _labels(
     confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
     weak = confidence >= WEAK_CONFIDENCE[0]
     weight = np.select([confirmed & textured, confirmed, weak], _WEIGHTS[:3], _WEIGHTS[3])
-    prior = np.zeros(ranges.shape) if outlined is None else _OUTLINE_WEIGHT * ((outlined >= 0) & ~confirmed)
+    # The weight of the outline of the room where nothing is confirmed.
+    prior = np.zeros(ranges.shape) if outlined is None else 0.2 * ((outlined >= 0) & ~confirmed)
     area = pixel_solid_angle(confidence.shape[:2])[:, None] / (4 * np.pi)
-    best, label = np.full(ranges.shape, _NO_PLANE), np.full(ranges.shape, -1, np.int16)
+    # What a pixel without a plane costs, where 1 is a range that is not on the plane.
+    best, label = np.full(ranges.shape, 0.6), np.full(ranges.shape, -1, np.int16)
     for number, on_plane in enumerate(on_planes):
         with np.errstate(invalid="ignore", divide="ignore"):
             error = np.abs(np.log(ranges / on_plane)) / tolerance
         shown = np.zeros(ranges.shape, np.bool_) if outlined is None else outlined == number
-        if not (area * ((error < 1) & weak | shown)).sum() >= _MIN_AREA:
+        # Planes with less of the sphere are not laid.
+        if not (area * ((error < 1) & weak | shown)).sum() >= 0.003:
             continue
         unknown = np.isfinite(on_plane) & ~np.isfinite(ranges)
         cost = np.where(unknown, 0.5, np.minimum(np.nan_to_num(error, nan=1.0), 1.0))

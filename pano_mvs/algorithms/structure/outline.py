@@ -35,7 +35,6 @@ Labels = NDArray[np.int64]
 _AZIMUTHS = 360  # of an outline, from the z axis of the world towards its x axis
 _LEAST_COSINE = 0.1
 _HALF_WINDOW = 4  # azimuths along a crease
-_CLEAR_LEVELS = 20.0  # a difference of colour that could not be clearer
 # The cost of a change of plane and of each relative step in distance there, in azimuths of clear creases.
 _CHANGE, _STEP_SIZE, _MOST_STEPS = 2.0, 0.1, 3.0
 # The planes of a search: distances in heights of the camera above the floor, and turns of four directions.
@@ -43,10 +42,8 @@ _DISTANCES = np.geomspace(0.35, 9.0, 110)
 _TURNS_RAD, _FINE_TURNS_RAD = np.radians(np.arange(0.0, 90.0, 3.0)), np.radians(np.arange(-2.0, 2.1, 1.0))
 # The turn is searched at every fourth azimuth of some views, with planes that are clear over 36°.
 _TURN_VIEWS, _TURN_STEP, _TURN_SPAN = 6, 4, 9
-_LEAST_MARGIN, _MOST_ROOMS, _NEARLY = 0.1, 6, 0.95
 # Heights of a ceiling above the cameras that are tried, in heights of the camera above the floor.
 _CEILINGS = np.geomspace(0.3, 1.6, 36)
-_ROOF_COSINE = 0.7  # of the angle to the zenith
 _SAME_RAD, _SAME_DISTANCE = np.radians(4.0), 0.05
 OUTLINE_UNCERTAINTY = 0.03
 """Relative standard deviation of ranges on a wall that creases of single views alone show."""
@@ -85,7 +82,8 @@ class Skyline:
         total = np.zeros(distance.shape)
         for elevation in (-np.arctan2(down, known), np.arctan2(up, known)):
             common = _along(self._at(elevation) * seen[..., None], self.half_window)
-            total += np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / _CLEAR_LEVELS, 1.0))
+            # A difference of colour that could not be clearer.
+            total += np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / 20.0, 1.0))
         return np.where(seen, total, -np.inf)
 
     def _at(self, elevation: FloatArray) -> NDArray[np.float32]:
@@ -182,7 +180,7 @@ def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -
 
 def _is_roofed(view: PlaneView) -> bool:
     """Return whether most of the sphere around the zenith has a range."""
-    above = view.rays[..., 1] < -_ROOF_COSINE
+    above = view.rays[..., 1] < -0.7  # cosine of the angle to the zenith
     return bool(view.area[above & np.isfinite(view.ranges)].sum() > view.area[above].sum() / 2)
 
 
@@ -227,7 +225,7 @@ def _rooms(planes: Sequence[ScenePlane], center: FloatArray) -> list[tuple[int, 
         for sign in (1, -1)
     )
     pairs = [(floor, ceiling) for floor in floors for ceiling in ceilings]
-    return sorted(pairs, key=lambda pair: -planes[pair[0]].support * planes[pair[1]].support)[:_MOST_ROOMS]
+    return sorted(pairs, key=lambda pair: -planes[pair[0]].support * planes[pair[1]].support)[:6]
 
 
 def _clearest(tried: Sequence[_Tried]) -> _Tried:
@@ -236,7 +234,7 @@ def _clearest(tried: Sequence[_Tried]) -> _Tried:
     A room and a smaller one of the same shape look the same in one view, so that support decides.
     """
     totals = [float(np.maximum(clarity.max(axis=0), 0).sum()) for _, _, clarity in tried]
-    return next(found for found, total in zip(tried, totals, strict=True) if total >= _NEARLY * max(totals))
+    return next(found for found, total in zip(tried, totals, strict=True) if total >= 0.95 * max(totals))
 
 
 def _coarsely(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[_Around]:
@@ -311,7 +309,7 @@ def _walls_of(one: _Around, planes: Sequence[ScenePlane], turn: float) -> list[t
         other = np.where(np.isfinite(apart) & (apart > _STEP_SIZE), clarity[:, azimuths], 0.0)
         margin = float(clarity[wall, azimuths].mean() - other.mean(axis=1).max())
         margin += 2 * float(_confirmed(one.view, plane, down=down, up=up)[azimuths].mean())
-        if margin > _LEAST_MARGIN:
+        if margin > 0.1:
             found.append((margin * len(azimuths), plane, center))
     return found
 

@@ -19,22 +19,18 @@ from pano_mvs.algorithms.structure.outline import outline_planes, same_wall, sup
 from pano_mvs.algorithms.structure.view import PLAIN_WEIGHT, PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import UP
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import states_y_down
 
-_DRAWN_POINTS, _LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 6000, 64, 200, 5
-_SCORED_POINTS = 4000
-# A point without texture counts for this share of a precise one in the support of a plane.
-_PLAIN_SUPPORT = 0.5
+_LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 64, 200, 5
 _ALONG_NORMAL = 0.7
-_LEAST_COSINE = 0.03
 _LEAST_UNCERTAINTY = 0.002
 # Cosines of the angles between the two points that a plane is drawn from.
 _PAIR_COSINES = 0.9, 0.9985
-_UP = np.array([0.0, -1.0, 0.0])
 
 
 def find_planes(
@@ -51,7 +47,7 @@ def find_planes(
     least = min_share * 4 * np.pi
     planes = [
         plane
-        for normal in (_UP, -_UP)
+        for normal in (UP, -UP)
         for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
     ]
     planes += supposed_ceiling(views, planes)
@@ -84,7 +80,7 @@ class _Points:
     def errors(self, normal: FloatArray, offset: float, chosen: NDArray[np.intp]) -> FloatArray:
         """Return the relative errors of ranges of some points if they were on a plane; NaN if it is grazing."""
         cosine = self.rays[chosen] @ normal
-        cosine = np.where(np.abs(cosine) < _LEAST_COSINE, np.nan, cosine)
+        cosine = np.where(np.abs(cosine) < 0.03, np.nan, cosine)
         return np.asarray((offset - self.centers[chosen] @ normal) / cosine / self.ranges[chosen] - 1)
 
     def on(self, normal: FloatArray, offset: float, chosen: NDArray[np.intp], *, tolerance: float) -> Mask:
@@ -114,7 +110,7 @@ def _drawn_points(views: Sequence[PlaneView], rng: np.random.Generator) -> _Poin
     total = float(weight.sum())
     if total <= 0:
         return None
-    count = min(_DRAWN_POINTS * len(views), int(np.count_nonzero(weight)))
+    count = min(6000 * len(views), int(np.count_nonzero(weight)))
     chosen = rng.choice(len(weight), count, p=weight / total, replace=False)
     drawn = {name: array[chosen] for name, array in arrays.items()}
     return replace(_Points(**drawn), weight=np.full(count, total / count))
@@ -125,6 +121,7 @@ def _points_of(view: PlaneView, number: int) -> _Points:
     seen = np.isfinite(view.ranges) & (view.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(normals).all(axis=-1)
     rays, ranges, precise = view.rays[seen], view.ranges[seen], view.precise[seen]
     center = view.cam_from_world.center
+    # A point without texture counts for this share of a precise one in the support of a plane.
     return _Points(
         xyz=center + rays * ranges[:, None],
         centers=np.broadcast_to(center, rays.shape),
@@ -134,7 +131,7 @@ def _points_of(view: PlaneView, number: int) -> _Points:
         precise=precise,
         uncertainty=view.uncertainty[seen],
         view=np.full(len(ranges), number),
-        weight=view.area[seen] * np.where(precise, 1.0, _PLAIN_SUPPORT),
+        weight=view.area[seen] * np.where(precise, 1.0, 0.5),
         left=np.ones(len(ranges), np.bool_),
     )
 
@@ -183,7 +180,7 @@ def _upright_planes(points: _Points, *, rng: np.random.Generator, tolerance: flo
     while True:
         free = np.flatnonzero(points.left & (np.abs(points.normals[:, 1]) < np.sqrt(1 - _ALONG_NORMAL**2)))
         best, drawn = least, None
-        some = free[:: max(1, len(free) // _SCORED_POINTS)]
+        some = free[:: max(1, len(free) // 4000)]
         share = len(some) / max(len(free), 1)
         for normal, offset in _drawn_upright(points, free, rng):
             support = float(points.weight[some][points.on(normal, offset, some, tolerance=tolerance)].sum()) / share

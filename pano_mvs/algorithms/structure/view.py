@@ -28,8 +28,6 @@ PLAIN_WEIGHT = 0.05
 """Weight of a point without texture relative to a precise one in the fit of a plane."""
 
 _ROWS = 256
-# Planes at a more grazing angle than this cosine are not assigned to pixels.
-_GRAZING = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +90,8 @@ def plane_ranges(rays: FloatArray, center: FloatArray, *, normal: FloatArray, of
     cosine = rays @ normal
     height = offset - center @ normal
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where((cosine < -_GRAZING) & (height < 0), height / cosine, np.nan))
+        # Planes at a more grazing angle than this cosine are not assigned to pixels.
+        return np.asarray(np.where((cosine < -0.02) & (height < 0), height / cosine, np.nan))
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,10 +54,7 @@ _MIN_GAP = 0.5
 # Shares of the worst cost: a match this dear is a poor one; it is odd if it is dearer than its tile by this; and
 # another is better if it is cheaper by this.
 _NO_MATCH, _UNUSUAL, _BETTER = 0.2, 0.15, 0.03
-_UNUSUAL_SHARE = 0.03
 _SEARCH_STEP = 2
-# Along the guides paths need less to hold them together.
-_P1_SHARE = 0.7
 _ADOPT_RADIUS, _ADOPT_GAP = 2, 3.0
 
 
@@ -131,7 +128,7 @@ class GuidedSweep:
         """Return the tiles, (bands, tiles), in which pixels match much worse than most of their tile do."""
         usual = spread_tiles(tile_means(least), least.shape)
         odd = (least > _NO_MATCH * unit) & (least > usual + _UNUSUAL * unit) & ~is_bare(self.work.reference)
-        return tile_means(odd) > _UNUSUAL_SHARE
+        return tile_means(odd) > 0.03
 
     def _search_run(self, plane: NDArray[np.float32], costs: NDArray[np.float32], run: TileRun) -> None:
         state, planes = fresh_state(run.rows, len(run.with_margin))
@@ -157,7 +154,8 @@ class GuidedSweep:
         height, _, width = self.volume.shape
         settings, total = self.work.settings, np.zeros(self.volume.shape, np.uint16)
         guides = np.ascontiguousarray(np.moveaxis(np.rint(self.guides * PER_PLANE).astype(np.int16), 0, 1))
-        p1 = np.uint16(_P1_SHARE * settings.penalties(height)[0])
+        # Along the guides paths need less to hold them together.
+        p1 = np.uint16(0.7 * settings.penalties(height)[0])
         beyond_pole, before_seam = warm_up((height, width))
         for rows, columns in DIRECTIONS:
             penalties = step_penalties(self.work.contrast_picture, (rows, columns), settings)
@@ -194,9 +192,6 @@ class GuidedSweep:
         return Winners(plane, costs[0], costs[1], costs[2], costs[3], position - plane)
 
 
-_MIN_ROWS = 64
-_MIN_PLANES = 16
-_MAX_PENALTY = 4000
 # Two surfaces meet where positions within this many coarse pixels differ by more planes.
 _SPLIT_RADIUS, _SPLIT_GAP = 2, 6.0
 
@@ -220,11 +215,11 @@ def find_winners_coarse_to_fine(work: SweepInput, *, find_coarsest: Callable[[Sw
 def _coarse_input(work: SweepInput) -> SweepInput | None:
     """Return the same sweep at half the size and half the planes, or None if this is the last level."""
     settings, (height, width) = work.settings, work.reference.shape[:2]
-    if settings.levels < 2 or height % 2 or width % 4 or height // 2 < _MIN_ROWS:
+    if settings.levels < 2 or height % 2 or width % 4 or height // 2 < 64:
         return None
-    planes = max(min(_MIN_PLANES, settings.planes), -(-settings.planes // 2))
+    planes = max(min(16, settings.planes), -(-settings.planes // 2))
     # A step by one plane is as much longer as there are fewer of them.
-    p1 = min(round(settings.p1 * (settings.planes - 1) / (planes - 1)), max(settings.p2, settings.p1), _MAX_PENALTY)
+    p1 = min(round(settings.p1 * (settings.planes - 1) / (planes - 1)), max(settings.p2, settings.p1), 4000)
     ranges = virtual_ranges(
         work.ranges[0], work.ranges[-1], planes=planes, spacing=settings.spacing, baseline=work.baseline
     )

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import column_offsets, neighbours
 
-# The contrast in grey levels at which a neighbour has half the weight of the pixel itself.
-_HALF_WEIGHT = 8.0
 _ONE = 256
 _PLANES_AT_ONCE = 4
 
@@ -140,7 +138,8 @@ def _contrast(picture: NDArray[np.uint8], row: int, columns: NDArray[np.int64]) 
 
 def _weights(contrasts: list[NDArray[np.int16]]) -> NDArray[np.uint16]:
     """Return whole weights that add up to 256, (side, H, W); what rounding leaves goes to the pixel itself."""
-    table = (1 / (1 + (np.arange(256) / _HALF_WEIGHT) ** 2)).astype(np.float32)
+    # The contrast in grey levels at which a neighbour has half the weight of the pixel itself.
+    table = (1 / (1 + (np.arange(256) / 8.0) ** 2)).astype(np.float32)
     weights = np.stack([table[contrast] for contrast in contrasts])
     whole: NDArray[np.uint16] = np.floor(weights * (np.float32(_ONE) / weights.sum(axis=0))).astype(np.uint16)
     middle = len(whole) // 2

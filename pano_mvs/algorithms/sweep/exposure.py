@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.panoramas import filtered
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
 
-_ROUNDS = 10
-_MIN_PIXELS = 50
 # No camera's exposures differ by more; a fit that says so has met moved things or bare walls.
 _GAIN_LIMITS = 0.4, 2.5
-# A smaller change of all grey levels is ignored: wrong ranges and noise cause as much.
-_MIN_CHANGE = 2.0
 # A source is looked up between its pixels, which takes contrast away; so far from pixel centres along both axes the
 # reference loses as much on average (w (1 − w) is 1/6, its mean), and smoothing leaves little of either.
 _BETWEEN_PIXELS, _SMOOTHING_PX = 0.2113, 0.8
@@ -27,15 +23,10 @@ _ENDS, _MAX_CUT_OFF = (3, 252), 10.0
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """reference ≈ gain · source + offset.
+    """reference ≈ gain · source + offset."""
 
-    Attributes:
-        gain: (C,) float64 for each colour.
-        offset: (C,) float64 in grey levels.
-    """
-
-    gain: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    gain: NDArray[np.float64]  # (C,) float64 for each colour
+    offset: NDArray[np.float64]  # (C,) float64 in grey levels
 
     def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the picture as the reference's exposure would have shown it, (H, W, C)."""
@@ -94,11 +85,11 @@ def match_exposure(
 
 def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """Return the slope and the intercept of y over x; (1, 0) where they cannot be known."""
-    if len(x) < _MIN_PIXELS or np.std(x) < 1:
+    if len(x) < 50 or np.std(x) < 1:
         return 1.0, 0.0
     gain, offset = float(np.std(y) / np.std(x)), 0.0
     offset = float(np.median(y - gain * x))
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         residual = y - gain * x - offset
         spread = 1.4826 * float(np.median(np.abs(residual))) + 0.5
         weight = 1 / (1 + (residual / (2 * spread)) ** 2) ** 2
@@ -110,7 +101,8 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
         offset = float(mean_y - gain * mean_x)
     darkest, brightest = np.quantile(x, [0.05, 0.95])
     change = max(abs(gain * level + offset - level) for level in (darkest, brightest))
-    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < _MIN_CHANGE:
+    # A smaller change of all grey levels is ignored: wrong ranges and noise cause as much.
+    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < 2.0:
         return 1.0, 0.0
     return gain, offset
 

@@ -34,15 +34,9 @@ _MAX_PICTURES = 5
 _NEAREST_BASELINES = 0.05
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
-_MIN_SHARE = 0.01
-# Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest measurable range
-# or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
-_OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
 # A plain surface nearer than any textured one ends in the nearest planes, in an area of at least this share of the
 # sphere. The near limit is then lowered in steps of half an octave. Where four do not help, chance decides.
 _NEAREST_PLANES, _MIN_ENDED_SHARE, _MAX_STEPS = 3, 0.003, 4
-# Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
-_MIN_CONTRAST = 4
 
 
 def limits_by_sweeping(
@@ -95,7 +89,7 @@ def limits_by_sweeping(
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()
-    if solid_angle[agreed].sum() <= _MIN_SHARE * seen_angle:
+    if solid_angle[agreed].sum() <= 0.01 * seen_angle:
         return nearest, farthest
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
     steps = np.log2([min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far]) * _STEPS_PER_OCTAVE
@@ -103,8 +97,10 @@ def limits_by_sweeping(
         float(2 ** (np.floor(steps[0]) / _STEPS_PER_OCTAVE)),
         float(2 ** (np.ceil(steps[1]) / _STEPS_PER_OCTAVE)),
     )
-    open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
-    far = max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
+    # Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest measurable range or
+    # beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
+    open_angle = solid_angle[maps[0].range > (1 / 3) * farthest].sum()
+    far = max(far, farthest) if open_angle > 0.1 * seen_angle else far
     return _lowered(near, far, sweeps), far
 
 
@@ -164,7 +160,9 @@ def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:
 
 def textured_pixels(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), in whose surroundings there is something to match."""
-    return contrast_around(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2) >= _MIN_CONTRAST
+    # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other
+    # anywhere.
+    return contrast_around(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2) >= 4
 
 
 def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tuple[float, float]:

@@ -166,10 +166,6 @@ def valid_where_seen(valid: NDArray[np.bool_], points_in_source: NDArray[np.floa
     return np.asarray(valid[pixels_containing(points_in_source, valid.shape)])
 
 
-# Of all weight this share is dealt out equally where no source sees range, so that something is compared at all.
-_EQUAL_SHARE = 1e-3
-
-
 def source_weights(
     size_hw: tuple[int, int], source_from_reference: Sequence[Rigid3], settings: SweepSettings
 ) -> NDArray[np.float32]:
@@ -190,17 +186,12 @@ def parallax_weights(size_hw: tuple[int, int], source_from_reference: Sequence[R
     """
     rays = ray_grid(size_hw)
     parallax = np.stack([np.linalg.norm(np.cross(rays, pose.center), axis=-1) for pose in source_from_reference])
-    parallax += _EQUAL_SHARE * max(float(np.linalg.norm(pose.center)) for pose in source_from_reference) + 1e-12
+    # Of all weight this share is dealt out equally where no source sees range, so that something is compared at all.
+    parallax += 1e-3 * max(float(np.linalg.norm(pose.center)) for pose in source_from_reference) + 1e-12
     return np.asarray(parallax / parallax.sum(axis=0), dtype=np.float32)
 
 
-# Grey levels between the darkest and the brightest pixel of a window below which it is bare.
-_MIN_CONTRAST = 10
 _CONTRAST_RADIUS = 2
-# The nearest planes are this share of all.
-_NEAREST_SHARE = 0.03
-# The last plane is as good as infinitely far if parallax there is less than this.
-_MIN_PARALLAX_PX = 1.0
 
 
 def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
@@ -215,15 +206,18 @@ def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """
     planes = work.settings.planes
     last = winners.plane == planes - 1
-    first = winners.plane < max(1, round(_NEAREST_SHARE * planes))
+    # The nearest planes are this share of all.
+    first = winners.plane < max(1, round(0.03 * planes))
     baseline = max(float(np.linalg.norm(pose.translation)) for pose in work.source_from_reference)
     parallax_px = baseline / work.ranges[-1] * work.reference.shape[1] / (2 * np.pi)
     unmatched = (last | first) & is_bare(work.reference)
-    if parallax_px < _MIN_PARALLAX_PX:
+    # The last plane is as good as infinitely far if parallax there is less than this.
+    if parallax_px < 1.0:
         unmatched |= last
     return np.asarray(~unmatched)
 
 
 def is_bare(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), around which no colour of a picture (H, W, C) changes enough to be matched."""
-    return contrast_around(picture, _CONTRAST_RADIUS) < _MIN_CONTRAST
+    # Grey levels between the darkest and the brightest pixel of a window below which it is bare.
+    return contrast_around(picture, _CONTRAST_RADIUS) < 10

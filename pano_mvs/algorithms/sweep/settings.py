@@ -11,8 +11,6 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import check_settings, setting
 
 _PENALTY_ROWS = 512
-# Eight paths of at most 255 + P2 each must fit uint16, and P1 on top of a plane that does not exist.
-_MAX_P1, _MAX_P2 = 5000, 7900
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,8 @@ class SweepSettings:
     def penalties(self, height: int) -> tuple[int, int]:
         """Return P1 and the largest P2 for a picture of `height` rows, such that sums of paths fit 16 bits."""
         scale = height / _PENALTY_ROWS
-        return min(round(self.p1 * scale), _MAX_P1), min(round(self.p2 * scale), _MAX_P2)
+        # Eight paths of at most 255 + P2 each must fit uint16, and P1 on top of a plane that does not exist.
+        return min(round(self.p1 * scale), 5000), min(round(self.p2 * scale), 7900)
 
     @property
     def matching_cost(self) -> SweepCost:

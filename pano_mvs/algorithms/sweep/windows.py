@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import pad_panorama
 
-MAX_STRETCH = 8.0
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
@@ -24,7 +23,7 @@ def column_stretch(height: int, *, spherical: bool) -> NDArray[np.float64]:
     if not spherical:
         return np.ones(height)
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    return np.minimum(1 / np.cos(elevation), MAX_STRETCH)
+    return np.minimum(1 / np.cos(elevation), 8.0)
 
 
 def column_offsets(size_hw: tuple[int, int], radius: int, *, spherical: bool) -> NDArray[np.int64]:
@@ -88,15 +87,10 @@ def box_mean(picture: NDArray[np.float64], window: CostWindow) -> NDArray[np.flo
 
 @dataclass(frozen=True, eq=False)
 class WindowBands:
-    """The rows of a picture in bands within which all windows are equally wide, to be worked on by slices.
+    """The rows of a picture in bands within which all windows are equally wide, to be worked on by slices."""
 
-    Attributes:
-        radius: rows on either side of a window's centre.
-        columns: (H, 2 radius + 1) columns of a window's pixels against its centre.
-    """
-
-    radius: int
-    columns: NDArray[np.int64]
+    radius: int  # rows on either side of a window's centre
+    columns: NDArray[np.int64]  # (H, 2 radius + 1) columns of a window's pixels against its centre
     width: int
 
     @staticmethod

@@ -12,10 +12,6 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
 
-# A winner cheaper than its best rival by this share of the rival's cost is as sure as can be.
-_SURE_MARGIN = 0.8
-# Likewise one that is cheaper than the planes next to it.
-_SHARP_MARGIN = 0.5
 _ROWS_AT_ONCE = 256
 
 
@@ -113,10 +109,12 @@ def confidence(winners: Winners, *, measure: Literal["peak_ratio", "curvature", 
         no_rival = np.isinf(winners.rival)  # three planes or fewer
         rival = np.where(no_rival, 1.0, winners.rival).astype(np.float64)
         cost = np.where(no_rival, 0.0, winners.cost)
-        shares.append((rival - cost) / np.maximum(rival, 1e-6) / _SURE_MARGIN)
+        # A winner cheaper than its best rival by this share of the rival's cost is as sure as can be.
+        shares.append((rival - cost) / np.maximum(rival, 1e-6) / 0.8)
     if measure != "peak_ratio":
         around = winners.before.astype(np.float64) + winners.after
-        shares.append((around - 2.0 * winners.cost) / np.maximum(around, 1e-6) / _SHARP_MARGIN)
+        # Likewise one that is cheaper than the planes next to it.
+        shares.append((around - 2.0 * winners.cost) / np.maximum(around, 1e-6) / 0.5)
     low, high = WEAK_CONFIDENCE
     share = np.prod(np.clip(shares, 0, 1), axis=0) ** (1 / len(shares))
     return np.asarray(np.rint(low + share * (high - low)), dtype=np.uint8)

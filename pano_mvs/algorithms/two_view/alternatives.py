@@ -30,17 +30,10 @@ from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 BoolArray = NDArray[np.bool_]
 
 _TWINS = 16  # number of samples among the matches of a known geometry
-_FRESH = 96  # number of samples among the matches that the best geometry does not explain
 _PEAKS = 6  # number of candidates of each kind that are refined
-_FINALISTS = 4  # number of candidates that are verified
-_MIN_REFINED = 8  # minimum number of matches for refinement
-_MIN_OWN_RATIO = 0.6  # own independent matches, relative to the number that a best geometry needs
 _MIN_OWN_SHARE = 0.08  # own matches, relative to the matches of the best geometry
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
 _MIN_DIRECTION_RAD = float(np.deg2rad(2.5))
-_SAME_ROTATION_RAD = float(np.deg2rad(2.0))
-_VARIANT_TURN_RAD = float(np.deg2rad(5.0))
-_VARIANT_DIRECTION_RAD = float(np.deg2rad(20.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +74,8 @@ def distinct_geometries(
     search = _Search(first, second, rng, threshold_rad, min_inliers)
     best, twins = search.better_twin(best)
     known = [search.geometry(best)]
-    pool = np.concatenate([twins, search.solutions(np.flatnonzero(~known[0].agreeing), _FRESH)])
+    # Number of samples among the matches that the best geometry does not explain.
+    pool = np.concatenate([twins, search.solutions(np.flatnonzero(~known[0].agreeing), 96)])
     while len(known) <= most:
         geometry = search.next_geometry(known, pool)
         if geometry is None:
@@ -128,7 +122,8 @@ class _Search:
     def next_geometry(self, known: Sequence[_Geometry], pool: FloatArray) -> _Geometry | None:
         """Return the geometry with most matches of its own; None unless these are more than chance."""
         searched = ~np.any([geometry.agreeing for geometry in known], axis=0)
-        needed = max(_MIN_OWN_RATIO * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
+        # Own independent matches, relative to the number that a best geometry needs.
+        needed = max(0.6 * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
         rest = self.rng.permutation(np.flatnonzero(searched))
         if len(rest) < needed:
             return None
@@ -141,7 +136,8 @@ class _Search:
         support = [int(agreement(pose, p, q, threshold_rad=1.5 * self.threshold_rad)[1].sum()) for pose in rough]
         chosen: list[Rigid3] = []
         for idx in np.argsort(support, kind="stable")[::-1]:
-            if support[idx] < needed or len(chosen) == _FINALISTS:
+            # Number of candidates that are verified.
+            if support[idx] < needed or len(chosen) == 4:
                 break
             if all(_differ(rough[idx], other) for other in chosen):
                 chosen.append(rough[idx])
@@ -172,7 +168,8 @@ class _Search:
         """Refine on the matches within successively narrower bands, in units of the threshold."""
         for widen in widths:
             near = agreement(pose, p, q, threshold_rad=widen * self.threshold_rad)[1]
-            if near.sum() < _MIN_REFINED:
+            # Minimum number of matches for refinement.
+            if near.sum() < 8:
                 break
             scale_rad = 0.5 * widen * self.threshold_rad
             pose = refine_relative_pose(pose, p[near], q[near], scale_rad=scale_rad, max_iterations=6)
@@ -189,7 +186,7 @@ class _Search:
         p, q = self.first[searched], self.second[searched]
         turn = min(float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known)
         # Two matches determine the direction if the rotation is known.
-        sample, models = (2, 1) if turn < _SAME_ROTATION_RAD else (5, 10)
+        sample, models = (2, 1) if turn < float(np.deg2rad(2.0)) else (5, 10)
         false_alarms = log10_false_alarms(
             witnesses,
             max(independent_count(p, q), witnesses),
@@ -211,7 +208,7 @@ def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArr
             return False
         turn = float(geodesic_angle(geometry.pose.rotation, other.pose.rotation))
         between = float(angle_between(geometry.pose.translation, other.pose.translation))
-        if turn < _VARIANT_TURN_RAD and between < _VARIANT_DIRECTION_RAD and not mostly_own:
+        if turn < float(np.deg2rad(5.0)) and between < float(np.deg2rad(20.0)) and not mostly_own:
             return False
     return True
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.core.kernels import kernel
+from pano_mvs.core.kernels import inlined, kernel
 
 _CHECKS = (16, 32, 64, 128)  # number of matches after which a hypothesis that lags too far behind is dropped
 
@@ -91,6 +91,19 @@ def rank_essentials(
         costs[row], best[row] = cost, n
 
 
+@inlined
+def epipolar(rotation: FloatArray, t: FloatArray, p: FloatArray, q: FloatArray) -> tuple[float, ...]:
+    """Return e and D of the Sampson error e / √D of a match, see `kernels_refinement`, q · a, t · a and t · q."""
+    a0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2]
+    a1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2]
+    a2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2]
+    e = t[0] * (a1 * q[2] - a2 * q[1]) + t[1] * (a2 * q[0] - a0 * q[2]) + t[2] * (a0 * q[1] - a1 * q[0])
+    along_a = t[0] * a0 + t[1] * a1 + t[2] * a2
+    along_q = t[0] * q[0] + t[1] * q[1] + t[2] * q[2]
+    squared = 2.0 - along_a * along_a - along_q * along_q - 2.0 * e * e
+    return e, squared, a0 * q[0] + a1 * q[1] + a2 * q[2], along_a, along_q
+
+
 @kernel
 def pose_residuals(
     rotation: FloatArray,
@@ -105,15 +118,8 @@ def pose_residuals(
     far = math.cos(2.0 * threshold)
     for idx in range(len(first)):
         p, q = first[idx], second[idx]
-        a0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2]
-        a1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2]
-        a2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2]
-        along_a = t[0] * a0 + t[1] * a1 + t[2] * a2
-        along_q = t[0] * q[0] + t[1] * q[1] + t[2] * q[2]
-        e = t[0] * (a1 * q[2] - a2 * q[1]) + t[1] * (a2 * q[0] - a0 * q[2]) + t[2] * (a0 * q[1] - a1 * q[0])
-        scale = max(2.0 - along_a * along_a - along_q * along_q - 2.0 * e * e, 1e-300)
-        residuals[idx] = abs(e) / math.sqrt(scale)
-        cosine = a0 * q[0] + a1 * q[1] + a2 * q[2]
+        e, squared, cosine, along_a, along_q = epipolar(rotation, t, p, q)
+        residuals[idx] = abs(e) / math.sqrt(max(squared, 1e-300))
         front = along_a < cosine * along_q and cosine * along_a < along_q
         agreeing[idx] = residuals[idx] < threshold and (front or cosine > far)
 
@@ -126,17 +132,11 @@ def pose_cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: Fl
     total = 0.0
     for idx in range(len(first)):
         p, q = first[idx], second[idx]
-        a0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2]
-        a1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2]
-        a2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2]
-        e = t[0] * (a1 * q[2] - a2 * q[1]) + t[1] * (a2 * q[0] - a0 * q[2]) + t[2] * (a0 * q[1] - a1 * q[0])
-        along_a = t[0] * a0 + t[1] * a1 + t[2] * a2
-        along_q = t[0] * q[0] + t[1] * q[1] + t[2] * q[2]
-        allowed = squared_threshold * max(2.0 - along_a * along_a - along_q * along_q - 2.0 * e * e, 1e-300)
+        e, squared, cosine, along_a, along_q = epipolar(rotation, t, p, q)
+        allowed = squared_threshold * max(squared, 1e-300)
         if e * e >= allowed:
             total += 1.0
             continue
-        cosine = a0 * q[0] + a1 * q[1] + a2 * q[2]
         front = along_a < cosine * along_q and cosine * along_a < along_q
         total += e * e / allowed if front or cosine > far else 1.0
     return total
@@ -284,14 +284,8 @@ def count_chance(
             continue
         drawn += 1
         p, q = first[pairs[n, 0]], second[pairs[n, 1]]
-        a0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2]
-        a1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2]
-        a2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2]
-        e = t[0] * (a1 * q[2] - a2 * q[1]) + t[1] * (a2 * q[0] - a0 * q[2]) + t[2] * (a0 * q[1] - a1 * q[0])
-        along_a = t[0] * a0 + t[1] * a1 + t[2] * a2
-        along_q = t[0] * q[0] + t[1] * q[1] + t[2] * q[2]
-        allowed = squared_threshold * max(2.0 - along_a * along_a - along_q * along_q - 2.0 * e * e, 1e-300)
-        cosine = a0 * q[0] + a1 * q[1] + a2 * q[2]
+        e, squared, cosine, along_a, along_q = epipolar(rotation, t, p, q)
+        allowed = squared_threshold * max(squared, 1e-300)
         if e * e < allowed and along_a < cosine * along_q and cosine * along_a < along_q:
             agreeing += 1
     return agreeing, drawn

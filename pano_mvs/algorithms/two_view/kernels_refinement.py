@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from pano_mvs.algorithms.two_view.kernels_agreement import epipolar
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
 
@@ -35,15 +36,8 @@ def _cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatA
     """Return Σ log(1 + r² / scale²), with one logarithm for the product of many factors."""
     total, factor = 0.0, 1.0
     for idx in range(len(first)):
-        p, q = first[idx], second[idx]
-        a0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2]
-        a1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2]
-        a2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2]
-        e = t[0] * (a1 * q[2] - a2 * q[1]) + t[1] * (a2 * q[0] - a0 * q[2]) + t[2] * (a0 * q[1] - a1 * q[0])
-        along_a = t[0] * a0 + t[1] * a1 + t[2] * a2
-        along_q = t[0] * q[0] + t[1] * q[1] + t[2] * q[2]
-        scale = max(2.0 - along_a * along_a - along_q * along_q - 2.0 * e * e, 1e-12)
-        factor *= 1.0 + e * e / (scale * squared_scale)
+        e, squared, _, _, _ = epipolar(rotation, t, first[idx], second[idx])
+        factor *= 1.0 + e * e / (max(squared, 1e-12) * squared_scale)
         if factor > 1e100:
             total += math.log(factor)
             factor = 1.0

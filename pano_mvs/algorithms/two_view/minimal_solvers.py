@@ -20,19 +20,13 @@ _MAX_SOLUTIONS = 10  # maximum number of essential matrices from one sample
 
 @dataclass(frozen=True)
 class MinimalSolver:
-    """A minimal solver.
+    """A minimal solver."""
 
-    Attributes:
-        sample: number of matches in a sample.
-        batch: number of samples that are drawn together.
-        solve: (N, sample, 3) bearings of the first and of the second image to (K, 3, 3) essential matrices.
-        models: maximum number of essential matrices from one sample.
-    """
-
-    sample: int
-    batch: int
+    sample: int  # number of matches in a sample
+    batch: int  # number of samples that are drawn together
+    # (N, sample, 3) bearings of the first and of the second image to (K, 3, 3) essential matrices
     solve: Callable[[FloatArray, FloatArray], FloatArray]
-    models: int
+    models: int  # maximum number of essential matrices from one sample
 
 
 def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:

@@ -21,7 +21,6 @@ from pano_mvs.geometry import Rigid3
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
 _SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
-_FINALISTS = 4  # number of hypotheses of a batch that are compared on all matches
 _LAG_SIGMAS = 3.0  # hypotheses that are worse than the best by more than this are rejected early
 _LEADERS = 6  # number of hypotheses whose direction is estimated again
 _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
@@ -29,24 +28,15 @@ _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The relative pose with most support; falsy if no hypothesis could be formed.
+    """The relative pose with most support; falsy if no hypothesis could be formed."""
 
-    Attributes:
-        second_from_first: rotation, and translation of length 1.
-        inliers: (M,) bool, True for matches with a small residual in front of both cameras.
-        residuals_rad: (M,) spherical Sampson error of all matches.
-        iterations: number of hypotheses.
-        reason: why there is no pose.
-    """
-
-    second_from_first: Rigid3
-    inliers: NDArray[np.bool_]
-    residuals_rad: FloatArray
-    iterations: int
-    reason: str = ""
+    second_from_first: Rigid3  # rotation, and translation of length 1
+    inliers: NDArray[np.bool_]  # (M,) bool, True for matches with a small residual in front of both cameras
+    residuals_rad: FloatArray  # (M,) spherical Sampson error of all matches
+    iterations: int  # number of hypotheses
+    reason: str = ""  # why there is no pose
 
     def __bool__(self) -> bool:
-        """Return whether a pose was found."""
         return not self.reason
 
 
@@ -58,7 +48,6 @@ def estimate_two_view(
     threshold_rad: float,
     solver: Solver = "five_point",
     refine: bool = True,
-    confidence: float = 0.9999,
     max_iterations: int = 15_000,
 ) -> RelativePose:
     """Estimate the relative pose of two panoramas by robust estimation on the sphere.
@@ -77,7 +66,6 @@ def estimate_two_view(
         solver: "five_point" needs fewer samples and handles planar scenes; "eight_point" is linear (the paper's) and
             ambiguous on planar scenes.
         refine: False returns the best minimal hypothesis unrefined, as in the paper.
-        confidence: stop when a better model would have been found with this probability.
         max_iterations: maximum number of hypotheses.
 
     Raises:
@@ -99,7 +87,8 @@ def estimate_two_view(
     # Hypotheses are rejected after the first few matches, so the order of matches must be random.
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
-    leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
+    # Stop when a better model would have been found with this probability.
+    leaders, iterations = search.run(confidence=0.9999, max_iterations=max_iterations)
     if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
     pose: Rigid3 | None = leaders[0]
@@ -168,6 +157,7 @@ class _Search:
         if not len(hypotheses):
             return None, np.inf, 0
         screened = slice(None, _SCREEN)
+        # Number of hypotheses of a batch that are compared on all matches.
         finalists = least_essentials(
             hypotheses,
             self.first[screened],
@@ -176,7 +166,7 @@ class _Search:
             # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=_LAG_SIGMAS if self.optimise else np.inf,
-            count=_FINALISTS,
+            count=4,
         )
         if not len(finalists):
             return None, np.inf, len(hypotheses)

@@ -9,9 +9,7 @@ from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 
-_MATCHES = 1000  # number of matches on which directions are compared
 _ROUNDS = 2
-_STEPS = 8
 
 
 def best_redirected(
@@ -44,14 +42,15 @@ def best_redirected(
 def _redirected(
     pose: Rigid3, first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
 ) -> Rigid3:
-    chosen = rng.choice(len(first), min(_MATCHES, len(first)), replace=False)
+    # Number of matches on which directions are compared.
+    chosen = rng.choice(len(first), min(1000, len(first)), replace=False)
     p, q = first[chosen], second[chosen]
     directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
     directions = np.concatenate([pose.translation[None], directions])
     costs = np.concatenate([facing_costs([pose], p, q, threshold_rad=2 * threshold_rad), costs])
     found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
     for widen in (2.0, 0.5):
-        found = refine_relative_pose(found, p, q, scale_rad=widen * threshold_rad, max_iterations=_STEPS)
+        found = refine_relative_pose(found, p, q, scale_rad=widen * threshold_rad, max_iterations=8)
     opposite = Rigid3(found.rotation, -found.translation)
     costs = facing_costs([found, opposite], p, q, threshold_rad=threshold_rad)
     return found if costs[0] <= costs[1] else opposite

@@ -63,17 +63,16 @@ def chance_of_pose(
     return float((agreeing + 1) / (drawn + 1))
 
 
-def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float = 0.025) -> int:
-    """Return the number of independent matches: at most one from each small cell of either image.
+def independent_count(first: FloatArray, second: FloatArray) -> int:
+    """Return the number of independent matches: at most one from each cell, 0.025 rad wide, of either image.
 
     The matches of a cluster of key points on one detail are right or wrong together, so they count as one.
 
     Args:
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
-        cell_rad: width of a cell.
     """
-    return min(_cells(bearings, cell_rad) for bearings in (first, second))
+    return min(_cells(bearings, 0.025) for bearings in (first, second))
 
 
 def _cells(bearings: FloatArray, cell_rad: float) -> int:

@@ -11,16 +11,13 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 
 _HEADINGS_RAD = np.deg2rad(np.arange(0.0, 360.0, 2.0))
-_DIRECTIONS = 100
-_TILT_RAD = float(np.deg2rad(0.6))  # allows for the tilt of the cameras and for the steps between headings
-_SAME_HEADING_RAD = float(np.deg2rad(3.0))
 _MIN_MATCHES = 6
 
 
 def upright_poses(
-    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float, count: int = 4
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
 ) -> list[Rigid3]:
-    """Return relative poses of two upright images, |t| = 1, best first.
+    """Return at most four relative poses of two upright images, |t| = 1, best first.
 
     With a known vertical, a heading and two matches determine a relative pose, so that one true match in ten is enough
     to find it, where five matches at random would hardly ever all be true. The poses are refined without the
@@ -31,25 +28,23 @@ def upright_poses(
         second: (M, 3) in the second.
         rng: draws the matches.
         threshold_rad: Sampson error from which a match costs 1 after refinement.
-        count: maximum number of poses.
     """
     if len(first) < _MIN_MATCHES:
         return []
-    wide_rad = max(_TILT_RAD, threshold_rad)
+    # Allows for the tilt of the cameras and for the steps between headings.
+    wide_rad = max(float(np.deg2rad(0.6)), threshold_rad)
     rough: list[tuple[float, Rigid3]] = []
     for heading in _HEADINGS_RAD:
         rotation = rotation_from_rotvec(np.array([0.0, heading, 0.0]))
-        directions, costs = direction_candidates(
-            rotation, first, second, rng=rng, threshold_rad=wide_rad, count=_DIRECTIONS
-        )
+        directions, costs = direction_candidates(rotation, first, second, rng=rng, threshold_rad=wide_rad, count=100)
         if len(directions):
             best = int(np.argmin(costs))
             rough.append((float(costs[best]), Rigid3(rotation, directions[best])))
     poses: list[Rigid3] = []
     for _, pose in sorted(rough, key=lambda item: item[0]):
-        if len(poses) == count:
+        if len(poses) == 4:
             break
-        if all(float(geodesic_angle(pose.rotation, other.rotation)) > _SAME_HEADING_RAD for other in poses):
+        if all(float(geodesic_angle(pose.rotation, other.rotation)) > float(np.deg2rad(3.0)) for other in poses):
             poses.append(pose)
     refined = [_settled(pose, first, second, threshold_rad=threshold_rad) for pose in poses]
     costs = facing_costs(refined, first, second, threshold_rad=threshold_rad)

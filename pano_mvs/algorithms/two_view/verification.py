@@ -32,11 +32,7 @@ from pano_mvs.scene import Features, TwoView
 MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""
 
-_MAX_DIRECTION_STD_DEG = 3.0
-_ROTATION_SHARE = 0.9
-_MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 8
-_UPRIGHT_SAMPLE, _UPRIGHT_MODELS = 3, 4
 _NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 
 
@@ -100,11 +96,11 @@ def verify_pair(
     tried = [pair.evidence(pose.second_from_first, sample=minimal.sample, models=minimal.models)] if pose else []
     if refine and not learned and not any(tried):
         tried += [
-            pair.evidence(upright, sample=_UPRIGHT_SAMPLE, models=_UPRIGHT_MODELS)
+            pair.evidence(upright, sample=3, models=4)
             for upright in upright_poses(p, q, rng=rng, threshold_rad=pair.threshold_rad)
         ]
     tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
-    if turned.sum() >= max(min_inliers, _ROTATION_SHARE * (tried[0].inliers if tried else 0)):
+    if turned.sum() >= max(min_inliers, 0.9 * (tried[0].inliers if tried else 0)):
         return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
     if not tried:
         return pair.failed(pose.reason)
@@ -138,8 +134,6 @@ def verify_pose(
     *,
     pose: Rigid3,
     rng: np.random.Generator,
-    threshold_deg: float = 0.2,
-    min_inliers: int = 8,
 ) -> TwoView:
     """Return the two-view geometry near a relative pose that is known from other pairs, as `verify_pair` does.
 
@@ -151,10 +145,9 @@ def verify_pose(
         matches_idx: (M, 2) positions of matching key points.
         pose: second_from_first; its length is ignored.
         rng: draws false matches.
-        threshold_deg: maximum spherical Sampson error of an inlier.
-        min_inliers: minimum number of independent inliers.
     """
-    pair = _Pair(first, second, matches_idx, rng, float(np.deg2rad(threshold_deg)), min_inliers, known=True)
+    min_inliers = 8
+    pair = _Pair(first, second, matches_idx, rng, float(np.deg2rad(0.2)), min_inliers, known=True)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0 or len(matches_idx) < min_inliers:
@@ -167,7 +160,7 @@ def verify_pose(
 
 
 def pose_near(
-    first: Features, second: Features, matches_idx: NDArray[np.int32], *, pose: Rigid3, threshold_deg: float = 0.2
+    first: Features, second: Features, matches_idx: NDArray[np.int32], *, pose: Rigid3
 ) -> tuple[Rigid3, float, float] | None:
     """Return the relative pose near another that most matches agree with, and how significant it is by itself.
 
@@ -176,13 +169,12 @@ def pose_near(
         second: key points of the second image.
         matches_idx: (M, 2) positions of matching key points.
         pose: second_from_first; its length is ignored.
-        threshold_deg: maximum spherical Sampson error of an inlier.
 
     Returns:
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
         itself. None if hardly any match agrees, or those that do leave the direction open.
     """
-    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), float(np.deg2rad(threshold_deg)), _MIN_NEAR)
+    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), float(np.deg2rad(0.2)), _MIN_NEAR)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0:
@@ -350,7 +342,7 @@ def _agreeing(witnesses: int, count: int) -> str:
 
 def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
     """Return a reason if hardly any inlier moved by more than the noise; "" otherwise."""
-    moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
+    moved = int((parallax > 4.0 * threshold_rad).sum())  # in units of the threshold
     if moved >= _MIN_WITH_PARALLAX:
         return ""
     return (
@@ -361,7 +353,7 @@ def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
 
 def _why_open(direction_std_deg: float) -> str:
     """Return a reason if the inliers do not determine the direction; "" otherwise."""
-    if direction_std_deg <= _MAX_DIRECTION_STD_DEG:
+    if direction_std_deg <= 3.0:
         return ""
     return (
         f"the matches determine the direction between the images only to {direction_std_deg:.0f}°: they lie too close "

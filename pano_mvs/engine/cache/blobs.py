@@ -30,9 +30,6 @@ from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
-_MAX_BYTES = 1 << 50
-# Smaller arrays are read, which is faster than mapping them; a mapped array also keeps a file open.
-_MIN_MAPPED_BYTES = 1 << 18
 _MAGIC = np.lib.format.magic(1, 0)
 
 
@@ -56,7 +53,8 @@ class BlobRef:
     @property
     def is_mapped(self) -> bool:
         """Whether the part is an array that is memory-mapped when it is loaded."""
-        return self.suffix == ".npy" and not self.external and self.size_bytes >= _MIN_MAPPED_BYTES
+        # Smaller arrays are read, which is faster than mapping them; a mapped array also keeps a file open.
+        return self.suffix == ".npy" and not self.external and self.size_bytes >= (1 << 18)
 
     @staticmethod
     def from_json(value: list[Any]) -> BlobRef:
@@ -69,7 +67,7 @@ class BlobRef:
         is_valid = isinstance(digest, str) and IS_DIGEST.fullmatch(digest) and isinstance(suffix, str)
         if not is_valid or not SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
             raise ValueError(f"not a reference to a blob: {value!r}")
-        if not 0 <= size_bytes < _MAX_BYTES:
+        if not 0 <= size_bytes < (1 << 50):
             raise ValueError(f"a blob of {size_bytes} bytes")
         return BlobRef(digest, size_bytes, suffix, external)
 
@@ -136,9 +134,12 @@ class BlobStore:
             return self._put_file(part)
         if isinstance(part, np.ndarray):
             return self._put_array(part)
-        return self._put_bytes(
-            json.dumps(part, sort_keys=True, separators=(",", ":"), allow_nan=False).encode(), ".json"
-        )
+        data = json.dumps(part, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+        ref = BlobRef(digest_from_bytes(data), len(data), ".json")
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
+                temporary.write_bytes(data)
+        return ref
 
     def get(self, ref: BlobRef) -> Part:
         """Return a stored part; arrays are read-only, and large ones are memory-mapped.
@@ -230,13 +231,6 @@ class BlobStore:
             raise self.discard(ref, "is damaged or missing")
         self._verified.add(ref)
         return place
-
-    def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
-        ref = BlobRef(digest_from_bytes(data), len(data), suffix)
-        if not self._keep(ref):
-            with self._writing(ref) as temporary:
-                temporary.write_bytes(data)
-        return ref
 
     def _put_array(self, array: NDArray[Any]) -> BlobRef:
         """Store an array as .npy without a second copy of it in memory."""

@@ -128,7 +128,7 @@ class RunHistory:
         Raises:
             StoreError: if it cannot be removed.
         """
-        path = self._path(entry)
+        path = self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
@@ -143,9 +143,6 @@ class RunHistory:
         with replacing(path, temporary_in=self.root / "tmp") as temporary, temporary.open("wb") as stream:
             stream.write(f"{digest_from_bytes(body)}\n".encode())
             stream.write(body)
-
-    def _path(self, entry: RunEntry) -> Path:
-        return self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
 
     def _paths(self, folder: str, pattern: str) -> list[Path]:
         return [path for path in children(self.root / folder, pattern) if is_file(path) and path.name[0] != "."]

@@ -91,7 +91,7 @@ def usage_of(store: Store) -> list[StageUsage]:
     seen: set[str] = set()
     totals: dict[str, list[float]] = {}
     for _, record in _intact_records(store):
-        total = totals.setdefault(_stage_of(record), [0, 0, 0.0])
+        total = totals.setdefault(str(record.identity.get("stage", "unknown")), [0, 0, 0.0])
         total[0] += 1
         total[2] += record.seconds
         for ref in record.own_blobs():
@@ -345,10 +345,6 @@ def _intact_records(store: Store) -> Iterator[tuple[_Value, UnitRecord]]:
         record = record_from_bytes(_read(value.place) or b"")
         if record is not None and record.key == value.digest:
             yield value, record
-
-
-def _stage_of(record: UnitRecord) -> str:
-    return str(record.identity.get("stage", "unknown"))
 
 
 def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:

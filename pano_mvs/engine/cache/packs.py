@@ -26,7 +26,6 @@ from pano_mvs.core.paths import children, is_file, is_link
 
 RECORD, ARRAY, JSON = "record", ".npy", ".json"
 _KINDS = (RECORD, ARRAY, JSON)
-_MAX_PACK_BYTES = 1 << 30  # collection rewrites a pack as a whole, and needs this much free space
 _ENTRY = np.dtype(
     [("high", ">u8"), ("low", ">u8"), ("offset", "<u8"), ("size", "<u8"), ("time", "<f8"), ("kind", "u1")]
 )
@@ -145,7 +144,8 @@ class Packs:
             pack = self.folder / f"{uuid.uuid4().hex}.pack"
             entries: list[tuple[int, int, int, int, float, int]] = []
             with replacing(pack, temporary_in=self._temporary, durable=True) as temporary, temporary.open("wb") as out:
-                while following is not None and (not entries or out.tell() < _MAX_PACK_BYTES):
+                # Collection rewrites a pack as a whole, and needs this much free space.
+                while following is not None and (not entries or out.tell() < (1 << 30)):
                     value, path = following
                     out.write(bytes(-out.tell() % 64))  # the alignment of arrays in memory, and so of .npy headers
                     offset = out.tell()

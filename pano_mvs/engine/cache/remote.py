@@ -176,11 +176,7 @@ class RemoteCache:
             raise UsageError(f"{self.url} has layout {layout!r}, but {store.root} has {own!r}: choose another place")
 
     def _attempt(self, action: Callable[[], Any]) -> Any:
-        """Return the result of an action; libraries of object stores raise errors of many kinds.
-
-        Raises:
-            StoreError: if the remote cache cannot be read or written.
-        """
+        """Return the result of an action; libraries of object stores raise errors of many kinds."""
         try:
             return action()
         except PanoMvsError:

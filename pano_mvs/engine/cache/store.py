@@ -446,11 +446,7 @@ class Store:
                 "Choose another cache with --cache DIR"
             )
         self.folder_digits = _FOLDER_DIGITS[version]
-        self._mark()
-
-    def _mark(self) -> None:
-        """Mark a cache of an earlier version, if it can be written."""
-        mark = self.root / CACHE_MARK
+        mark = self.root / CACHE_MARK  # missing from caches of earlier versions
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()

@@ -84,11 +84,7 @@ class DaskExecutor:
         self.cores = max(self.threads, cores)
 
     def _connect(self, store: Store, cluster: Any) -> None:
-        """Connect to a cluster, or to a scheduler by its address.
-
-        Raises:
-            UsageError: if the scheduler does not answer, or the cache cannot be written.
-        """
+        """Connect to a cluster, or to a scheduler by its address."""
         self._store = store
         self._run = uuid.uuid4().hex
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()

@@ -140,7 +140,7 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
         return [store.load(ref, port.kind) for ref in value.values()]
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
-    refs = {_gathered_key(port, name): ref for name, ref in value.items()}
+    refs = {(pair_from_name(name) if port.kind.axis is Axis.PAIR else name): ref for name, ref in value.items()}
     return LazyMapping(refs, partial(store.load, kind=port.kind), max_kept=max_kept_items(value.values()))
 
 
@@ -153,10 +153,6 @@ def max_kept_items(refs: Iterable[ItemRef]) -> int:
     by_memory = max(1, 128_000_000 // read)
     # A process may open only about a thousand files, and a stage may read several kinds.
     return min(by_memory, max(1, 128 // opened)) if opened else by_memory
-
-
-def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:
-    return pair_from_name(name) if port.kind.axis is Axis.PAIR else name
 
 
 Key = TypeVar("Key")

@@ -73,20 +73,13 @@ class JobOutcome:
 
 
 class Executor(Protocol):
-    """Computes units, several at a time or one.
-
-    Attributes:
-        capacity: number of jobs that it takes at a time.
-        threads: number of threads for a unit while `capacity` units run.
-        cores: number of threads for a unit that runs alone.
-        enforces_timeouts: whether it can end a unit that takes too long.
-    """
+    """Computes units, several at a time or one."""
 
     name: str
-    capacity: int
-    threads: int
-    cores: int
-    enforces_timeouts: bool
+    capacity: int  # number of jobs that it takes at a time
+    threads: int  # number of threads for a unit while `capacity` units run
+    cores: int  # number of threads for a unit that runs alone
+    enforces_timeouts: bool  # whether it can end a unit that takes too long
 
     def submit(self, job: Job) -> None:
         """Start a job; the caller never submits more than `capacity` at a time."""

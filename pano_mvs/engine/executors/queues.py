@@ -41,30 +41,22 @@ _WALLTIME = re.compile(r"\d+([-:]\d+)*")
 
 
 class Queue(BaseModel):
-    """The jobs of a queueing system.
-
-    Attributes:
-        memory: of a job, such as `32GB`.
-        walltime: time limit of a job, as the queueing system writes it, such as `04:00:00`.
-        jobs: largest number of jobs at a time.
-        queue: queue or partition; None for the default one.
-        account: account or project that is charged; None for the default one.
-        interface: network interface by which jobs reach this host, such as `ib0`; None for the default one.
-        directives: further options of a job, such as `--qos=low`.
-        prologue: shell commands with which a job begins.
-    """
+    """The jobs of a queueing system."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
 
     cores: int = Field(ge=1)
-    memory: str | int
-    walltime: str
-    jobs: int = Field(ge=1)
+    memory: str | int  # of a job, such as `32GB`
+    walltime: str  # time limit of a job, as the queueing system writes it, such as `04:00:00`
+    jobs: int = Field(ge=1)  # largest number of jobs at a time
+    # queue or partition; None for the default one
     queue: str | None = Field(default=None, validation_alias=AliasChoices("queue", "partition"))
+    # account or project that is charged; None for the default one
     account: str | None = Field(default=None, validation_alias=AliasChoices("account", "project"))
+    # network interface by which jobs reach this host, such as `ib0`; None for the default one
     interface: str | None = None
-    directives: tuple[str, ...] = ()
-    prologue: tuple[str, ...] = ()
+    directives: tuple[str, ...] = ()  # further options of a job, such as `--qos=low`
+    prologue: tuple[str, ...] = ()  # shell commands with which a job begins
 
     @field_validator("memory")
     @classmethod

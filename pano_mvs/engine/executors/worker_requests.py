@@ -81,12 +81,7 @@ def _installed() -> Registry:
 
 @cache
 def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
-    """Load plugin files with the given digests of their code.
-
-    Raises:
-        UsageError: if a file has other code.
-        PluginError: if one cannot be loaded.
-    """
+    """Load plugin files with the given digests of their code."""
     registry = Registry()
     for path, digest in plugins:
         registry.add_file(Path(path))

@@ -117,11 +117,7 @@ class SourceListing:
 
 
 def _path_digest(path: Path) -> str:
-    """Return a digest of the path of a file.
-
-    Raises:
-        InputError: if the file cannot be read.
-    """
+    """Return a digest of the path of a file."""
     try:
         with path.open("rb"):
             return digest_from_value(str(path))

@@ -12,17 +12,24 @@ UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """A unit without a result."""
+class UnitFailed:
+    """A unit failed; `UnitFinished` follows."""
 
-    stage: str
-    item: str  # the unit; empty if the stage has one only
-    cause: str  # what went wrong and what to do
-    trace: str = ""  # the Python traceback, if the code of the stage failed
-    consequence: str = ""  # what is missing in the results because of it
-    blocked: bool = False  # whether the unit did not run because one of its inputs failed
+    kind: ClassVar[str] = "unit_failed"
+    stage: str  # name of the stage in the workflow
+    item: str  # the image, pair or view; empty if the stage has one unit
+    cause: str  # what went wrong and what to do about it
+    consequence: str = ""  # what the result lacks because of it
     log: str = ""  # file with what the unit printed; empty if it printed nothing
-    said: tuple[str, ...] = ()  # the last lines of the log
+    said: tuple[str, ...] = ()  # the last lines that it printed
+
+
+@dataclass(frozen=True, slots=True)
+class Failure(UnitFailed):
+    """A unit without a result: its event, and what that leaves out."""
+
+    trace: str = ""  # the Python traceback, if the code of the stage failed
+    blocked: bool = False  # whether the unit did not run because one of its inputs failed
 
     def event(self) -> UnitFailed:
         """Return the event that the unit has failed."""
@@ -123,19 +130,6 @@ class UnitStarted:
     kind: ClassVar[str] = "unit_started"
     stage: str
     item: str
-
-
-@dataclass(frozen=True, slots=True)
-class UnitFailed:
-    """A unit failed; `UnitFinished` follows."""
-
-    kind: ClassVar[str] = "unit_failed"
-    stage: str  # name of the stage in the workflow
-    item: str  # the image, pair or view; empty if the stage has one unit
-    cause: str  # what went wrong and what to do about it
-    consequence: str = ""  # what the result lacks because of it
-    log: str = ""  # file with what the unit printed; empty if it printed nothing
-    said: tuple[str, ...] = ()  # the last lines that it printed
 
 
 @dataclass(frozen=True, slots=True)

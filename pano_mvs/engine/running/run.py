@@ -44,7 +44,6 @@ from pano_mvs.scene import Axis, Files, Record
 
 GRACE_S = 10.0  # time for which running units may go on after an interrupt, so that their results are not lost
 WAIT_S = 5.0  # time without an event after which observers are notified that the run is waiting for units
-_MAX_REPAIRS = 3
 _STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 
 
@@ -127,11 +126,18 @@ class Run:
             KeyboardInterrupt: if the user interrupts; running units get some time to finish.
         """
         self.publisher.earlier = dict(earlier_files or {})
-        self._warn_of_timeouts()
+        names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]
+        if names and not self.executor.enforces_timeouts:
+            self.warn(
+                f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
+                "Use --executor processes"
+            )
         try:
             self._execute_passes()
             self._has_passed = True
-            self._warn_of_unused_refresh()
+            for unit in self.options.refresh:
+                if ":" in unit and unit not in self.refreshed:
+                    self.warn(f"--refresh {unit}: nothing was computed again, because no unit of that name was reached")
             if not self.result.stopped and not self.graph.is_part:
                 self.result.removed = self.publisher.remove_stale(self.publisher.earlier, complete=self.result.complete)
         except KeyboardInterrupt:
@@ -183,7 +189,7 @@ class Run:
                 for text in dict.fromkeys(self._pass.damaged or [str(error)]):
                     self.warn(text)
                     found[text] += 1
-                    if found[text] > _MAX_REPAIRS:
+                    if found[text] > 3:
                         raise StoreError(
                             f"{text} again and again: check the disk, or choose another cache with --cache DIR"
                         ) from error
@@ -248,19 +254,6 @@ class Run:
             self.observer(Warned(f"{text}; interrupt again to stop at once"))
             while self.dispatcher and (left := deadline - time.monotonic()) > 0:
                 self.dispatcher.next_finished(left)
-
-    def _warn_of_timeouts(self) -> None:
-        names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]
-        if names and not self.executor.enforces_timeouts:
-            self.warn(
-                f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
-                "Use --executor processes"
-            )
-
-    def _warn_of_unused_refresh(self) -> None:
-        for unit in self.options.refresh:
-            if ":" in unit and unit not in self.refreshed:
-                self.warn(f"--refresh {unit}: nothing was computed again, because no unit of that name was reached")
 
 
 class RunPass:
@@ -434,10 +427,10 @@ class RunPass:
             entry.name,
             unit.item,
             outcome.cause,
-            outcome.trace,
             consequence_of(entry, unit.item),
-            log="" if finished.log is None else str(finished.log),
-            said=finished.said,
+            "" if finished.log is None else str(finished.log),
+            finished.said,
+            outcome.trace,
         )
         self._statistics.unit_failed(failure, outcome.seconds)
         if outcome.exit_code and self.queue.states[entry.name].axis is Axis.ONE:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -151,7 +151,7 @@ def params_from(*sources: Callable[..., Any], own_last: bool = False) -> Callabl
             `Annotated` with a `core.settings.Setting`.
         own_last: whether the fields of the class itself come after the added ones in the schema and the reference.
     """
-    added: dict[str, Any] = {name: _field(one) for source in sources for name, one in settings_of(source).items()}
+    added = _fields(sources)
 
     def decorate(model: type[Model]) -> type[Model]:
         name = model.__name__
@@ -163,6 +163,15 @@ def params_from(*sources: Callable[..., Any], own_last: bool = False) -> Callabl
         return made
 
     return decorate
+
+
+def settings_model(stage: str, *sources: Callable[..., Any]) -> type[Params]:
+    """Return the parameters of a stage that are the settings of algorithms only; see `params_from`."""
+    return create_model(stage, __base__=Params, __doc__=f"Settings of {stage}.", **_fields(sources))
+
+
+def _fields(sources: Sequence[Callable[..., Any]]) -> dict[str, Any]:
+    return {name: _field(one) for source in sources for name, one in settings_of(source).items()}
 
 
 def _field(declared: Declared) -> tuple[Any, Any]:

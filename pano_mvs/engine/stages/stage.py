@@ -16,7 +16,7 @@ from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar, Union, 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.params import Params, settings_model
 from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
 
 
@@ -202,6 +202,7 @@ class _Signature:
 def stage(
     name: str,
     *,
+    settings: Callable[..., Any] | Sequence[Callable[..., Any]] = (),
     version: int = 1,
     memory: str | int | MemoryNeeded = 0,
     every_image: bool = False,
@@ -216,6 +217,9 @@ def stage(
     "2GB", is the most that one unit needs; only as many units run at a time as fit into memory. If it depends on the
     unit, pass a function `(params, inputs) -> bytes`, which receives the same values as the stage. It is called in the
     main process, so it must be fast.
+
+    `settings` names the algorithms whose settings are all that `params` holds (see `params_from`); it is then annotated
+    `params: Params`. A stage with further parameters declares a model of its own.
 
     A stage with Near ports has a unit for each view of the index. With `every_image`, it has one for each item of its
     Each ports instead, so that a stage that returns images loses none. Near ports then begin with the image's own
@@ -237,6 +241,8 @@ def stage(
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
+        if sources := settings if isinstance(settings, Sequence) else (settings,):
+            signature = replace(signature, params_type=settings_model(name, *sources))
         spec = _spec(name, function, signature, version=version, memory=memory)
         if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
             raise PluginError(f"stage {name!r} ({spec.origin}): every_image needs ports annotated Each and Near")

@@ -40,7 +40,10 @@ def apply_overrides(
         if override.target == "plugins":
             plugins.extend(_items(override.value))
         elif _stage_of(override.target, stages) == override.target:
-            _remove(stages, override, problems)
+            if override.value.value is None:
+                del stages[override.target]
+            else:
+                problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {override.target}=null removes the stage")
         elif override.target.removeprefix(f"{_stage_of(override.target, stages)}.") == "use":
             _replace(stages, override)
         else:
@@ -79,13 +82,6 @@ def _stage_of(target: str, stages: dict[str, Located]) -> str:
 def _items(value: Located) -> list[Located]:
     items = value.value if isinstance(value.value, list) else [value]
     return [Located(item.value, 0, 0, origin=value.origin) for item in items]
-
-
-def _remove(stages: dict[str, Located], override: _Override, problems: Problems) -> None:
-    if override.value.value is None:
-        del stages[override.target]
-    else:
-        problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {override.target}=null removes the stage")
 
 
 def _replace(stages: dict[str, Located], override: _Override) -> None:

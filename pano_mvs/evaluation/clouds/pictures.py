@@ -67,7 +67,7 @@ def write_error_cloud(
         raise UsageError(f"{start} points, but {len(distances)} distances")
 
 
-_MAX_POINTS, _MAX_VIEWS = 2_000_000, 12
+_MAX_POINTS = 2_000_000
 _LEGEND_COLUMNS = 7
 _SIZE_HW = 640, WIDTH
 
@@ -103,7 +103,7 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
     surface, distances, limits = evaluation.compared.surface, evaluation.distances, evaluation.limits
     missed = surface.area * (distances.of_surface > limits[-1])
     lost = np.bincount(surface.view_idx, missed, max(1, len(evaluation.compared.used)))
-    shown = set(np.argsort(-lost, kind="stable")[:_MAX_VIEWS].tolist())
+    shown = set(np.argsort(-lost, kind="stable")[:12].tolist())
     shown_pictures: list[tuple[str, Picture]] = []
     for idx, (name, view) in enumerate(evaluation.compared.used.items()):
         if idx not in shown:

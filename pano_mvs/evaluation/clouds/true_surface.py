@@ -13,8 +13,6 @@ from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_
 
 # A view sees a sample if the sample's distance lies within the four true ranges around it, give or take this share.
 _SEEN_WITHIN = 0.01
-# Surfaces seen at a flatter angle than this have no reliable area.
-_MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,16 +43,15 @@ def view_points(view: TrueView) -> NDArray[np.float32]:
     return _points(view, rows, columns)
 
 
-def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_samples: int = 1_000_000) -> TrueSurface:
-    """Return the part of the true surface that at least `min_views` of the views see.
+def surface_of_views(views: Sequence[TrueView], *, max_samples: int = 1_000_000) -> TrueSurface:
+    """Return the part of the true surface that at least two of the views see, or the only one.
 
     A pixel of range r and solid angle Ω that meets the surface at the angle α to its normal represents the area
     Ω r² / cos α. Surface that k views see is sampled k times, with a k-th of the area each, so that it counts by its
     area, however near or often it was seen.
 
     Args:
-        views: the views that were used; if they are fewer than `min_views`, all must see the surface.
-        min_views: number of views that must see a sample, including the one it comes from.
+        views: the views that were used.
         max_samples: pixels are skipped evenly to have at most this many samples.
 
     Raises:
@@ -64,7 +61,7 @@ def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_sampl
         raise UsageError("no view has ground truth, so the true surface is unknown")
     pixels = sum(view.range.size for view in views)
     step = max(1, int(np.ceil(np.sqrt(pixels / max_samples))))
-    parts = [_samples(idx, views, step=step, min_views=min(min_views, len(views))) for idx in range(len(views))]
+    parts = [_samples(idx, views, step=step, min_views=min(2, len(views))) for idx in range(len(views))]
     return TrueSurface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -109,7 +106,8 @@ def _cosines(ranges: NDArray[np.float32]) -> NDArray[np.float64]:
     normals = np.cross(across, down)
     length = np.linalg.norm(normals, axis=-1)
     cosine = np.abs(np.sum(rays * normals, axis=-1)) / np.where(length > 0, length, np.nan)
-    return np.where(np.isfinite(cosine), cosine.clip(_MIN_COSINE), 1.0)
+    # Surfaces seen at a flatter angle than this have no reliable area.
+    return np.where(np.isfinite(cosine), cosine.clip(0.05), 1.0)
 
 
 def _step_on_surface(points: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -196,10 +196,6 @@ def weighted_quantile(values: NDArray[np.floating], weight: FloatArray, share: f
     return float(values[order[np.searchsorted(reached, reached[-1] * share)]])
 
 
-# Larger relative errors count as this one; otherwise a few far pixels would decide the area.
-_MAX_ERROR = 1.0
-
-
 @dataclass(frozen=True, eq=False)
 class Sparsification:
     """Mean error of the most confident pixels against the share of pixels that is kept.
@@ -238,7 +234,8 @@ def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsifica
     if len(weight) == 0:
         nothing = np.zeros(0)
         return Sparsification(nothing, nothing, nothing, float("nan"), float("nan"))
-    error = np.minimum(np.abs(both.found - both.true) / both.true, _MAX_ERROR)
+    # Larger relative errors count as this one; otherwise a few far pixels would decide the area.
+    error = np.minimum(np.abs(both.found - both.true) / both.true, 1.0)
     kept, mean, area = _curve(both.confidence.astype(np.float64), error, weight)
     oracle_kept, oracle_mean, oracle_area = _curve(-error, error, weight)
     return Sparsification(kept, mean, np.interp(kept, oracle_kept, oracle_mean), area, oracle_area)

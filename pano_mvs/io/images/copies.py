@@ -23,10 +23,6 @@ from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
 from pano_mvs.scene.image_header import stated_size
 
 _SIZE_HW = (128, 256)
-_BLUR_PX = 2.0  # coarser structure is alike in all pictures of a place
-# Copies at a quarter of the size, or saved as JPEG of quality 30, have .91 and more; other panoramas .77 and less
-# (20 places with up to 44 panoramas, some with a tripod or the same logo in each).
-_MIN_CORRELATION = 0.85
 # Of 512 magnitudes: such copies agree by .98 and more, other panoramas by .89 and less (rooms, a city, a flat).
 _SAMPLES, _MIN_AGREEMENT = 512, 0.9
 _ROWS_AT_ONCE = 1024
@@ -72,7 +68,9 @@ def find_copies(paths: Mapping[str, Path], *, max_pixels: int = MAX_PIXELS, read
                     continue
                 correlation = np.fft.irfft((np.conj(own) * other).sum(axis=0), _SIZE_HW[1])
                 best = int(correlation.argmax())
-                if correlation[best] >= _MIN_CORRELATION:
+                # Copies at a quarter of the size, or saved as JPEG of quality 30, have .91 and more; other panoramas
+                # .77 and less (20 places with up to 44 panoramas, some with a tripod or the same logo in each).
+                if correlation[best] >= 0.85:
                     copies[names[later]] = Copy(names[earlier], 360 * best / _SIZE_HW[1])
                     break
     return copies
@@ -110,7 +108,8 @@ def _sampled_places() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def _spectrum(picture: NDArray[np.uint8]) -> NDArray[np.complex64]:
     margin = _SIZE_HW[1] // 16
     wrapped = np.pad(picture.astype(np.float32), ((0, 0), (margin, margin)), mode="wrap")
-    fine = (wrapped - cv2.GaussianBlur(wrapped, (0, 0), _BLUR_PX))[:, margin:-margin]
+    # Coarser structure is alike in all pictures of a place.
+    fine = (wrapped - cv2.GaussianBlur(wrapped, (0, 0), 2.0))[:, margin:-margin]
     norm = float(np.linalg.norm(fine))
     is_plain = norm < 0.5 * np.sqrt(fine.size)
     return np.fft.rfft(np.asarray(np.zeros_like(fine) if is_plain else fine / norm, np.float32), axis=1).astype(

@@ -251,7 +251,14 @@ class MergeFiles:
         centers = (merged.before or merged.poses).centers
         for number, (block, similarity) in enumerate(zip(self.blocks, self.world_from_block, strict=True)):
             for part in block.cloud_parts():
-                moved = _moved(part, similarity)
+                moved = replace(
+                    part,
+                    points_in_world=similarity.apply(part.points_in_world).astype(np.float32),
+                    normals_in_world=(part.normals_in_world.astype(np.float64) @ similarity.rotation.T).astype(
+                        np.float32
+                    ),
+                    uncertainty=None if part.uncertainty is None else part.uncertainty * np.float32(similarity.scale),
+                )
                 camera_idx = nearest_cameras(moved.points_in_world, centers)
                 own = merged.owner[camera_idx] == number
                 moved, camera_idx = _selected(moved, own), camera_idx[own]
@@ -280,15 +287,6 @@ def _frame(path: str, size_hw: tuple[int, int]) -> NerfstudioFrame:
     height, width = size_hw
     rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return NerfstudioFrame("equirectangular", path, "", "", (width, height), (width / 2, float(height)), rows)
-
-
-def _moved(cloud: PointCloud, similarity: Similarity3) -> PointCloud:
-    return replace(
-        cloud,
-        points_in_world=similarity.apply(cloud.points_in_world).astype(np.float32),
-        normals_in_world=(cloud.normals_in_world.astype(np.float64) @ similarity.rotation.T).astype(np.float32),
-        uncertainty=None if cloud.uncertainty is None else cloud.uncertainty * np.float32(similarity.scale),
-    )
 
 
 def _selected(cloud: PointCloud, kept: NDArray[np.bool_] | slice) -> PointCloud:

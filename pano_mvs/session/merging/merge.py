@@ -151,7 +151,14 @@ def _written(files: MergeFiles, alignment: BlockAlignment, *, exports_of: RunSum
     notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged), *left_out)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     rejected = _rejected(blocks, poses)
-    warnings = (*_disagreements(blocks, alignment), *_failures(blocks, rejected))
+    warnings = (
+        *[
+            f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
+            for link in alignment.links
+            if is_doubtful(link)
+        ],
+        *_failures(blocks, rejected),
+    )
     return RunSummary(
         workflow=WorkflowSummary(name=_STAGE),
         merged=MergedSummary(blocks=tuple(str(resolved(block.run.out)) for block in blocks), images=_images(blocks)),
@@ -181,14 +188,6 @@ def _rejected(blocks: Sequence[Block], poses: Poses) -> dict[str, str]:
         }
         found |= {name: reason for name, reason in why.items() if name not in registered and name not in found}
     return dict(sorted(found.items(), key=lambda item: natural_key(item[0])))
-
-
-def _disagreements(blocks: Sequence[Block], alignment: BlockAlignment) -> list[str]:
-    return [
-        f"{blocks[link.first].name} and {blocks[link.second].name} agree less than usual: {link_text(link)}"
-        for link in alignment.links
-        if is_doubtful(link)
-    ]
 
 
 def _failures(blocks: Sequence[Block], rejected: Mapping[str, str]) -> list[str]:
@@ -413,9 +412,6 @@ def _merged_cloud(out: Path) -> Iterator[tuple[PointCloud, Path]]:
     """Yield the cloud in cloud.ply, with its arrays in files, and a folder that is deleted afterwards.
 
     Points of blocks that do not state how many views agree on them count as confirmed.
-
-    Raises:
-        StoreError: if the arrays cannot be written.
     """
     with ExitStack() as stack:
         try:

@@ -228,7 +228,13 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
         relative = np.where(valid, range_map.uncertainty, np.float16(np.nan)).astype(np.float32)
         write_range_tiff(files["uncertainty/{item}.tiff"], relative)
     if params.normals:
-        known = _normals(range_map, valid, threads=ctx.threads)
+        given = range_map.normals_in_cam
+        known = (
+            normals_from_range(range_map, threads=ctx.threads)
+            if given is None
+            else np.asarray(given).astype(np.float32)
+        )
+        known = np.where(valid[..., None], known, np.float32(np.nan))
         files |= {f"normals/{{item}}.{name}": _write_normals(known, name, ctx.scratch) for name in params.normals}
     return Files(files)
 
@@ -258,13 +264,6 @@ def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams,
         about = {"quantity": "range along the ray", "unit": params.png_unit, "invalid": 0, "beyond_px": beyond}
         (ctx.scratch / "range.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return path
-
-
-def _normals(range_map: RangeMap, valid: NDArray[np.bool_], *, threads: int) -> NDArray[np.float32]:
-    """Return the normals of the valid pixels: those of the range map, else normals of planes fitted to the ranges."""
-    given = range_map.normals_in_cam
-    known = normals_from_range(range_map, threads=threads) if given is None else np.asarray(given).astype(np.float32)
-    return np.where(valid[..., None], known, np.float32(np.nan))
 
 
 def _write_normals(normals: NDArray[np.float32], suffix: str, folder: Path) -> Path:

@@ -229,7 +229,13 @@ def textured_mesh(
     names = [name for name in views[0].names if name in views[1]]
 
     def load(idx: int) -> PaintView:
-        return _paint_view(names[idx], views)
+        name = names[idx]
+        poses, images, ranges = views
+        image, range_map = images[name], ranges.get(name)
+        if range_map is not None and range_map.range.shape != image.size_hw:
+            range_map = None
+        pose = poses.cam_from_world(poses.names.index(name))
+        return PaintView(pose, image.load(), image.load_mask(), range_map)
 
     solved = _without_free_space(solved, names, views, smallest_part=params.smallest_part)
     vertices, faces = decimated(solved.vertices_in_world, solved.faces, triangles=params.triangles)
@@ -262,15 +268,6 @@ def _without_free_space(
     if not len(kept.faces):
         raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
     return kept
-
-
-def _paint_view(name: str, views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]]) -> PaintView:
-    poses, images, ranges = views
-    image, range_map = images[name], ranges.get(name)
-    if range_map is not None and range_map.range.shape != image.size_hw:
-        range_map = None
-    pose = poses.cam_from_world(poses.names.index(name))
-    return PaintView(pose, image.load(), image.load_mask(), range_map)
 
 
 def _write(

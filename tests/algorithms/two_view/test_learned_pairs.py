@@ -29,7 +29,7 @@ def _room(*, below: int = 60, above: int = 60) -> FloatArray:
 
 def _rays(points: FloatArray, pose: Rigid3 = POSE) -> tuple[FloatArray, FloatArray]:
     first, second = points, pose.apply(points)
-    return tuple(rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))  # type: ignore[return-value]
+    return tuple(rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
 
 
 def _unit(pose: Rigid3) -> Rigid3:

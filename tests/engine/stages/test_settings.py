@@ -12,6 +12,8 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.settings import Setting, check_settings, checks_settings, setting, settings_of
 from pano_mvs.engine.stages.params import Params, arguments_from, params_from, settings_from
+from pano_mvs.engine.stages.stage import Each, spec_of, stage
+from pano_mvs.scene import Features
 
 ANIMALS = NamedRegistry("animal", {"cat": 1, "dog": 2})
 
@@ -105,6 +107,23 @@ def test_the_settings_of_a_function_are_its_annotated_parameters() -> None:
     assert settings_from(ZooSettings, params).count == 4
     stated = {"default": 3, "description": "how many", "minimum": 1, "title": "Pieces", "type": "integer"}
     assert FeedParams.model_json_schema()["properties"]["pieces"] == stated
+
+
+def test_a_stage_may_have_the_settings_of_algorithms_as_its_only_parameters() -> None:
+    @stage("zoo.feed", settings=(ZooSettings, feed))
+    def fed(features: Each[Features], params: Params) -> Features:
+        return features
+
+    @stage("zoo.open", settings=ZooSettings)
+    def opened(features: Each[Features], params: Params) -> Features:
+        return features
+
+    both, one = (spec.params_type for each in (fed, opened) if (spec := spec_of(each)))
+    assert list(both.model_fields) == [*settings_of(ZooSettings), *settings_of(feed)]
+    assert settings_from(ZooSettings, one.model_validate({"count": 4})) == ZooSettings(count=4)
+    assert one.__doc__ == "Settings of zoo.open."
+    with pytest.raises(ValidationError, match="less than or equal to 9"):
+        one.model_validate({"count": 10})
 
 
 @pytest.mark.parametrize(

@@ -17,25 +17,17 @@ from pano_mvs.geometry import rotation_from_rotvec
 
 Loss: TypeAlias = Literal["cauchy", "huber"]
 
-_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
 _LENGTH_PULL = 3.0  # standard deviations at which an expected length starts to lose influence
 
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
-    """Expected lengths of baselines.
+    """Expected lengths of baselines."""
 
-    Attributes:
-        pairs: (K, 2) positions of the cameras of each baseline.
-        lengths: (K,) the expected distances of their centres.
-        std: standard deviation of the logarithm of each.
-        weight: of their squared deviations relative to that of rays, in units of the scale of their loss.
-    """
-
-    pairs: NDArray[np.intp]
-    lengths: FloatArray
-    std: float
-    weight: float
+    pairs: NDArray[np.intp]  # (K, 2) positions of the cameras of each baseline
+    lengths: FloatArray  # (K,) the expected distances of their centres
+    std: float  # standard deviation of the logarithm of each
+    weight: float  # of their squared deviations relative to that of rays, in units of the scale of their loss
 
     def in_order(self, place: NDArray[np.intp]) -> Lengths:
         """Return the lengths after camera n has got position place[n]."""
@@ -70,30 +62,20 @@ class Lengths:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Cameras, points, and observations sorted by point.
+    """Cameras, points, and observations sorted by point."""
 
-    Attributes:
-        rotations: (N, 3, 3) of cam_from_world.
-        centers: (N, 3) in the world.
-        points: (P, 3) in the world.
-        point_idx: (T,) ascending.
-        image_idx: (T,).
-        bearings: (T, 3) unit rays in the camera.
-        sigmas: (T,) standard deviation of each ray relative to a typical one, positive; None if all are equal.
-        offsets_m: (T, 3) where each ray starts in its camera's frame, in metres; None if all start at the centre.
-        units_per_m: units of the world per metre, by which the offsets are multiplied; 0 ignores them.
-        lengths: expected lengths of baselines between cameras that share points; None if nothing is known.
-    """
-
-    rotations: FloatArray
-    centers: FloatArray
-    points: FloatArray
-    point_idx: IndexArray
-    image_idx: IndexArray
-    bearings: FloatArray
+    rotations: FloatArray  # (N, 3, 3) of cam_from_world
+    centers: FloatArray  # (N, 3) in the world
+    points: FloatArray  # (P, 3) in the world
+    point_idx: IndexArray  # (T,) ascending
+    image_idx: IndexArray  # (T,)
+    bearings: FloatArray  # (T, 3) unit rays in the camera
+    # (T,) standard deviation of each ray relative to a typical one, positive; None if all are equal
     sigmas: FloatArray | None = None
+    # (T, 3) where each ray starts in its camera's frame, in metres; None if all start at the centre
     offsets_m: FloatArray | None = None
-    units_per_m: float = 0.0
+    units_per_m: float = 0.0  # units of the world per metre, by which the offsets are multiplied; 0 ignores them
+    # expected lengths of baselines between cameras that share points; None if nothing is known
     lengths: Lengths | None = None
 
     @property
@@ -211,11 +193,11 @@ def _adjust_ordered(
         moved_cost = cost_of(moved, moved_errors)
         if not moved_cost < cost:
             damping *= 10
-            if damping > _MAX_DAMPING:
+            if damping > 1e6:
                 break
             continue
         converged = cost - moved_cost < tolerance * cost
-        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, _MIN_DAMPING)
+        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, 1e-9)
         if converged:
             break
     return bundle
@@ -238,40 +220,24 @@ def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> floa
 
 @dataclass(frozen=True, eq=False)
 class ReducedCameras:
-    """The reduced system of the cameras after elimination of the points, and what is needed to recover the points.
+    """The reduced system of the cameras after elimination of the points, and what is needed to recover the points."""
 
-    Attributes:
-        band: (6N, width), see `camera_system`.
-        gradient: (6N,).
-        diagonal: (6N,) of the cameras' own blocks, before elimination.
-        couplings: (T, 6, 3) blocks of camera and point of every observation.
-        inverses: (P, 3, 3) inverses of the points' own blocks.
-        point_gradients: (P, 3).
-    """
-
-    band: FloatArray
-    gradient: FloatArray
-    diagonal: FloatArray
-    couplings: FloatArray
-    inverses: FloatArray
-    point_gradients: FloatArray
+    band: FloatArray  # (6N, width), see `camera_system`
+    gradient: FloatArray  # (6N,)
+    diagonal: FloatArray  # (6N,) of the cameras' own blocks, before elimination
+    couplings: FloatArray  # (T, 6, 3) blocks of camera and point of every observation
+    inverses: FloatArray  # (P, 3, 3) inverses of the points' own blocks
+    point_gradients: FloatArray  # (P, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Data that do not change during an adjustment.
+    """Data that do not change during an adjustment."""
 
-    Attributes:
-        starts: (P + 1,) the observations of point p are starts[p] to starts[p + 1].
-        width: width of the band, see `camera_system`.
-        bases: (T, 3, 2) two vectors normal to each observed ray.
-        origins: (T, 3) where each ray starts in its camera's frame.
-    """
-
-    starts: NDArray[np.intp]
-    width: int
-    bases: FloatArray
-    origins: FloatArray
+    starts: NDArray[np.intp]  # (P + 1,) the observations of point p are starts[p] to starts[p + 1]
+    width: int  # width of the band, see `camera_system`
+    bases: FloatArray  # (T, 3, 2) two vectors normal to each observed ray
+    origins: FloatArray  # (T, 3) where each ray starts in its camera's frame
 
     @staticmethod
     def of(bundle: Bundle) -> _Layout:

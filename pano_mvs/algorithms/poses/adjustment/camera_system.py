@@ -16,9 +16,6 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from pano_mvs.core.arrays import FloatArray, IndexArray
 
-# A band wider than this share of the matrix is solved faster as a full matrix.
-_WIDE = 0.4
-
 
 def camera_order(point_idx: IndexArray, image_idx: IndexArray, count: int) -> NDArray[np.intp]:
     """Return the order of cameras, (count,), in which cameras that share points are close to each other.
@@ -68,7 +65,8 @@ def camera_solver(band: FloatArray) -> Callable[[FloatArray], FloatArray]:
         LinAlgError: if the system is not positive definite.
     """
     size, width = band.shape
-    if width > _WIDE * size:
+    # A band wider than this share of the matrix is solved faster as a full matrix.
+    if width > 0.4 * size:
         whole = cho_factor(dense_from_band(band), lower=True, overwrite_a=True)
         return lambda right: np.asarray(cho_solve(whole, right), np.float64)
     factor = cholesky_banded(band.T, lower=True)

@@ -16,12 +16,9 @@ from pano_mvs.core.arrays import FloatArray
 # The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
 # with this many points, and more than twice as many as any other.
 _REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
-_MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
 # A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of 20
 # panoramas, 28 of 35 are within 1.6 %, the others at 7 to 14 %, all due to wrong lengths.
 _MAX_DIFFERENCE, _MIN_STD, _MIN_PAIRS = 0.25, 0.02, 3
-_MIN_BASELINE = 0.2  # in heights: shorter ones do not determine the height, and would be held at any length
-_STD_OF_ONE = 0.1  # what is known of the spread of heights before any is measured
 _MEDIAN_SQUARE = 1.39  # squared median of the length of a 2D normal vector of variance 1 in each direction
 
 
@@ -39,17 +36,20 @@ def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
     downs = bundle.rotations[:, 1, :]
     down = downs.mean(axis=0)
     down /= max(float(np.linalg.norm(down)), 1e-12)
-    if np.median(np.arccos(np.clip(downs @ down, -1, 1))) > _MAX_TILT_RAD:
+    # Of a typical camera against all: others are not known to be upright.
+    if np.median(np.arccos(np.clip(downs @ down, -1, 1))) > float(np.deg2rad(3.0)):
         return None
     pairs, heights = _heights(bundle, down)
     baselines = np.linalg.norm(bundle.centers[pairs[:, 0]] - bundle.centers[pairs[:, 1]], axis=1)
-    long = baselines > _MIN_BASELINE * heights
+    # In heights: shorter ones do not determine the height, and would be held at any length.
+    long = baselines > 0.2 * heights
     pairs, heights, baselines = pairs[long], heights[long], baselines[long]
     if len(pairs) < _MIN_PAIRS:
         return None
     differences = np.log(heights / np.median(heights))
     same = np.abs(differences) < _MAX_DIFFERENCE
-    std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), _STD_OF_ONE / len(pairs) ** 0.5)
+    # What is known of the spread of heights before any is measured.
+    std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
     weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / _MEDIAN_SQUARE
     return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
 

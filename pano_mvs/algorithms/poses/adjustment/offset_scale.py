@@ -17,15 +17,10 @@ from pano_mvs.core.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class OffsetScale:
-    """An estimate of the units per metre.
+    """An estimate of the units per metre."""
 
-    Attributes:
-        units_per_m: units of the world per metre.
-        std: its standard deviation from noise in the rays; inf if it cannot be estimated.
-    """
-
-    units_per_m: float
-    std: float
+    units_per_m: float  # units of the world per metre
+    std: float  # its standard deviation from noise in the rays; inf if it cannot be estimated
 
     @property
     def relative_std(self) -> float:

@@ -19,7 +19,6 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 SIZE, MARGIN = 13, 4
 _MAX_WIDTH = 4096  # wider panoramas are rarely sharp to a pixel, and their patches would contain too little detail
-_SMOOTHING = 0.5  # standard deviation, in samples
 _PAD_PX = 8
 # All of these were tuned on rendered and synthetic captures; the result changes little around them.
 _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
@@ -60,7 +59,7 @@ def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
 def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     if not len(poses.track_point_idx):
         return poses
-    step_rad = _step_rad(load(poses.names[0])[0].shape[1])
+    step_rad = 2 * np.pi / min(load(poses.names[0])[0].shape[1], _MAX_WIDTH)
     sightings = _sightings(poses, step_rad)
     bearings = np.array(poses.track_bearings)
     chosen = _longest_tracks(poses.track_point_idx, _MAX_PER_IMAGE * len(poses.names))
@@ -93,10 +92,6 @@ class _Sightings:
     first_axes: FloatArray
     second_axes: FloatArray
     zoom: FloatArray
-
-
-def _step_rad(width: int) -> float:
-    return 2 * np.pi / min(width, _MAX_WIDTH)
 
 
 def _sightings(poses: Poses, step_rad: float) -> _Sightings:
@@ -217,7 +212,7 @@ def _masked(mask: NDArray[np.bool_], rays: tuple[FloatArray, FloatArray, FloatAr
 def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the grey levels from which patches are sampled, (H + 16, W + 16), with a margin of 8 pixels."""
     gray = cv2.cvtColor(panorama, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    sigma_px = _SMOOTHING * max(1.0, panorama.shape[1] / _MAX_WIDTH)
+    sigma_px = 0.5 * max(1.0, panorama.shape[1] / _MAX_WIDTH)  # standard deviation, in samples
     return np.asarray(cv2.GaussianBlur(pad_panorama(gray, _PAD_PX), (0, 0), sigma_px), np.float32)
 
 

@@ -14,19 +14,12 @@ ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class Triangulated:
-    """Triangulated points of tracks, and the observations that support them.
+    """Triangulated points of tracks, and the observations that support them."""
 
-    Attributes:
-        points_in_world: (P, 3), NaN if a track gives no point.
-        valid: (P,) bool.
-        used: (T,) bool, the observations that fit a valid point.
-        errors_rad: (T,) angle between the observed ray and the ray to the point; π if there is no point.
-    """
-
-    points_in_world: FloatArray
-    valid: NDArray[np.bool_]
-    used: NDArray[np.bool_]
-    errors_rad: FloatArray
+    points_in_world: FloatArray  # (P, 3), NaN if a track gives no point
+    valid: NDArray[np.bool_]  # (P,) bool
+    used: NDArray[np.bool_]  # (T,) bool, the observations that fit a valid point
+    errors_rad: FloatArray  # (T,) angle between the observed ray and the ray to the point; π if there is no point
 
 
 def triangulate_observations(

@@ -26,20 +26,9 @@ from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group, split_groups
 
 _ROUNDS = 3
-# Nine captures of full spheres are within 2.3 deviations; later rounds choose the observations that fit them.
-_RANGE_ROUNDS, _MIN_FIRST_STDS = 8, 3.0
 # The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
-_OFFSET_ROUNDS, _WIDE = 10, 4
-_SAME_SCALE = 0.02  # relative difference of two estimates
-# Offsets that determine the unit of length less well than this are too small to matter.
-_MAX_SCALE_STD = 0.03
 _MIN_USED = 0.5  # share of the observations that fit a solution; a wrong one leaves most of them out
-_MAX_ROUGH_STD = 0.5  # before outliers are dropped and patches are aligned
-# A patch this close to the strip in which two lenses are mixed shows both. Such key points bias the unit of length: by
-# 1.4 % instead of 0.3 % for 30 mm.
-_SEAM_PATCH_DEG = 2.0
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 # Sigma of a key point in a panorama of 1024 columns, a fifth of a pixel, to which the scale of the loss refers.
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
 
@@ -77,11 +66,8 @@ def refine_poses(
 
     Args:
         poses: poses with tracks; poses without tracks are returned unchanged.
-        loss: "huber" or "cauchy".
         loss_scale_deg: error at which an observation starts to lose influence. If the precision of observations is
             known, this is for a standard deviation of 0.07°, and scales with it.
-        max_iterations: maximum number of steps in each round.
-        max_error_deg: observations with a larger error are dropped.
         load: returns the panorama and the mask of an image by its name; None keeps the observations as they are.
         rigs: image name to the lenses of its panorama; other images are central cameras.
 
@@ -111,12 +97,13 @@ def fitted_elevation_range(poses: Poses, refined: Poses, *, loss: Loss, loss_sca
     if not neighbour or not len(fitted.track_point_idx):
         return None
     found = ElevationRange(90.0, -90.0, (0.0, 0.0))
-    for round_idx in range(_RANGE_ROUNDS):
+    # Nine captures of full spheres are within 2.3 deviations; later rounds choose the observations that fit them.
+    for round_idx in range(8):
         step = estimate_elevation_range(
             _bundle(fitted)[0], loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg)), neighbour=neighbour
         )
         found = found.then(step)
-        if step.deviations <= (1 if round_idx else _MIN_FIRST_STDS):
+        if step.deviations <= (1 if round_idx else 3.0):
             break
         again = replace(
             group,
@@ -180,7 +167,8 @@ def _refined_with_rigs(
     if poses.metric and measured:
         return in_gauge_of(refined, poses.centers)
     scale = estimate(adjusted)
-    if not scale.relative_std < _MAX_SCALE_STD or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
+    # Offsets that determine the unit of length less well than this are too small to matter.
+    if not scale.relative_std < 0.03 or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
         return _refined_centrally(poses, settings, load=load)
     if not measured:
         return in_gauge_of(refined, poses.centers)
@@ -191,13 +179,15 @@ def _with_unit(
     bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, *, estimate: Callable[[Bundle], OffsetScale]
 ) -> Bundle | None:
     """Return a bundle with its units per metre and rough cameras; None if the offsets do not determine the unit."""
-    for _ in range(_OFFSET_ROUNDS):
+    for _ in range(10):
         # Until the offsets are known in units of the world, no observation can be called an outlier.
-        rough, _unused = _adjusted(bundle, colors, settings, rounds=1, widen=_WIDE)
+        rough, _unused = _adjusted(bundle, colors, settings, rounds=1, widen=4)
         scale = estimate(rough)
-        if not scale.relative_std < _MAX_ROUGH_STD:
+        # Before outliers are dropped and patches are aligned.
+        if not scale.relative_std < 0.5:
             return None
-        known = abs(scale.units_per_m - bundle.units_per_m) < _SAME_SCALE * scale.units_per_m
+        # Relative difference of two estimates.
+        known = abs(scale.units_per_m - bundle.units_per_m) < 0.02 * scale.units_per_m
         bundle = replace(bundle, rotations=rough.rotations, centers=rough.centers, units_per_m=scale.units_per_m)
         if known:
             return bundle
@@ -234,7 +224,10 @@ def _adjusted(
             max_iterations=settings.max_iterations,
             tolerance=_TOLERANCES[round_idx - rounds] if widen == 1 else _TOLERANCES[0],
         )
-    return _without_outliers(bundle, colors, max_error_rad=max_error_rad)
+    # Drop observations with large errors, then points with fewer than two observations.
+    used = bundle.errors_rad() <= max_error_rad
+    valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
+    return _selected(bundle, colors, used & valid[bundle.point_idx], valid=valid)
 
 
 def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, *, neighbour: int) -> Poses:
@@ -274,7 +267,9 @@ def _with_offsets(
         if rig is not None:
             own = bundle.image_idx == idx
             offsets_m[own], bearings[own] = rig.rays_from_bearings(bundle.bearings[own])
-            strip_rad = float(np.radians(rig.blend_deg / 2 + _SEAM_PATCH_DEG))
+            # A patch this close to the strip in which two lenses are mixed shows both. Such key points bias the unit of
+            # length: by 1.4 % instead of 0.3 % for 30 mm.
+            strip_rad = float(np.radians(rig.blend_deg / 2 + 2.0))
             used[own] = rig.angle_from_seam(bundle.bearings[own]) > strip_rad
     valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
     with_offsets = replace(bundle, bearings=bearings, offsets_m=offsets_m)
@@ -304,18 +299,9 @@ def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float)
         bundle.point_idx,
         count=len(bundle.points),
         max_error_rad=max_error_rad,
-        min_angle_rad=_MIN_ANGLE_RAD,
+        min_angle_rad=float(np.deg2rad(1.0)),
     )
     return _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
-
-
-def _without_outliers(
-    bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float
-) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Drop observations with large errors, then points with fewer than two observations."""
-    used = bundle.errors_rad() <= max_error_rad
-    valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
-    return _selected(bundle, colors, used & valid[bundle.point_idx], valid=valid)
 
 
 def _selected(

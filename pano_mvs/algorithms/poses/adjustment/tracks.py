@@ -22,28 +22,17 @@ TwoViews = Mapping[tuple[str, str], TwoView]
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Observations sorted by track, then by image; no track has two key points in one image.
+    """Observations sorted by track, then by image; no track has two key points in one image."""
 
-    Attributes:
-        names: image names, in the capture's order.
-        track_idx: (T,) the track of each observation, 0 … count − 1.
-        image_idx: (T,) its image, a position in `names`.
-        keypoint_idx: (T,) its key point in that image.
-        bearings: (T, 3) its unit ray in the camera frame.
-        colors_rgb: (T, 3) uint8 its colour.
-        count: number of tracks.
-    """
-
-    names: tuple[str, ...]
-    track_idx: IndexArray
-    image_idx: IndexArray
-    keypoint_idx: IndexArray
-    bearings: FloatArray
-    colors_rgb: NDArray[np.uint8]
-    count: int
+    names: tuple[str, ...]  # image names, in the capture's order
+    track_idx: IndexArray  # (T,) the track of each observation, 0 … count − 1
+    image_idx: IndexArray  # (T,) its image, a position in `names`
+    keypoint_idx: IndexArray  # (T,) its key point in that image
+    bearings: FloatArray  # (T, 3) its unit ray in the camera frame
+    colors_rgb: NDArray[np.uint8]  # (T, 3) uint8 its colour
+    count: int  # number of tracks
 
     def __len__(self) -> int:
-        """Return the number of tracks."""
         return self.count
 
 

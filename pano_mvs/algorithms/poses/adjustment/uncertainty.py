@@ -13,30 +13,19 @@ from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, cam
 from pano_mvs.core.arrays import FloatArray
 
 _COLUMNS_AT_ONCE = 64  # cameras
-_HELD_LENGTH = 1e6  # stiffness of the unit of length, relative to the stiffest camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldCameras:
-    """The reduced system of the cameras with the first camera and the length of the first baseline held.
+    """The reduced system of the cameras with the first camera and the length of the first baseline held."""
 
-    Attributes:
-        bundle: the bundle with its cameras in the order of the system.
-        place: (N,) position of each camera in that order.
-        weights: (T,) of the squared errors.
-        system: the reduced system, without the constraints.
-        band: the matrix with the constraints.
-        unseen: (N,) cameras without observations, in the order of the system.
-        variance: of a residual with weight 1.
-    """
-
-    bundle: Bundle
-    place: NDArray[np.intp]
-    weights: FloatArray
-    system: ReducedCameras
-    band: FloatArray
-    unseen: NDArray[np.bool_]
-    variance: float
+    bundle: Bundle  # the bundle with its cameras in the order of the system
+    place: NDArray[np.intp]  # (N,) position of each camera in that order
+    weights: FloatArray  # (T,) of the squared errors
+    system: ReducedCameras  # the reduced system, without the constraints
+    band: FloatArray  # the matrix with the constraints
+    unseen: NDArray[np.bool_]  # (N,) cameras without observations, in the order of the system
+    variance: float  # of a residual with weight 1
 
 
 def held_cameras(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> HeldCameras:
@@ -92,7 +81,7 @@ def _hold_length(band: FloatArray, centers: FloatArray, first: int, *, neighbour
     """Constrain the system so that the distance between two cameras does not change."""
     along = centers[neighbour] - centers[first]
     along /= np.linalg.norm(along)
-    stiffness = _HELD_LENGTH * float(band[:, 0].max())
+    stiffness = 1e6 * float(band[:, 0].max())  # stiffness of the unit of length, relative to the stiffest camera
     for j in range(3):
         for i in range(j, 3):
             band[6 * neighbour + 3 + j, i - j] += stiffness * along[i] * along[j]

@@ -21,17 +21,12 @@ TwoViews = Mapping[tuple[str, str], TwoView]
 
 @dataclass(frozen=True, eq=False)
 class DatabaseImage:
-    """One COLMAP image: a panorama, or one of its faces.
+    """One COLMAP image: a panorama, or one of its faces."""
 
-    Attributes:
-        panorama_idx: position of the panorama among the features.
-        keypoint_idx: (N,) the panorama's key points in this image; keypoint_idx[n] is key point n of the image.
-        face_from_panorama: (3, 3) rotation; the identity for a whole panorama.
-    """
-
-    panorama_idx: int
+    panorama_idx: int  # position of the panorama among the features
+    # (N,) the panorama's key points in this image; keypoint_idx[n] is key point n of the image
     keypoint_idx: IndexArray
-    face_from_panorama: FloatArray
+    face_from_panorama: FloatArray  # (3, 3) rotation; the identity for a whole panorama
 
 
 def write_database(

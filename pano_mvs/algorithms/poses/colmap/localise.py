@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.photograph import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
+from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
 from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
@@ -19,16 +20,11 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
-_SEED_LIMIT = 2**31 - 1
-# Without a focal length in the file, a picture is taken to be as wide as most phones' for the first guess.
-_GUESSED_FOV_DEG = 65.0
 _FOV_BOUNDS_DEG = (15.0, 120.0)
-_MAX_RADIAL = 0.5
 # How well EXIF's focal length, or a guessed one, is known: the standard deviation of its natural logarithm.
 _EXIF_LOG_STD, _GUESSED_LOG_STD = 0.1, 0.4
 # With a pose, key points within this many times the maximum error of a point's place are compared with it.
 _GUIDED_ROUNDS, _GUIDED, _GUIDED_RATIO, _MAX_DISTANCE = 2, 2.0, 0.9, 300.0
-_MIN_INLIER_SHARE = 0.15
 # The inliers must spread over the picture: the standard deviation of their pixels, as a share of its diagonal.
 _MIN_SPREAD = 0.05
 # A pose that fewer key points suggest is accepted if the patches of the panoramas confirm it: this many, and this share
@@ -38,26 +34,16 @@ _MIN_CONFIRMED, _MIN_CONFIRMED_SHARE = 60, 0.3
 _ALIGNED_PANORAMAS = 8
 # Patches refine a pose if there are at least this many, and if they turn the camera by less than this.
 _MIN_ALIGNED, _MAX_TURN = 40, float(np.radians(2.0))
-# A photograph whose optical centre is further from its middle, as a share of the longer side, was cropped.
-_MAX_OFF_CENTER = 0.02
 
 
 class Localised(NamedTuple):
-    """A photograph's pose and camera (see `Photographs`).
+    """A photograph's pose and camera (see `Photographs`)."""
 
-    Attributes:
-        cam_from_world: the pose.
-        focal_px: focal length.
-        radial: coefficient of the distortion.
-        inliers: number of key points that agree.
-        error_px: median error of these.
-    """
-
-    cam_from_world: Rigid3
-    focal_px: float
-    radial: float
-    inliers: int
-    error_px: float
+    cam_from_world: Rigid3  # the pose
+    focal_px: float  # focal length
+    radial: float  # coefficient of the distortion
+    inliers: int  # number of key points that agree
+    error_px: float  # median error of these
 
 
 @checks_settings
@@ -91,9 +77,6 @@ def localise_photograph(
         focal_px: focal length if it is known, None otherwise.
         patches: the photograph and the panoramas, to align patches; None: key points only.
         learned: by panorama, matches (M, 2) that a network found: positions in `keypoints` and in the known points.
-        candidates: number of most similar panoramas that are used; 0: all.
-        min_inliers: minimum number of key points that agree with the pose.
-        max_error_deg: maximum error of these.
         rng: gives RANSAC's seed.
     """
     if patches is not None and patches.too_narrow:
@@ -107,7 +90,8 @@ def localise_photograph(
             f"only {len(matches.pixels_px)} of its {len(keypoints.pixels_px)} key points match points of the panoramas"
         )
     if focal_px is None:
-        prior = FocalPrior(max(size_hw) / 2 / float(np.tan(np.radians(_GUESSED_FOV_DEG) / 2)), _GUESSED_LOG_STD)
+        # Without a focal length in the file, a picture is taken to be as wide as most phones' for the first guess.
+        prior = FocalPrior(max(size_hw) / 2 / float(np.tan(np.radians(65.0) / 2)), _GUESSED_LOG_STD)
     else:
         prior = FocalPrior(focal_px, _EXIF_LOG_STD)
     search = _Search(
@@ -120,7 +104,7 @@ def localise_photograph(
         min_inliers=min_inliers,
         max_error=float(np.radians(max_error_deg)),
     )
-    found = search.located(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+    found = search.located(matches, seed=colmap_seed(rng))
     if isinstance(found, Localised | _Cropped) or patches is None:
         return found
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
@@ -206,7 +190,7 @@ class _Search:
         assert self.patches is not None
         best: tuple[Aligned, _Matches] | None = None
         for matches in candidates:
-            first = self.first(matches, seed=int(rng.integers(1, _SEED_LIMIT)))
+            first = self.first(matches, seed=colmap_seed(rng))
             if first is None:
                 continue
             camera = self.refined(matches, first)
@@ -360,7 +344,8 @@ class _Cropped(str):
 
 def _cropped(aligned: Aligned) -> _Cropped:
     """Return why a photograph is taken to be cropped, "" if it is not."""
-    if aligned.off_center <= _MAX_OFF_CENTER:
+    # A photograph whose optical centre is further from its middle, as a share of the longer side, was cropped.
+    if aligned.off_center <= 0.02:
         return _Cropped()
     return _Cropped(
         f"it seems to be cropped: its optical centre is {100 * aligned.off_center:.0f} % of its longer side away from "
@@ -374,10 +359,10 @@ def _implausible(
     """Return why a pose cannot be trusted, "" if it can."""
     # A key point that matches the same place in several panoramas counts once.
     distinct = len(np.unique(inliers_px, axis=0))
-    if distinct < min_inliers or len(inliers_px) < _MIN_INLIER_SHARE * matches:
+    if distinct < min_inliers or len(inliers_px) < 0.15 * matches:
         return f"only {len(inliers_px)} of its {matches} matches, of {distinct} key points, agree with one pose"
     fov_deg = camera.fov_deg(size_hw)
-    if not _FOV_BOUNDS_DEG[0] <= fov_deg <= _FOV_BOUNDS_DEG[1] or abs(camera.radial) > _MAX_RADIAL:
+    if not _FOV_BOUNDS_DEG[0] <= fov_deg <= _FOV_BOUNDS_DEG[1] or abs(camera.radial) > 0.5:
         return f"its matches give an implausible camera: {fov_deg:.0f}° wide, distortion {camera.radial:.2f}"
     spread = np.linalg.svd(inliers_px - inliers_px.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(inliers_px))
     if spread < _MIN_SPREAD * np.hypot(*size_hw):

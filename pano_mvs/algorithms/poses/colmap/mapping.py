@@ -17,9 +17,15 @@ from pano_mvs.scene import Features, Poses
 
 Mapper = Literal["incremental", "global"]
 
-# With more threads the order of Ceres' sums, and thus the last digits, would depend on the scheduler.
-_THREADS = 1
+THREADS = 1
+"""With more, the order of Ceres' sums, and thus the last digits, and the numbers of images depend on the scheduler."""
+
 _WIDTH_OF_LIMITS_PX = 1024
+
+
+def colmap_seed(rng: np.random.Generator) -> int:
+    """Return a seed for COLMAP's random numbers, positive."""
+    return int(rng.integers(1, 2**31 - 1))
 
 
 @contextmanager
@@ -217,8 +223,8 @@ def _incremental_options(*, cameras: Cameras, seed: int, width_px: float) -> Any
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = _THREADS, seed
-    options.mapper.num_threads, options.mapper.random_seed = _THREADS, seed
+    options.num_threads, options.random_seed = THREADS, seed
+    options.mapper.num_threads, options.mapper.random_seed = THREADS, seed
     options.triangulation.random_seed = seed
     options.extract_colors = False
     options.min_model_size = 2
@@ -247,12 +253,12 @@ def _global_options(*, cameras: Cameras, seed: int) -> Any:
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads, options.random_seed = _THREADS, seed
+    options.num_threads, options.random_seed = THREADS, seed
     mapper = options.mapper
-    mapper.num_threads, mapper.random_seed = _THREADS, seed
+    mapper.num_threads, mapper.random_seed = THREADS, seed
     mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = seed
     mapper.retriangulation.random_seed = seed
-    mapper.bundle_adjustment.ceres.solver_options.num_threads = _THREADS
+    mapper.bundle_adjustment.ceres.solver_options.num_threads = THREADS
     mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
     mapper.refine_sensor_from_rig = mapper.rotation_averaging.refine_sensor_from_rig = False
     mapper.global_positioning.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False

@@ -10,15 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
+from pano_mvs.algorithms.poses.colmap.mapping import THREADS, quiet_colmap
 from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
 from pano_mvs.scene import Features, TwoView
-
-# With more threads COLMAP numbers the images in the order in which they are finished.
-_THREADS = 1
-_SIFT_PATCH_SCALES = 12.0  # SIFT describes 4 × 4 bins of three scales each
 
 
 @checks_settings
@@ -36,7 +32,6 @@ def colmap_sift(
     Args:
         pictures: name, (H, W, 3) uint8 RGB and (H, W) bool valid pixels of each panorama, in the capture's order;
             loaded one at a time, so they need not all be in memory.
-        max_keypoints: maximum number per panorama.
         rng: gives COLMAP's seed.
         scratch: an empty folder for the images, their masks and COLMAP's database.
     """
@@ -90,7 +85,7 @@ def _extraction_options(max_keypoints: int) -> Any:
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = _THREADS, False
+    options.num_threads, options.use_gpu = THREADS, False
     options.sift.max_num_features = max_keypoints
     return options
 
@@ -99,7 +94,7 @@ def _matching_options() -> Any:
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = _THREADS, False
+    options.num_threads, options.use_gpu = THREADS, False
     return options
 
 
@@ -108,7 +103,7 @@ def _verification_options(seed: int) -> Any:
 
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
-    options.ransac.random_seed, options.ransac.num_threads = seed, _THREADS
+    options.ransac.random_seed, options.ransac.num_threads = seed, THREADS
     return options
 
 
@@ -140,10 +135,11 @@ def _features(database: Any, image_id: int, picture: Path) -> Features:
     keypoints = np.asarray(database.read_keypoints(image_id), np.float64).reshape(-1, 6)
     columns, rows = (np.floor(keypoints[:, axis]).astype(int) for axis in (0, 1))
     scales_px = np.sqrt(np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4]))
+    # SIFT describes 4 × 4 bins of three scales each.
     return Features(
         bearings=ray_from_pixel(keypoints[:, :2], (height, width)),
         descriptors=np.asarray(database.read_descriptors(image_id).data, np.float32).reshape(-1, 128),
-        sizes_rad=(_SIFT_PATCH_SCALES * scales_px * 2 * np.pi / width).astype(np.float32),
+        sizes_rad=(12.0 * scales_px * 2 * np.pi / width).astype(np.float32),
         scores=scales_px.astype(np.float32),
         colors_rgb=image[np.clip(rows, 0, height - 1), columns % width],
         metric="l2",

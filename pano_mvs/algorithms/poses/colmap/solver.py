@@ -12,6 +12,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.colmap.database import Cameras, TwoViews, write_database
 from pano_mvs.algorithms.poses.colmap.mapping import (
     Mapper,
+    colmap_seed,
     extend_model,
     poses_from_model,
     registered_panoramas,
@@ -24,7 +25,6 @@ from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Features, Poses
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
 
-_SEED_LIMIT = 2**31 - 1
 _CAMERAS = Setting("EQUIRECTANGULAR cameras, or a rig of six pinhole faces for each panorama")
 
 
@@ -45,7 +45,6 @@ def solve_colmap(
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs; those without a general geometry are left out.
-        mapper: "incremental" or "global".
         cameras: "sphere": EQUIRECTANGULAR cameras; "faces": six pinhole faces, held together as one rig.
         rng: gives COLMAP's seed.
         scratch: an empty folder for COLMAP's files.
@@ -55,7 +54,7 @@ def solve_colmap(
         several groups, each in its own frame; a panorama in two models is taken from the larger one. Panoramas that are
         in no model of two or more are in `rejected`, with the reason.
     """
-    seed = int(rng.integers(1, _SEED_LIMIT))
+    seed = colmap_seed(rng)
     (scratch / "models").mkdir()
     images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
     try:
@@ -105,7 +104,7 @@ def extend_with_colmap(
         Poses in the frame and unit of the known poses. Images that COLMAP does not add are in `rejected`, with the
         reason; so are known images without any reliable pair, which COLMAP does not load (`extend_poses` keeps them).
     """
-    seed = int(rng.integers(1, _SEED_LIMIT))
+    seed = colmap_seed(rng)
     (scratch / "models").mkdir()
     images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
     position = {name: idx for idx, name in enumerate(features)}

@@ -11,9 +11,6 @@ from pano_mvs.geometry import Similarity3, similarity_from_points
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
-# A neighbour closer than this share of the median distance to the first camera gives no reliable unit of length.
-_MIN_NEIGHBOUR_SHARE = 0.1
-
 
 def normalised_poses(poses: Poses) -> Poses:
     """Return the same scene with the first camera as the world and its first baseline as the unit of length.
@@ -56,7 +53,8 @@ def first_neighbour(centers: FloatArray) -> int:
     distances = np.linalg.norm(centers - centers[0], axis=1)[1:] if len(centers) else np.zeros(0)
     if not distances.any():
         return 0
-    return 1 + int(np.flatnonzero(distances > _MIN_NEIGHBOUR_SHARE * np.median(distances))[0])
+    # A neighbour closer than this share of the median distance to the first camera gives no reliable unit of length.
+    return 1 + int(np.flatnonzero(distances > 0.1 * np.median(distances))[0])
 
 
 def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:

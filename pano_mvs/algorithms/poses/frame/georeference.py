@@ -13,45 +13,31 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import UP, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.geometry.geodesy import lla_from_local, local_from_lla
 from pano_mvs.scene import Poses
 
 ComplexArray = NDArray[np.complex128]
 
-_UP = np.array([0.0, -1.0, 0.0])
 _MIN_POSITIONS = 3
 _MAX_HYPOTHESES = 2000
-# A scale with a larger relative uncertainty than this is not used.
-_MAX_SCALE_ERROR = 0.1
 _OUTLIER_SIGMAS = 3.0
 _GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)°, (-?[\d.]+)°, (-?[\d.]+) m\)")
 
 
 @dataclass(frozen=True, eq=False)
 class GpsFit:
-    """A fit of camera positions to GPS; falsy, with the reason, if there is no reliable one.
+    """A fit of camera positions to GPS; falsy, with the reason, if there is no reliable one."""
 
-    Attributes:
-        local_from_world: the similarity into metres east, down, north of `origin_lla`.
-        origin_lla: (3,) latitude deg, longitude deg, altitude m.
-        used: number of positions that agree with the fit.
-        of: number of registered panoramas with a position.
-        residual_m: median horizontal distance between the positions and the fit.
-        scale_error: relative standard deviation of the scale.
-        reason: why there is no reliable fit; "" if there is one.
-    """
-
-    local_from_world: Similarity3
-    origin_lla: FloatArray
-    used: int
-    of: int
-    residual_m: float = float("nan")
-    scale_error: float = float("nan")
-    reason: str = ""
+    local_from_world: Similarity3  # the similarity into metres east, down, north of `origin_lla`
+    origin_lla: FloatArray  # (3,) latitude deg, longitude deg, altitude m
+    used: int  # number of positions that agree with the fit
+    of: int  # number of registered panoramas with a position
+    residual_m: float = float("nan")  # median horizontal distance between the positions and the fit
+    scale_error: float = float("nan")  # relative standard deviation of the scale
+    reason: str = ""  # why there is no reliable fit; "" if there is one
 
     def __bool__(self) -> bool:
-        """Return whether the fit is reliable."""
         return not self.reason
 
     @property
@@ -96,7 +82,7 @@ def fit_gps(
     lla = np.array([position for _, position in located], np.float64)
     origin_lla = np.median(lla, axis=0)
     local = local_from_lla(lla, origin_lla)
-    levelling = rotation_from_two_vectors(up_in_world, _UP)
+    levelling = rotation_from_two_vectors(up_in_world, UP)
     level = poses.centers[[idx for idx, _ in located]] @ levelling.T
     source, target = level[:, 0] + 1j * level[:, 2], local[:, 0] + 1j * local[:, 2]
     factor, shift = _fit_plane(source, target, gps_noise_m, rng=rng)
@@ -169,7 +155,8 @@ def _judged(
     noise_m = max(gps_noise_m, float(np.sqrt(np.sum(residuals_m**2) / freedom)))
     spread_m = float(abs(factor) * np.sqrt(np.sum(np.abs(source - source.mean()) ** 2)))
     fit = replace(fit, scale_error=noise_m / spread_m if spread_m > 0 else float("inf"))
-    if fit.scale_error > _MAX_SCALE_ERROR:
+    # A scale with a larger relative uncertainty than this is not used.
+    if fit.scale_error > 0.1:
         side_m = spread_m / np.sqrt(len(source))
         return replace(
             fit,

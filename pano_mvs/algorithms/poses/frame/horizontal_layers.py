@@ -16,9 +16,6 @@ from pano_mvs.geometry import angle_between
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
 _MIN_POINTS = 100
 _PARTS = 4
-# Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms, 200
-# to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
-_MIN_CONTRAST = 1.3
 _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
 _BINS_PER_WIDTH = 2.0
 # The floor: density along the logarithm of the depth below the cameras, which makes it independent of the unit.
@@ -30,43 +27,27 @@ _MIN_FLOOR_POINTS = 12
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none.
+    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none."""
 
-    Attributes:
-        up: (3,) unit vector.
-        contrast: sharpness of the layers relative to the median direction within 8°.
-        reason: why there is none; else "".
-        uncertainty_deg: standard deviation of the direction, from four parts of the points.
-    """
-
-    up: FloatArray
-    contrast: float
-    reason: str = ""
-    uncertainty_deg: float = float("nan")
+    up: FloatArray  # (3,) unit vector
+    contrast: float  # sharpness of the layers relative to the median direction within 8°
+    reason: str = ""  # why there is none; else ""
+    uncertainty_deg: float = float("nan")  # standard deviation of the direction, from four parts of the points
 
     def __bool__(self) -> bool:
-        """Return whether there are layers."""
         return not self.reason
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The depth of the floor below the cameras; falsy, with the reason, if no floor was found.
+    """The depth of the floor below the cameras; falsy, with the reason, if no floor was found."""
 
-    Attributes:
-        depth: median height of the cameras above the floor, scene units.
-        points: number of sparse points on the floor.
-        spread: median distance of these points from the floor, scene units.
-        reason: why no floor was found; else "".
-    """
-
-    depth: float
-    points: int = 0
-    spread: float = 0.0
-    reason: str = ""
+    depth: float  # median height of the cameras above the floor, scene units
+    points: int = 0  # number of sparse points on the floor
+    spread: float = 0.0  # median distance of these points from the floor, scene units
+    reason: str = ""  # why no floor was found; else ""
 
     def __bool__(self) -> bool:
-        """Return whether a floor was found."""
         return not self.reason
 
 
@@ -94,7 +75,9 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
     others = directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
     usual = np.median([_concentration(near @ other, width) for other in others])
     contrast = float(_concentration(near @ best, width) / usual)
-    if contrast < _MIN_CONTRAST:
+    # Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms,
+    # 200 to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
+    if contrast < 1.3:
         return Layers(up, contrast, f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
     return Layers(best, contrast, uncertainty_deg=_scatter_deg(near, best))
 

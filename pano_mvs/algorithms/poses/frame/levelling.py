@@ -15,12 +15,8 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.geometry import UP, Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
-
-_UP = np.array([0.0, -1.0, 0.0])
-_MIN_HEADINGS = 2
-_MAX_HEADING_DISAGREEMENT_DEG = 15.0
 
 
 @checks_settings
@@ -53,14 +49,13 @@ def level_poses(
         heading_deg: image name to the compass heading of its centre, clockwise from north.
         pictures: image name to a function that loads its panorama, for vertical lines.
         evidence: as in `find_vertical`.
-        max_uncertainty_deg: standard deviation of the vertical above which the poses stay as they are.
 
     Returns:
         The poses, and the evidence that they were levelled by. If the vertical cannot be determined, or GPS has turned
         the world to east, down and north, the unchanged poses and a falsy record with the reason.
     """
     if origin_of_frame(poses.frame) is not None:
-        return poses, Vertical(_UP, reason="GPS has already turned it: x east, y down, z north")
+        return poses, Vertical(UP, reason="GPS has already turned it: x east, y down, z north")
     vertical = find_vertical(poses, up_in_cam, pictures, evidence=evidence)
     if vertical and vertical.uncertainty_deg > max_uncertainty_deg:
         reason = (
@@ -70,7 +65,7 @@ def level_poses(
         vertical = replace(vertical, reason=reason)
     if not vertical:
         return poses, vertical
-    levelling = rotation_from_two_vectors(vertical.up_in_world, _UP)
+    levelling = rotation_from_two_vectors(vertical.up_in_world, UP)
     level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
     towards, heading = _northward(level, heading_deg or {})
     # Adding 0 turns −0 into 0: the first camera is exactly at the origin.
@@ -86,7 +81,7 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
     unturned = "z close to where it pointed before levelling"
     # Software that knows no heading writes zero for all images.
-    if len(headings) < _MIN_HEADINGS or not any(heading for _, heading in headings):
+    if len(headings) < 2 or not any(heading for _, heading in headings):
         return np.eye(3), unturned
     forward = np.array([level.rotations[idx][2] for idx, _ in headings])
     measured_rad = np.deg2rad([heading for _, heading in headings])
@@ -94,7 +89,7 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     medoid = turns[int(np.argmin(np.abs(np.angle(turns[:, None] / turns[None, :])).sum(axis=1)))]
     turn_rad = float(np.angle(medoid)) + float(np.median(np.angle(turns / medoid)))
     off_deg = float(np.median(np.abs(np.rad2deg(np.angle(turns * np.exp(-1j * turn_rad))))))
-    if off_deg > _MAX_HEADING_DISAGREEMENT_DEG:
+    if off_deg > 15.0:
         return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
     return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
         f"z north, by {len(headings)} compass {plural(len(headings), 'heading')} (median disagreement {off_deg:.1f}°)"

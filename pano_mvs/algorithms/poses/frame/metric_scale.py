@@ -13,9 +13,6 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Poses
 
-# Cameras closer than this share of the capture's extent are at the same place: their distance is noise.
-_COINCIDENT_SHARE = 1e-3
-
 
 def scaled_poses(poses: Poses, factor: float, *, origin: str) -> Poses:
     """Return the same scene with all lengths multiplied by a factor, in metres.
@@ -58,7 +55,8 @@ def scaled_by_baseline(poses: Poses, first: str, second: str, *, metres: float) 
     centers = poses.centers
     distance = float(np.linalg.norm(centers[poses.names.index(second)] - centers[poses.names.index(first)]))
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    if distance <= _COINCIDENT_SHARE * extent:
+    # Cameras closer than this share of the capture's extent are at the same place: their distance is noise.
+    if distance <= 1e-3 * extent:
         raise UsageError(
             f"{first} and {second} were taken in one place, so the distance between them gives no scale. "
             "Use two images that are farther apart"

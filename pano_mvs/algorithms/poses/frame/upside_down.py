@@ -24,12 +24,10 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import (
     up_from_lines,
 )
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import ray_grid, rotate_panorama, rotation_from_two_vectors
+from pano_mvs.geometry import UP, ray_grid, rotate_panorama, rotation_from_two_vectors
 from pano_mvs.scene import Poses
 
-_UP = np.array([0.0, -1.0, 0.0])
 _SIZE_HW = (256, 512)
-_MAX_PICTURES = 24
 # Pictures are compared between these elevations: beyond furniture, up to the tripod.
 _BAND_DEG = (55.0, 80.0)
 # Fitted: where each difference is bounded, and its weight in the log-odds.
@@ -39,8 +37,6 @@ LEVEL_DEG = 20.0
 """Tilt up to which a panorama counts as level."""
 # Of single panoramas: the share that is level, and of these the share whose axes do not include the vertical (1 of 47).
 _LEVEL, _OUTSIDE = 0.9, 0.03
-_LEAST = 0.1
-_MIN_VALID = 0.1  # share of the compared directions that must not be masked
 PRIOR_LOG_ODDS = float(np.log(0.01 / 0.99))
 """One capture in a hundred is taken to be upside down."""
 
@@ -68,16 +64,16 @@ def ups_of_picture(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> list[F
         valid: (H, W) bool; masked (False) pixels do not count.
     """
     segments = find_segments({"": lambda: (image, valid)}, {"": np.eye(3)})
-    lines = up_from_lines(segments.nearly_vertical(_UP, groups=SIDES), _UP)
-    own = lines.up if lines else _UP
+    lines = up_from_lines(segments.nearly_vertical(UP, groups=SIDES), UP)
+    own = lines.up if lines else UP
     axes = orthogonal_directions(segments)
-    turned = np.zeros((0, 3)) if axes is None else axes[np.abs(axes @ _UP) < np.cos(np.radians(LEVEL_DEG))]
+    turned = np.zeros((0, 3)) if axes is None else axes[np.abs(axes @ UP) < np.cos(np.radians(LEVEL_DEG))]
     ends = np.concatenate([[own, -own], turned, -turned])
     prior = np.full(len(ends), (1 - _LEVEL) / max(1, 2 * len(turned)))
     prior[:2] = _LEVEL * (_OUTSIDE if len(turned) == 3 else 1) * np.array([1, np.exp(PRIOR_LOG_ODDS)])
     small = _reduced(image, valid)
     chances = _chances(np.array([_in_picture(*small, end) for end in ends]), prior)
-    return [ends[idx] for idx in np.argsort(-chances, kind="stable") if chances[idx] >= _LEAST]
+    return [ends[idx] for idx in np.argsort(-chances, kind="stable") if chances[idx] >= 0.1]
 
 
 def most_probable_up(poses: Poses, pictures: Mapping[str, Picture], axes: FloatArray) -> tuple[FloatArray, float]:
@@ -115,7 +111,7 @@ def differences_below(poses: Poses, pictures: Mapping[str, Picture], ups: FloatA
         ups: (K, 3) unit vectors that may be up.
     """
     names = [idx for idx, name in enumerate(poses.names) if name in pictures]
-    chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), _MAX_PICTURES)).astype(int))
+    chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), 24)).astype(int))
     seen = []
     for idx in chosen:
         small = _reduced(*pictures[poses.names[names[idx]]]())
@@ -142,7 +138,7 @@ def _reduced(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[NDArra
 
 def _in_picture(small: NDArray[np.uint8], mask: NDArray[np.uint8], up_in_cam: FloatArray) -> FloatArray:
     """Return the differences of brightness and texture, (2,); 0 where too little is valid both below and above."""
-    turn = rotation_from_two_vectors(up_in_cam, _UP)
+    turn = rotation_from_two_vectors(up_in_cam, UP)
     level = rotate_panorama(small, turn)
     is_valid = rotate_panorama(mask, turn) > 254
     # Logarithms of noise in black and of grain in plain surfaces say nothing.
@@ -153,6 +149,7 @@ def _in_picture(small: NDArray[np.uint8], mask: NDArray[np.uint8], up_in_cam: Fl
     weights = cosine * ((cosine < np.cos(np.radians(_BAND_DEG[0]))) & (cosine > np.cos(np.radians(_BAND_DEG[1]))))
     weights[_SIZE_HW[0] // 2 :] = 0
     own = weights * (is_valid & is_valid[::-1])
-    if own.sum() < _MIN_VALID * weights.sum():
+    # Share of the compared directions that must not be masked.
+    if own.sum() < 0.1 * weights.sum():
         return np.zeros(2)
     return np.array([((part[::-1] - part) * own).sum() / own.sum() for part in (brightness, texture)])

@@ -20,7 +20,7 @@ from pano_mvs.algorithms.poses.frame.vertical_lines import (
 )
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import angle_between
+from pano_mvs.geometry import UP, angle_between
 from pano_mvs.scene import Poses
 
 Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
@@ -28,48 +28,28 @@ Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 SURE = 0.8
 """Probability from which a capture is taken to be upside down. Of upright ones that were measured, none reaches .01."""
 
-_UP = np.array([0.0, -1.0, 0.0])
-# Sensors of one rigid capture that differ by more than this did not measure gravity.
-_MAX_SENSOR_DISAGREEMENT_DEG = 5.0
-# Cameras whose up directions differ by more than this were not held upright.
-_MAX_CAMERA_DISAGREEMENT_DEG = 20.0
-# Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a ramp.
-_MAX_STRUCTURE_TILT_DEG = 2.0
 # Errors that all sensors of a type, or all cameras of one person, have in common; that of a single reading.
 _SENSOR_BIAS_DEG, _CAMERA_BIAS_DEG, _SINGLE_READING_DEG = 0.5, 1.0, 1.0
 # Of the median of the angles between directions and their mean, in terms of the standard deviation of the direction.
 _STD_PER_MEDIAN = 0.85 * np.sqrt(2.0)
-# How far from upright a single camera is usually held.
-_ONE_CAMERA_DEG = 2.0
-# Agreement better than this rejects nothing: readings are tenths of degrees at best.
-_MIN_LIMIT_DEG = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Vertical:
-    """The direction away from gravity; falsy, with the reason, if it is unknown.
+    """The direction away from gravity; falsy, with the reason, if it is unknown."""
 
-    Attributes:
-        up_in_world: (3,) unit vector.
-        source: "sensors", "lines", "structure" or "cameras".
-        evidence: description of the source, with its amount and agreement.
-        disagreement_deg: median angle between single readings and `up_in_world`; NaN if there is only one.
-        reason: why the direction is unknown; "" if it is known.
-        uncertainty_deg: standard deviation of `up_in_world`; NaN if unknown.
-        upside_down: probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on,
-            `up_in_world` is opposite to their up direction.
-    """
-
-    up_in_world: FloatArray
-    source: str = ""
-    evidence: str = ""
+    up_in_world: FloatArray  # (3,) unit vector
+    source: str = ""  # "sensors", "lines", "structure" or "cameras"
+    evidence: str = ""  # description of the source, with its amount and agreement
+    # median angle between single readings and `up_in_world`; NaN if there is only one
     disagreement_deg: float = float("nan")
-    reason: str = ""
-    uncertainty_deg: float = float("nan")
+    reason: str = ""  # why the direction is unknown; "" if it is known
+    uncertainty_deg: float = float("nan")  # standard deviation of `up_in_world`; NaN if unknown
+    # probability that the cameras were held upside down; NaN if it was not asked for. From `SURE` on, `up_in_world` is
+    # opposite to their up direction.
     upside_down: float = float("nan")
 
     def __bool__(self) -> bool:
-        """Return whether the direction is known."""
         return not self.reason
 
 
@@ -123,7 +103,8 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
     readings = np.array([poses.rotations[idx].T @ np.asarray(up, np.float64) for idx, up in measured])
     up, deviations_deg, kept = robust_mean_direction(readings)
     disagreement_deg = float(np.median(deviations_deg))
-    if disagreement_deg > _MAX_SENSOR_DISAGREEMENT_DEG:
+    # Sensors of one rigid capture that differ by more than this did not measure gravity.
+    if disagreement_deg > 5.0:
         return _unknown(f"the sensors of {len(measured)} panoramas disagree by {disagreement_deg:.1f}° in the median")
     agreement = f", median disagreement {disagreement_deg:.2f}°" if len(measured) > 1 else ", nothing to compare with"
     states = plural(int(kept.sum()), "states", "state")
@@ -138,9 +119,10 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
     """Return the robust mean of the cameras' up directions: panoramas are taken with the camera nearly upright."""
     if len(poses.names) < 2:
         return _unknown("a single camera does not determine the vertical")
-    up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ _UP)
+    up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ UP)
     disagreement_deg = float(np.median(deviations_deg))
-    if disagreement_deg > _MAX_CAMERA_DISAGREEMENT_DEG:
+    # Cameras whose up directions differ by more than this were not held upright.
+    if disagreement_deg > 20.0:
         return _unknown(
             f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
         )
@@ -221,7 +203,8 @@ def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArra
     mean = directions[int(np.argmin(angles.sum(axis=1)))]
     for _ in range(2):
         deviations_deg = np.rad2deg(angle_between(directions, mean))
-        kept = deviations_deg <= max(_MIN_LIMIT_DEG, 3 * 1.4826 * float(np.median(deviations_deg)))
+        # Agreement better than this rejects nothing: readings are tenths of degrees at best.
+        kept = deviations_deg <= max(1.0, 3 * 1.4826 * float(np.median(deviations_deg)))
         mean = directions[kept].mean(axis=0)
         mean = mean / np.linalg.norm(mean)
     return mean, np.rad2deg(angle_between(directions, mean)), kept
@@ -230,13 +213,16 @@ def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArra
 def _of_one_camera(poses: Poses) -> Vertical:
     if not poses.names:
         return _unknown("there is no camera")
-    return Vertical(poses.rotations[0].T @ _UP, "cameras", "a single camera", _ONE_CAMERA_DEG)
+    # How far from upright a single camera is usually held.
+    return Vertical(poses.rotations[0].T @ UP, "cameras", "a single camera", 2.0)
 
 
 def _too_far(up: FloatArray, prior: Vertical, what: str) -> str:
     """Return why a direction cannot be the vertical, if it is too far from that of the cameras; else ""."""
     moved_deg = float(np.rad2deg(angle_between(up, prior.up_in_world)))
-    limit_deg = _MAX_STRUCTURE_TILT_DEG + 3 * 1.4826 * prior.disagreement_deg
+    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
+    # ramp.
+    limit_deg = 2.0 + 3 * 1.4826 * prior.disagreement_deg
     return f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction" if moved_deg > limit_deg else ""
 
 
@@ -245,4 +231,4 @@ def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) 
 
 
 def _unknown(reason: str) -> Vertical:
-    return Vertical(_UP, reason=reason)
+    return Vertical(UP, reason=reason)

@@ -16,77 +16,52 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.faces.render import face_image, face_mask
+from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
+from pano_mvs.geometry import UP, PinholeView, rotation_from_rotvec, rotation_from_two_vectors, spiral_rays
 
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
 
-_UP = np.array([0.0, -1.0, 0.0])
-_MAX_PICTURES = 24
-_MAX_FACE_PX = 512
 _FOV_DEG = 90.0
 SIDES = 4
 """Views of a panorama around the horizon; the other two look up and down."""
-# Segments shorter than this share of a face do not point anywhere exactly.
-_MIN_LENGTH_SHARE = 0.06
-# Segments that are farther from pointing up than this cannot be vertical.
-_MAX_TILT_DEG = 25.0
 # Search around the given up direction, as for level surfaces: half width, step and tolerance in degrees.
 _ROUNDS = ((20.0, 2.0, 3.0), (2.0, 0.5, 1.0), (0.5, 0.1, 0.5))
 _MIN_SEGMENTS = 20
-# Minimum ratio of the weight of agreeing segments to the median over all directions within 8°.
-_MIN_CONTRAST = 1.5
 _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
-# The rest of the weight must not be in one plane: edges at one azimuth leave the tilt towards them unknown.
-_MIN_SPREAD = 0.05
-_REFINEMENTS = 3
-# Rendered rooms: errors of 0.03° to 0.13°, whatever the number of lines.
-_BIAS_DEG = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Line segments in the world.
+    """Line segments in the world."""
 
-    Attributes:
-        normals: (M, 3) unit normals of the planes through the segments and their cameras.
-        weights: (M,) lengths in radians.
-        groups: (M,) number of the view in which the segment was found; errors within a view are not independent.
-    """
-
-    normals: FloatArray
-    weights: FloatArray
+    normals: FloatArray  # (M, 3) unit normals of the planes through the segments and their cameras
+    weights: FloatArray  # (M,) lengths in radians
+    # (M,) number of the view in which the segment was found; errors within a view are not independent
     groups: NDArray[np.int64]
 
     def nearly_vertical(self, up: FloatArray, *, groups: int) -> Segments:
         """Return the segments of the first groups that point to within 25° of `up` (3,)."""
-        near = (np.abs(self.normals @ up) < np.sin(np.deg2rad(_MAX_TILT_DEG))) & (self.groups < groups)
+        # Segments that are farther from pointing up than this cannot be vertical.
+        near = (np.abs(self.normals @ up) < np.sin(np.deg2rad(25.0))) & (self.groups < groups)
         return Segments(self.normals[near], self.weights[near], self.groups[near])
 
 
 @dataclass(frozen=True, eq=False)
 class VerticalLines:
-    """The direction that vertical lines agree on; falsy, with the reason, if there is none.
+    """The direction that vertical lines agree on; falsy, with the reason, if there is none."""
 
-    Attributes:
-        up: (3,) unit vector.
-        count: number of segments that agree on it.
-        uncertainty_deg: standard deviation of the direction, from leaving out one view at a time, and 0.1° for what
-            all views have in common.
-        contrast: weight of agreeing segments relative to the median direction within 8°.
-        reason: why there is none; else "".
-    """
-
-    up: FloatArray
-    count: int = 0
+    up: FloatArray  # (3,) unit vector
+    count: int = 0  # number of segments that agree on it
+    # standard deviation of the direction, from leaving out one view at a time, and 0.1° for what all views have in
+    # common
     uncertainty_deg: float = float("nan")
-    contrast: float = 0.0
-    reason: str = ""
+    contrast: float = 0.0  # weight of agreeing segments relative to the median direction within 8°
+    reason: str = ""  # why there is none; else ""
 
     def __bool__(self) -> bool:
-        """Return whether there is such a direction."""
         return not self.reason
 
 
@@ -101,12 +76,12 @@ def find_segments(
         up: (3,) approximate up direction in the world; None: unknown, so that segments of all directions are returned.
     """
     names = [name for name in rotations if name in pictures]
-    chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), _MAX_PICTURES)).astype(int))
+    chosen = np.unique(np.linspace(0, max(0, len(names) - 1), min(len(names), 24)).astype(int))
     found: list[tuple[FloatArray, FloatArray]] = []
     for idx in chosen:
         rotation = rotations[names[idx]]
         image, valid = pictures[names[idx]]()
-        level_from_cam = np.eye(3) if up is None else rotation_from_two_vectors(rotation @ up, _UP)
+        level_from_cam = np.eye(3) if up is None else rotation_from_two_vectors(rotation @ up, UP)
         sides = CUBE_ROTATIONS if up is None else CUBE_ROTATIONS[:SIDES]
         for normals_in_cam, lengths in _in_panorama(image, valid, [side @ level_from_cam for side in sides]):
             found.append((normals_in_cam @ rotation, lengths))
@@ -132,7 +107,8 @@ def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
     tolerance_deg = _ROUNDS[-1][2]
     others = _support(segments, directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG), tolerance_deg)
     contrast = float(_support(segments, best[None], tolerance_deg)[0] / max(float(np.median(others)), 1e-12))
-    if contrast < _MIN_CONTRAST:
+    # Minimum ratio of the weight of agreeing segments to the median over all directions within 8°.
+    if contrast < 1.5:
         return VerticalLines(
             up, contrast=contrast, reason=f"the pictures have no clear vertical lines ({contrast:.1f})"
         )
@@ -157,7 +133,7 @@ def orthogonal_directions(segments: Segments) -> FloatArray | None:
         return None
     angles = np.deg2rad(np.arange(0.0, 90.0))
     across = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
-    across = across @ rotation_from_two_vectors(_UP, first.up).T
+    across = across @ rotation_from_two_vectors(UP, first.up).T
     along = np.cross(first.up, across)
     best = int(np.argmax(sum(_support(segments, each, tolerance_deg) for each in (across, along))))
     return np.array([first.up, across[best], along[best]])
@@ -181,7 +157,7 @@ def _in_panorama(
     image: NDArray[np.uint8], valid: NDArray[np.bool_], sides: Sequence[FloatArray]
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return normals in the camera frame (M, 3) and lengths (M,) of the segments in each view, by its rotation."""
-    small = _reduced(image, width=4 * _MAX_FACE_PX)
+    small = reduced_panorama(image, 4 * 512)
     mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
     size = max(16, small.shape[1] // 4)
     focal = size / 2 / np.tan(np.deg2rad(_FOV_DEG / 2))
@@ -196,7 +172,8 @@ def _in_view(image: NDArray[np.uint8], valid: NDArray[np.bool_], view: PinholeVi
     # OpenCV's pixels have their centres at whole numbers, ours at halves.
     found = cv2.createLineSegmentDetector().detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[0]
     ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64) + 0.5
-    ends = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= _MIN_LENGTH_SHARE * view.size_hw[0]]
+    # Segments shorter than this share of a face do not point anywhere exactly.
+    ends = ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= 0.06 * view.size_hw[0]]
     if len(ends) and not valid.all():
         along = ends[:, :1] + np.linspace(0, 1, 9)[None, :, None] * (ends[:, 1:] - ends[:, :1])
         columns, rows = np.clip(along.astype(int), 0, view.size_hw[0] - 1).transpose(2, 0, 1)
@@ -205,12 +182,6 @@ def _in_view(image: NDArray[np.uint8], valid: NDArray[np.bool_], view: PinholeVi
     normals = np.cross(rays[:, 0], rays[:, 1])
     sines = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / sines, np.arcsin(np.clip(sines[:, 0], 0, 1))
-
-
-def _reduced(image: NDArray[np.uint8], *, width: int) -> NDArray[np.uint8]:
-    if image.shape[1] <= width:
-        return image
-    return np.asarray(cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _support(segments: Segments, candidates: FloatArray, tolerance_deg: float) -> FloatArray:
@@ -229,7 +200,7 @@ def _refined(segments: Segments, up: FloatArray, contrast: float) -> VerticalLin
     groups = int(segments.groups.max()) + 1
     near = np.zeros(len(segments.weights), np.bool_)
     moments = np.zeros((groups, 3, 3))
-    for _ in range(_REFINEMENTS):
+    for _ in range(3):
         off = segments.normals @ up / tolerance
         near = np.abs(off) < 1
         weights = segments.weights * np.where(near, (1 - off**2) ** 2, 0.0)
@@ -241,13 +212,15 @@ def _refined(segments: Segments, up: FloatArray, contrast: float) -> VerticalLin
     if count < _MIN_SEGMENTS:
         return VerticalLines(up, count, contrast=contrast, reason=_few(count))
     spread = np.linalg.eigvalsh(moments.sum(axis=0))
-    if spread[1] < _MIN_SPREAD * spread[2]:
+    # The rest of the weight must not be in one plane: edges at one azimuth leave the tilt towards them unknown.
+    if spread[1] < 0.05 * spread[2]:
         return VerticalLines(up, count, contrast=contrast, reason="all vertical lines are in one direction")
     used = [number for number in range(groups) if moments[number].any()]
     without = np.array([_weakest(moments.sum(axis=0) - moments[number], up) for number in used])
     deviations = without - without.mean(axis=0)
     variance = (len(used) - 1) / len(used) * float((deviations**2).sum())
-    return VerticalLines(up, count, float(np.hypot(_BIAS_DEG, np.rad2deg(np.sqrt(variance)))), contrast)
+    # Rendered rooms: errors of 0.03° to 0.13°, whatever the number of lines.
+    return VerticalLines(up, count, float(np.hypot(0.1, np.rad2deg(np.sqrt(variance)))), contrast)
 
 
 def _weakest(moment: FloatArray, up: FloatArray) -> FloatArray:

@@ -16,36 +16,27 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-MIN_RATIOS = 6
+_MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
-_AGREEING, MIN_AGREEING = 1.25, 0.4
+_AGREEING, _MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
 _SHUFFLES = 50
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
-# Standard deviation of the direction that is assumed for a geometry without one.
-_ALTERNATIVE_STD_DEG = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """One of the geometries of a pair (i, j), i < j.
+    """One of the geometries of a pair (i, j), i < j."""
 
-    Attributes:
-        view: second_from_first with the matches that support it.
-        weight: grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false
-            geometry, and with their share of the matches of the pair's best geometry.
-        direction_std_deg: standard deviation of its direction.
-        unit_ranges: (2, M) ranges of its matches from either image, in units of its translation, NaN where not usable.
-        parallax_rad: (M,) angle between the rays of each match after de-rotation.
-    """
-
-    view: TwoView
+    view: TwoView  # second_from_first with the matches that support it
+    # grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false geometry,
+    # and with their share of the matches of the pair's best geometry
     weight: float
-    direction_std_deg: float
+    direction_std_deg: float  # standard deviation of its direction
+    # (2, M) ranges of its matches from either image, in units of its translation, NaN where not usable
     unit_ranges: FloatArray
-    parallax_rad: FloatArray
+    parallax_rad: FloatArray  # (M,) angle between the rays of each match after de-rotation
 
     @cached_property
     def parallax_deg(self) -> float:
@@ -66,11 +57,12 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
     for rank, geometry in enumerate((view, *view.alternatives)):
         p, q = bearings_first[geometry.matches_idx[:, 0]], bearings_second[geometry.matches_idx[:, 1]]
         ranges, parallax = unit_ranges(Rigid3(geometry.rotation, geometry.direction), p, q)
+        # Standard deviation of the direction that is assumed for a geometry without one.
         found.append(
             Geometry(
                 view=geometry,
                 weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
-                direction_std_deg=view.direction_std_deg if rank == 0 else _ALTERNATIVE_STD_DEG,
+                direction_std_deg=view.direction_std_deg if rank == 0 else 0.5,
                 unit_ranges=ranges,
                 parallax_rad=parallax,
             )
@@ -80,30 +72,19 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
 
 @dataclass(frozen=True, eq=False)
 class PairEvidence:
-    """The W geometries that join an image to registered images.
+    """The W geometries that join an image to registered images."""
 
-    Attributes:
-        partner: (W,) position of the registered image.
-        rank: (W,) rank of the geometry in its pair.
-        weight: (W,) weight of the geometry.
-        rotations: (W, 3, 3) rotation of cam_from_world of the image according to the geometry.
-        origins: (W, 3) centre of the partner in the world.
-        directions: (W, 3) unit vector from there to the image.
-        lengths: (W,) the distance at which points are at their known ranges; NaN if too few points determine it.
-        tolerance_rad: (W,) largest error of a direction.
-    """
-
-    partner: NDArray[np.intp]
-    rank: NDArray[np.intp]
-    weight: FloatArray
-    rotations: FloatArray
-    origins: FloatArray
-    directions: FloatArray
+    partner: NDArray[np.intp]  # (W,) position of the registered image
+    rank: NDArray[np.intp]  # (W,) rank of the geometry in its pair
+    weight: FloatArray  # (W,) weight of the geometry
+    rotations: FloatArray  # (W, 3, 3) rotation of cam_from_world of the image according to the geometry
+    origins: FloatArray  # (W, 3) centre of the partner in the world
+    directions: FloatArray  # (W, 3) unit vector from there to the image
+    # (W,) the distance at which points are at their known ranges; NaN if too few points determine it
     lengths: FloatArray
-    tolerance_rad: FloatArray
+    tolerance_rad: FloatArray  # (W,) largest error of a direction
 
     def __len__(self) -> int:
-        """Return the number of geometries."""
         return len(self.partner)
 
     @property
@@ -202,11 +183,11 @@ def _length(
     ratios = known_ranges / unit_ranges
     known = np.isfinite(ratios)
     ratios = ratios[known]
-    if len(ratios) < MIN_RATIOS:
+    if len(ratios) < _MIN_RATIOS:
         return np.nan
     length = estimate_scale(ratios, np.sin(parallax[known]) ** 2, estimator=estimator, kappa=kappa)
     agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
-    return length if agreeing >= max(MIN_RATIOS, MIN_AGREEING * len(ratios)) else np.nan
+    return length if agreeing >= max(_MIN_RATIOS, _MIN_AGREEING * len(ratios)) else np.nan
 
 
 def significant_length(
@@ -250,5 +231,5 @@ def unit_ranges(second_from_first: Rigid3, p: FloatArray, q: FloatArray) -> tupl
     ranges = np.stack(ranges_from_bearings(p, q, second_from_first))
     parallax = angle_between(p @ second_from_first.rotation.T, q)
     with np.errstate(invalid="ignore"):
-        usable = (ranges > 0).all(axis=0) & (parallax > _MIN_ANGLE_RAD)
+        usable = (ranges > 0).all(axis=0) & (parallax > float(np.deg2rad(1.0)))
     return np.where(usable, ranges, np.nan), parallax

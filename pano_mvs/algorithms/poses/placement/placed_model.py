@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
-from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
@@ -26,27 +27,18 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.5))
-_MAX_PARTNERS = 16
-
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs of a capture with all their geometries.
+    """The pairs of a capture with all their geometries."""
 
-    Attributes:
-        features: key points by image name, in the capture's order.
-        geometries: (i, j), i < j, to the geometries of the pair, the heaviest first.
-        estimator: how translation scale factors are estimated from the ratios of single features.
-        kappa: the paper's κ.
-        compared: (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without
-            success; None: all, without matches.
-    """
-
-    features: Mapping[str, Features]
-    geometries: Mapping[Edge, tuple[Geometry, ...]]
+    features: Mapping[str, Features]  # key points by image name, in the capture's order
+    geometries: Mapping[Edge, tuple[Geometry, ...]]  # (i, j), i < j, to the geometries of the pair, the heaviest first
+    # how translation scale factors are estimated from the ratios of single features
     estimator: ScaleEstimator = "cauchy"
-    kappa: float = 0.01
+    kappa: float = 0.01  # the paper's κ
+    # (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without success; None:
+    # all, without matches
     compared: Mapping[Edge, TwoView] | None = None
     names: tuple[str, ...] = field(init=False)
     bearings: tuple[FloatArray, ...] = field(init=False)
@@ -102,17 +94,12 @@ def pairs_of(
 
 @dataclass(eq=False)
 class PlacedModel:
-    """Registered cameras; the world frame is that of the first camera that was added.
+    """Registered cameras; the world frame is that of the first camera that was added."""
 
-    Attributes:
-        pairs: all pairs of the capture.
-        cameras: image position to cam_from_world.
-        chosen: pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such
-            a geometry are left out.
-    """
-
-    pairs: Pairs
-    cameras: dict[int, Rigid3] = field(default_factory=dict)
+    pairs: Pairs  # all pairs of the capture
+    cameras: dict[int, Rigid3] = field(default_factory=dict)  # image position to cam_from_world
+    # pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such a
+    # geometry are left out.
     chosen: dict[Edge, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -137,7 +124,7 @@ class PlacedModel:
     def evidence(self, image: int, partners: Sequence[int] | None = None) -> PairEvidence:
         """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
-            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
+            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:16]
         return gather_pair_evidence(
             image,
             partners,
@@ -231,28 +218,53 @@ class PlacedModel:
             cameras: False keeps the cameras fixed and only triangulates.
         """
         tracks, members = self.tracks()
-        model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
-        first = next(iter(self.cameras))
-        # The first camera stays fixed.
-        order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
-        model.cameras = {idx: self.cameras[members[idx]] for idx in order}
         if cameras:
-            model.adjust()
-            for idx, image in enumerate(members):
-                self.cameras[image] = model.cameras[idx]
-        else:
-            model.triangulate()
-        for image in members:
-            self._ranges[image][:] = np.nan
-            self._parallax[image][:] = 0
-        points = model.points_in_world[tracks.track_idx]
+            self._adjust_cameras(tracks, members)
+        points = self.triangulated(tracks, members).points_in_world[tracks.track_idx]
         known = np.isfinite(points[:, 0])
         centers = np.array([self.cameras[image].center for image in members])
         distances = np.linalg.norm(points - centers[tracks.image_idx], axis=1)
         for idx, image in enumerate(members):
             mine = known & (tracks.image_idx == idx)
+            self._ranges[image][:] = np.nan
+            self._parallax[image][:] = 0
             self._ranges[image][tracks.keypoint_idx[mine]] = distances[mine]
             self._parallax[image][tracks.keypoint_idx[mine]] = np.pi
+
+    def _adjust_cameras(self, tracks: Tracks, members: list[int]) -> None:
+        """Refine all cameras except the first by bundle adjustment with the points of the tracks."""
+        found = self.triangulated(tracks, members)
+        bundle = adjust_bundle(
+            Bundle(
+                rotations=np.array([self.cameras[image].rotation for image in members]),
+                centers=np.array([self.cameras[image].center for image in members]),
+                points=found.points_in_world[found.valid],
+                point_idx=(np.cumsum(found.valid) - 1)[tracks.track_idx[found.used]].astype(np.int32),
+                image_idx=tracks.image_idx[found.used],
+                bearings=tracks.bearings[found.used],
+            ),
+            loss="cauchy",
+            scale_rad=MAX_ERROR_RAD / 4,
+            max_iterations=20,
+            # Further steps are not needed: the finished model is refined anyway.
+            tolerance=1e-3,
+            fixed_camera=members.index(next(iter(self.cameras))),
+        )
+        for image, rotation, center in zip(members, bundle.rotations, bundle.centers, strict=True):
+            self.cameras[image] = Rigid3.from_center(rotation, center)
+
+    def triangulated(self, tracks: Tracks, members: list[int]) -> Triangulated:
+        """Return the points of the tracks of registered images, see `tracks`."""
+        rotations = np.array([self.cameras[image].rotation for image in members])
+        centers = np.array([self.cameras[image].center for image in members])
+        return triangulate_observations(
+            centers[tracks.image_idx],
+            np.einsum("nji,nj->ni", rotations[tracks.image_idx], tracks.bearings),
+            tracks.track_idx,
+            count=tracks.count,
+            max_error_rad=MAX_ERROR_RAD,
+            min_angle_rad=float(np.deg2rad(1.0)),
+        )
 
     def tracks(self) -> tuple[Tracks, list[int]]:
         """Return the tracks that the chosen geometries form among registered images, and the position of each image."""
@@ -326,7 +338,7 @@ class PlacedModel:
         ranges = ranges_from_bearings(p, q, relative)
         parallax = angle_between(p @ relative.rotation.T, q)
         with np.errstate(invalid="ignore"):
-            usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > _MIN_ANGLE_RAD)
+            usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > float(np.deg2rad(1.5)))
         usable &= view.residuals_rad < MAX_ERROR_RAD
         for image, keypoints, found in ((first, mine, ranges[0]), (second, theirs, ranges[1])):
             better = usable & (parallax > self._parallax[image][keypoints])

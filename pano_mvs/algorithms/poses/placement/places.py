@@ -11,30 +11,17 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence, best
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, nearest_rotation
 
-_MAX_TURN_RAD = float(np.deg2rad(2.0))
 _MAX_LENGTH_FACTOR = 1.25
-# A candidate from a single chain has the error of its length, so directions are compared with more tolerance at first.
-_LOOSE_RAD = float(np.deg2rad(3.0))
 _LENGTH_STD = 0.05
-_POLISHED = 6  # number of candidates that are refined
-_CROSSED = 8  # number of geometries without known length whose rays are intersected
-_MIN_CROSSING_SINE = float(np.sin(np.deg2rad(5.0)))
-_SAME_TURN_RAD, _SAME_PLACE = float(np.deg2rad(1.0)), 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A pose on which some of an image's pairs agree.
+    """A pose on which some of an image's pairs agree."""
 
-    Attributes:
-        cam_from_world: the pose.
-        explained: (W,) bool, the geometries that agree.
-        score: sum over the partners of the weight of their heaviest geometry that agrees.
-    """
-
-    cam_from_world: Rigid3
-    explained: NDArray[np.bool_]
-    score: float
+    cam_from_world: Rigid3  # the pose
+    explained: NDArray[np.bool_]  # (W,) bool, the geometries that agree
+    score: float  # sum over the partners of the weight of their heaviest geometry that agrees
 
 
 def placements(evidence: PairEvidence) -> list[Placement]:
@@ -50,11 +37,14 @@ def placements(evidence: PairEvidence) -> list[Placement]:
     rotations, centers = _candidates(evidence)
     if not len(centers):
         return []
-    agree = agreement(evidence, rotations, centers, loose_rad=_LOOSE_RAD)
+    # A candidate from a single chain has the error of its length, so directions are compared with more tolerance at
+    # first.
+    agree = agreement(evidence, rotations, centers, loose_rad=float(np.deg2rad(3.0)))
     scores = best_by_partner(evidence.partner, agree * evidence.weight)
     found: list[Placement] = []
     for idx in np.argsort(-scores, kind="stable"):
-        if len(found) == _POLISHED:
+        # Number of candidates that are refined.
+        if len(found) == 6:
             break
         pose = _refined(evidence, agree[idx], centers[idx])
         if any(_same(pose, other.cam_from_world, evidence) for other in found):
@@ -97,7 +87,7 @@ def agreement(
         stretch = np.abs(np.log(distances / evidence.lengths))
     fits = np.isnan(evidence.lengths) | (stretch < np.log(_MAX_LENGTH_FACTOR))
     agrees: NDArray[np.bool_] = (
-        (angles < evidence.tolerance_rad + loose_rad) & (turned < _MAX_TURN_RAD) & fits & (distances > 0)
+        (angles < evidence.tolerance_rad + loose_rad) & (turned < float(np.deg2rad(2.0))) & fits & (distances > 0)
     )
     return agrees
 
@@ -109,7 +99,8 @@ def _candidates(evidence: PairEvidence) -> tuple[FloatArray, FloatArray]:
     centers = [evidence.origins[known] + evidence.lengths[known, None] * evidence.directions[known]]
     open_ended = np.flatnonzero(np.isnan(evidence.lengths))
     if len(open_ended):
-        heaviest = np.argsort(-evidence.weight, kind="stable")[:_CROSSED]
+        # Number of geometries without known length whose rays are intersected.
+        heaviest = np.argsort(-evidence.weight, kind="stable")[:8]
         for a in heaviest:
             for b in heaviest:
                 if evidence.partner[a] < evidence.partner[b] and (a in open_ended or b in open_ended):
@@ -126,7 +117,7 @@ def _crossing(evidence: PairEvidence, a: np.intp, b: np.intp) -> FloatArray | No
     gap = evidence.origins[b] - evidence.origins[a]
     normal = np.cross(u, v)
     squared = float(normal @ normal)
-    if squared < _MIN_CROSSING_SINE**2:
+    if squared < float(np.sin(np.deg2rad(5.0))) ** 2:
         return None
     along_u, along_v = float(np.cross(gap, v) @ normal) / squared, float(np.cross(gap, u) @ normal) / squared
     if along_u <= 0 or along_v <= 0:
@@ -162,4 +153,4 @@ def _same(pose: Rigid3, other: Rigid3, evidence: PairEvidence) -> bool:
     nearest = float(np.median(np.linalg.norm(pose.center - evidence.origins, axis=1)))
     cosine = (float(np.sum(pose.rotation * other.rotation)) - 1) / 2
     turned = float(np.arccos(np.clip(cosine, -1, 1)))
-    return turned < _SAME_TURN_RAD and float(np.linalg.norm(pose.center - other.center)) < _SAME_PLACE * nearest
+    return turned < float(np.deg2rad(1.0)) and float(np.linalg.norm(pose.center - other.center)) < 0.03 * nearest

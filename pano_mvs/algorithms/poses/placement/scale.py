@@ -11,8 +11,6 @@ from pano_mvs.core.errors import UsageError
 
 ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
 
-_CAUCHY_STEPS, _CONVERGED = 20, 1e-7
-
 
 def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
     """Estimate one scale factor from the ratios of single features.
@@ -32,28 +30,25 @@ def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleE
     if len(ratios) == 0 or not np.all(ratios > 0):
         raise UsageError("a scale factor needs at least one ratio, all positive")
     if estimator == "kappa":
-        return _most_neighbours(ratios, kappa)
+        ordered = np.sort(ratios)
+        first, end = np.searchsorted(ordered, ordered - kappa), np.searchsorted(ordered, ordered + kappa, "right")
+        neighbours = end - first
+        # Of several ratios with equally many neighbours take the middle one, so that no end of the range is preferred.
+        best = np.flatnonzero(neighbours == neighbours.max())
+        return float(ordered[best[len(best) // 2]])
     logs = np.log(ratios)
     center = float(np.median(logs))
     return float(np.exp(center if estimator == "log_median" else _cauchy_center(logs, weights, center)))
 
 
-def _most_neighbours(ratios: FloatArray, kappa: float) -> float:
-    ordered = np.sort(ratios)
-    neighbours = np.searchsorted(ordered, ordered + kappa, "right") - np.searchsorted(ordered, ordered - kappa, "left")
-    # Of several ratios with equally many neighbours take the middle one, so that no end of the range is preferred.
-    best = np.flatnonzero(neighbours == neighbours.max())
-    return float(ordered[best[len(best) // 2]])
-
-
 def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> float:
     spread = np.sqrt(weights / _median(weights))
-    for _ in range(_CAUCHY_STEPS):
+    for _ in range(20):
         deviations = (logs - center) * spread
         scale = max(1.4826 * _median(np.abs(deviations)), 1e-9)
         robust = weights / (1 + (deviations / (2 * scale)) ** 2)
         moved = float(np.sum(robust * logs) / np.sum(robust))
-        if abs(moved - center) < _CONVERGED:
+        if abs(moved - center) < 1e-7:
             break
         center = moved
     return center

@@ -14,18 +14,15 @@ from pano_mvs.scene import TwoView
 Edge = tuple[int, int]
 
 
-def consistent_edges(
-    names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView], *, max_loop_deg: float = 3.0
-) -> dict[Edge, TwoView]:
+def consistent_edges(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:
     """Return the pairs with a general geometry whose rotations are consistent with the pairs around them.
 
-    The three rotations around a triangle of images must cancel (Zach et al. 2010). While any triangle does not close,
-    remove the pair with the largest share of such triangles; of equals, the one with fewest matches.
+    The three rotations around a triangle of images must cancel to 3° (Zach et al. 2010). While any triangle does not
+    close, remove the pair with the largest share of such triangles; of equals, the one with fewest matches.
 
     Args:
         names: image names in the capture's order.
         two_views: verified pairs, in either order of names.
-        max_loop_deg: largest residual rotation around a triangle.
 
     Returns:
         (first, second) positions in `names`, first < second, to the geometry second_from_first.
@@ -33,7 +30,7 @@ def consistent_edges(
     edges = {edge: view for edge, view in views_by_position(names, two_views).items() if view}
     keys = list(edges)
     triangles = _triangles(keys)
-    closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(max_loop_deg)
+    closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(3.0)
     sizes = np.array([len(view) for view in edges.values()])
     of_edge = _triangles_of_edges(triangles, len(keys))
     good, bad = (np.bincount(triangles[which].ravel(), minlength=len(keys)) for which in (closes, ~closes))
@@ -65,13 +62,6 @@ def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
         left -= group
         groups.append(sorted(group))
     return sorted(groups, key=lambda group: (-len(group), group[0]))
-
-
-def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rigid3:
-    """Return second_from_first of an edge, with a translation of length 1, for either order of the images."""
-    if (first, second) in edges:
-        return Rigid3(edges[first, second].rotation, edges[first, second].direction)
-    return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
 
 
 def views_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:

@@ -20,42 +20,24 @@ from pano_mvs.geometry import Rigid3, geodesic_angle, nearest_rotation
 FloatArray = NDArray[np.float64]
 
 _MAX_TURN_RAD = float(np.deg2rad(3.0))
-# A move shorter than this share of the pair's distance is an error, not another place.
-_MIN_MOVE = 0.05
-# Moves are the same if they differ by less than this share of their length and of the usual distance between cameras.
-_SAME_MOVE, _SAME_PLACE = 0.06, 0.02
-_MIN_PAIRS, _MIN_PAIR_SHARE = 3, 0.1
 # A motion that rotates a block by more than this has six degrees of freedom; two pairs hardly agree on it by chance.
 _MIN_TURN_RAD = float(np.deg2rad(20.0))
 _MIN_TURNED_PAIRS = 2
-_SAME_TURNED_PLACE = 0.1  # share of the move and of the usual distance between cameras
-_MAX_ALIASES, _ATTEMPTS = 2, 6
-# Weight of a pair that agrees with the current arrangement against separating its images.
-_HELD = 0.1
-_LABELLINGS = 2
-_STARTS = 50
 # If very many motions are suggested, only the heaviest are compared with one another.
 _MAX_MOVES, _MAX_TURNED = 1500, 60
 
 
 @dataclass(frozen=True, eq=False)
 class Alias:
-    """A motion that runner-up geometries of several pairs suggest alike.
+    """A motion that runner-up geometries of several pairs suggest alike."""
 
-    Attributes:
-        move: (3,) in the world, after the rotation about the origin.
-        support: weight of the pairs that suggest it.
-        signed_weights: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move
-            relative to i, negative if by its inverse.
-        turn: (3, 3) rotation of the world, usually the identity.
-        own_inverse: whether the motion is its own inverse, like a half turn.
-    """
-
-    move: FloatArray
-    support: float
+    move: FloatArray  # (3,) in the world, after the rotation about the origin
+    support: float  # weight of the pairs that suggest it
+    # (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move relative to i,
+    # negative if by its inverse
     signed_weights: dict[Edge, float]
-    turn: FloatArray = field(default_factory=lambda: np.eye(3))
-    own_inverse: bool = False
+    turn: FloatArray = field(default_factory=lambda: np.eye(3))  # (3, 3) rotation of the world, usually the identity
+    own_inverse: bool = False  # whether the motion is its own inverse, like a half turn
 
     def motion(self, *, inverse: bool = False) -> Rigid3:
         """Return the motion of a block, or its inverse."""
@@ -94,14 +76,16 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
         return []
     lengths = np.linalg.norm(moves, axis=1)
     spread = float(np.median(lengths))
-    tolerance = _SAME_MOVE * lengths + _SAME_PLACE * spread
+    # Moves are the same if they differ by less than this share of their length and of the usual distance between
+    # cameras.
+    tolerance = 0.06 * lengths + 0.02 * spread
     apart = np.linalg.norm(moves[:, None] - moves[None], axis=2)
     opposite = np.linalg.norm(moves[:, None] + moves[None], axis=2)
     near = np.minimum(apart, opposite) < tolerance[:, None]
     left = np.ones(len(edges), np.bool_)
     found: list[Alias] = []
-    for _ in range(_ATTEMPTS):
-        if not left.any() or len(found) == _MAX_ALIASES:
+    for _ in range(6):
+        if not left.any() or len(found) == 2:
             break
         signed_weights = [
             _signed_weights(edges, weights, apart[row] <= opposite[row], near=near[row] & left)
@@ -112,7 +96,7 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
         members = np.flatnonzero(near[best] & left)
         left[members] = False
         left[best] = False
-        if len(signed_weights[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
+        if len(signed_weights[best]) < max(3, 0.1 * len(model.chosen)):
             continue
         signs = np.where(apart[best, members] <= opposite[best, members], 1.0, -1.0)
         move = np.average(moves[members] * signs[:, None], axis=0, weights=weights[members])
@@ -160,7 +144,8 @@ def _same_motion(motion: Rigid3, other: _Suggestion, spread: float) -> bool:
     apart = float(np.linalg.norm(motion.apply(other.center) - other.motion.apply(other.center)))
     length = float(np.linalg.norm(other.displacement))
     turned = float(geodesic_angle(motion.rotation, other.motion.rotation))
-    return turned < _MAX_TURN_RAD and apart < _SAME_TURNED_PLACE * (length + spread)
+    # Share of the move and of the usual distance between cameras.
+    return turned < _MAX_TURN_RAD and apart < 0.1 * (length + spread)
 
 
 def _angle(motion: Rigid3) -> float:
@@ -179,7 +164,8 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
     # gain[a, b]: the gain from moving b while a stays.
     gain = np.zeros((len(images), len(images)))
     for (i, j), rank in model.chosen.items():
-        held = _HELD * model.pairs.geometries[i, j][rank].weight
+        # Weight of a pair that agrees with the current arrangement against separating its images.
+        held = 0.1 * model.pairs.geometries[i, j][rank].weight
         gain[place[i], place[j]] -= held
         gain[place[j], place[i]] -= held
     for (i, j), signed in alias.signed_weights.items():
@@ -187,14 +173,14 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
         gain[place[a], place[b]] += abs(signed)
         gain[place[b], place[a]] += abs(signed) if alias.own_inverse else -abs(signed)
     found: dict[tuple[int, ...], float] = {}
-    for (i, j), signed in sorted(alias.signed_weights.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
+    for (i, j), signed in sorted(alias.signed_weights.items(), key=lambda item: (-abs(item[1]), item[0]))[:50]:
         a, b = (place[i], place[j]) if signed > 0 else (place[j], place[i])
         labels = np.zeros(len(images), np.intp)
         labels[b] = 1
         labels, score = _improved(gain, labels, kept=(a, b))
         if score > 0:
             found[tuple(labels.tolist())] = score
-    best = sorted(found, key=lambda labels: (-found[labels], labels))[:_LABELLINGS]
+    best = sorted(found, key=lambda labels: (-found[labels], labels))[:2]
     best += [labels for labels in _best_cut(gain) if labels not in best]
     return [dict(zip(images, labels, strict=True)) for labels in best]
 
@@ -231,7 +217,8 @@ def _suggestions(model: PlacedModel) -> list[_Suggestion]:
                 turn = pair_evidence.rotations[idx].T @ here.rotation
                 motion = Rigid3(turn, there - turn @ here.center)
                 displacement = sign * (there - here.center)
-                if float(np.linalg.norm(displacement)) > _MIN_MOVE * distance or _angle(motion) > _MIN_TURN_RAD:
+                # A move shorter than this share of the pair's distance is an error, not another place.
+                if float(np.linalg.norm(displacement)) > 0.05 * distance or _angle(motion) > _MIN_TURN_RAD:
                     motion = motion if sign > 0 else motion.inverse()
                     center = model.cameras[j].center
                     suggestions.append(

@@ -19,29 +19,15 @@ from pano_mvs.algorithms.poses.verification.contradictions import contradicted_p
 from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
-# A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
-_SUSPICIOUS = 0.75
-# Another pose is used if it is better by this factor and by this difference.
-_BETTER, _MARGIN = 1.15, 0.03
 # If no more than this can be expected to be confirmed, nothing can be concluded.
 _MIN_EXPECTED = 0.1
-_NEIGHBOURS = 6
-# With this many cameras or more, the first pass uses shared sweeps; a second one follows below this expected share.
-_MANY, _SECOND_LOOK = 8, 0.9
-_ALTERNATIVES = 4
-_MIN_SCORE = 0.2  # minimum share of the best placement's score by matches, for a pose to be tried at all
-_ROUNDS = 3
 _BLOCK_ROUNDS = 2
-# A block is moved if the images around the cut confirm this much more. If a first choice of the block loses no more
-# than this, similar blocks are tried.
-_MIN_BLOCK_GAIN, _PROMISING_GAIN = 0.05, -0.1
 # If the images would confirm hardly less than now, the arrangement is ambiguous.
 _AMBIGUOUS_GAIN = -0.2
 # If almost every pair of images would agree with the same motion, the place is periodic throughout.
 _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
-_NAMED, _NAMED_TURN_DEG = 4, 5.0
+_NAMED = 4
 _FLIPPED = 3
-_ASKED = 6
 # Exponent of the share of explained pairs relative to the share of confirmed texture.
 PAIRS_POWER = 0.25
 _HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or more; below it no more images are consulted
@@ -49,25 +35,17 @@ _HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or mor
 
 @dataclass(eq=False)
 class CameraChecks:
-    """Evidence of the images for or against the cameras of a model.
+    """Evidence of the images for or against the cameras of a model."""
 
-    Attributes:
-        shares: image position to the confirmed share of its textured pixels; NaN if too little can be judged.
-        expected: image position to the share that its neighbours suggest; NaN likewise.
-        moved: images that were moved to another pose.
-        p_right: image position to the probability that its pose is right.
-        doubts: images with a doubtful pose, with the reason.
-        removed: images that were removed from the model, with the reason.
-        asked: whether the images were consulted.
-    """
-
+    # image position to the confirmed share of its textured pixels; NaN if too little can be judged
     shares: dict[int, float] = field(default_factory=dict)
+    # image position to the share that its neighbours suggest; NaN likewise
     expected: dict[int, float] = field(default_factory=dict)
-    moved: set[int] = field(default_factory=set)
-    p_right: dict[int, float] = field(default_factory=dict)
-    doubts: dict[int, str] = field(default_factory=dict)
-    removed: dict[int, str] = field(default_factory=dict)
-    asked: bool = True
+    moved: set[int] = field(default_factory=set)  # images that were moved to another pose
+    p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
+    doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
+    removed: dict[int, str] = field(default_factory=dict)  # images that were removed from the model, with the reason
+    asked: bool = True  # whether the images were consulted
 
 
 def correct_cameras(
@@ -88,7 +66,7 @@ def correct_cameras(
     ambiguity = ""
     if not fixed:
         found.moved, ambiguity = _unshift_blocks(model, confirmation)
-    for _ in range(_ROUNDS):
+    for _ in range(3):
         _judge(model, confirmation, found)
         suspects = _suspects(found)
         trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
@@ -128,9 +106,11 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if not moves:
             break
         gain, alias, labels = max(moves, key=lambda found: found.gain)
-        if gain > _PROMISING_GAIN and remaining:
+        # A block is moved if the images around the cut confirm this much more. If a first choice of the block loses no
+        # more than this, similar blocks are tried.
+        if gain > -0.1 and remaining:
             labels, gain = _with_better_labels(model, alias, labels, gain=gain, confirmation=confirmation)
-        if gain <= _MIN_BLOCK_GAIN or not remaining:
+        if gain <= 0.05 or not remaining:
             periodic = len(alias.signed_weights) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
             if gain > limit:
@@ -144,17 +124,11 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
 
 
 class BlockMove(NamedTuple):
-    """A block of cameras that an alias may have moved.
+    """A block of cameras that an alias may have moved."""
 
-    Attributes:
-        gain: relative gain in agreement of images and pairs if the block is moved.
-        alias: the motion.
-        labels: image position to 1 for the images of the block, 0 for the others.
-    """
-
-    gain: float
-    alias: Alias
-    labels: dict[int, int]
+    gain: float  # relative gain in agreement of images and pairs if the block is moved
+    alias: Alias  # the motion
+    labels: dict[int, int]  # image position to 1 for the images of the block, 0 for the others
 
 
 def block_moves(model: PlacedModel, confirmation: Confirmation) -> list[BlockMove]:
@@ -202,7 +176,7 @@ def _turned_ambiguity(alias: Alias) -> str:
 def _turn_deg(alias: Alias) -> float:
     """Return the angle by which an alias rotates a block; 0 if it only translates it."""
     turn_deg = float(np.rad2deg(geodesic_angle(alias.turn, np.eye(3))))
-    return turn_deg if turn_deg > _NAMED_TURN_DEG else 0.0
+    return turn_deg if turn_deg > 5.0 else 0.0
 
 
 def _with_better_labels(
@@ -241,7 +215,7 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], *, confir
             for idx in nearest_cameras(poses[image], {k: pose for k, pose in poses.items() if k != image})
         }
         crossing[image] = sum(labels[idx] != labels[image] for idx in around)
-    asked = sorted((image for image in crossing if crossing[image]), key=lambda idx: (-crossing[idx], idx))[:_ASKED]
+    asked = sorted((image for image in crossing if crossing[image]), key=lambda idx: (-crossing[idx], idx))[:6]
     before = after = gain = 0.0
     for number, image in enumerate(asked):
         before += float(np.nan_to_num(confirmation.share(image, model.cameras[image], model.cameras)))
@@ -270,15 +244,14 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
     In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
     again by sweeps of their neighbours without them.
     """
-    shared = len(model.cameras) >= _MANY
+    # With this many cameras or more, the first pass uses shared sweeps; a second one follows below this expected share.
+    shared = len(model.cameras) >= 8
     evidence = {
         image: confirmation.evidence(image, pose, model.cameras, independent=not shared)
         for image, pose in sorted(model.cameras.items())
     }
     neighbours = {
-        image: nearest_cameras(
-            pose, {idx: camera for idx, camera in model.cameras.items() if idx != image}, count=_NEIGHBOURS
-        )
+        image: nearest_cameras(pose, {idx: camera for idx, camera in model.cameras.items() if idx != image}, count=6)
         for image, pose in model.cameras.items()
     }
 
@@ -286,7 +259,7 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
         return evidence[image].expected_share([evidence[idx] for idx in neighbours[image]])
 
     if shared:
-        doubted = [image for image in evidence if evidence[image].share < _SECOND_LOOK * expected_of(image)]
+        doubted = [image for image in evidence if evidence[image].share < 0.9 * expected_of(image)]
         for image in doubted:
             evidence[image] = confirmation.evidence(image, model.cameras[image], model.cameras)
     found.shares = {image: own.share for image, own in evidence.items()}
@@ -296,8 +269,9 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
 def _suspects(found: CameraChecks) -> list[int]:
     """Return the images that confirm much less than expected, worst first."""
     ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
+    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
     return sorted(
-        (image for image, ratio in ratios.items() if ratio < _SUSPICIOUS and found.expected[image] > _MIN_EXPECTED),
+        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > _MIN_EXPECTED),
         key=lambda image: (ratios[image], image),
     )
 
@@ -310,7 +284,8 @@ def _better_place(
     if len(cameras) < 2:
         return None
     here = confirmation.share(image, model.cameras[image], cameras)
-    best, best_share = None, max(_BETTER * here, here + _MARGIN)
+    # Another pose is used if it is better by this factor and by this difference.
+    best, best_share = None, max(1.15 * here, here + 0.03)
     for pose in _alternatives(model, image, cameras):
         share = confirmation.share(image, pose, cameras)
         if share > best_share:
@@ -324,8 +299,9 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
     without.cameras = dict(cameras)
     pair_evidence, places = without.place(image)
     poses = []
-    for place in places[:_ALTERNATIVES]:
-        if place.score < _MIN_SCORE * places[0].score:
+    for place in places[:4]:
+        # Minimum share of the best placement's score by matches, for a pose to be tried at all.
+        if place.score < 0.2 * places[0].score:
             continue
         pose, support, known = without.polished(image, pair_evidence, place)
         if support >= points_needed(known):

@@ -25,9 +25,6 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 WIDTH_PX = 256
 _SETTINGS = SURFACE_SETTINGS.replace(planes=64, spacing="inverse")
 _SOURCES = 4
-# In units of the median baseline. A near limit from the longest one would lose the foreground if one source is far
-# away.
-_NEAREST_BASELINES = 0.15
 # With less textured area than this share of the sphere, nothing can be concluded about a pose.
 MIN_TEXTURED = 0.05
 # Maps kept for an image with the same sources; relative poses that differ by less than this give the same map.
@@ -39,36 +36,21 @@ _CLASSES = len(_PARALLAX_EDGES_DEG)
 _PRIOR = 0.05
 
 
-# When other maps confirm a pixel; the last one is in pixels.
-_MAX_RELATIVE_ERROR, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 0.5, 0.05
-
-
 @dataclass(frozen=True, eq=False)
 class _Small:
-    """A panorama at 256 columns.
+    """A panorama at 256 columns."""
 
-    Attributes:
-        image: (128, 256, 3) uint8.
-        mask: (128, 256) bool, False is ignored.
-        textured: (128, 256) bool, True where there is texture to match.
-    """
-
-    image: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
-    textured: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (128, 256, 3) uint8
+    mask: NDArray[np.bool_]  # (128, 256) bool, False is ignored
+    textured: NDArray[np.bool_]  # (128, 256) bool, True where there is texture to match
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How much of what an image sees other images confirm, by parallax.
+    """How much of what an image sees other images confirm, by parallax."""
 
-    Attributes:
-        textured: (B,) solid angle of the textured pixels in each parallax class.
-        confirmed: (B,) solid angle of the pixels that other images confirm.
-    """
-
-    textured: NDArray[np.float64]
-    confirmed: NDArray[np.float64]
+    textured: NDArray[np.float64]  # (B,) solid angle of the textured pixels in each parallax class
+    confirmed: NDArray[np.float64]  # (B,) solid angle of the pixels that other images confirm
 
     @property
     def share(self) -> float:
@@ -196,11 +178,13 @@ class Confirmation:
     def _sweep(self, image: int, sources: Sequence[int], relative: Sequence[Rigid3]) -> RangeMap:
         small = self.small(image)
         baselines = [float(np.linalg.norm(to.translation)) for to in relative]
+        # In units of the median baseline. A near limit from the longest one would lose the foreground if one source is
+        # far away.
         return sweep_range(
             small.image,
             [self.small(idx).image for idx in sources],
             relative,
-            near=_NEAREST_BASELINES * float(np.median(baselines)),
+            near=0.15 * float(np.median(baselines)),
             far=range_limits(baselines, width=4 * WIDTH_PX)[1],
             settings=_SETTINGS,
             reference_mask=small.mask,
@@ -213,15 +197,16 @@ def _confirmed(
 ) -> NDArray[np.bool_]:
     """Return the pixels of a small map that the maps of its sources confirm."""
     px_rad = 2 * np.pi / own.range.shape[1]
+    # When other maps confirm a pixel; the last one is in pixels.
     return consistent_pixels(
         own,
         pose,
         maps,
         source_poses=source_poses,
-        max_relative_error=_MAX_RELATIVE_ERROR,
+        max_relative_error=0.05,
         max_angle_rad=px_rad,
-        min_support=_MIN_SUPPORT,
-        min_motion_rad=_MIN_MOTION_PX * px_rad,
+        min_support=0.5,
+        min_motion_rad=0.05 * px_rad,
     )[0]
 
 

@@ -17,32 +17,19 @@ from scipy.sparse import coo_array, csr_array
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.geometry import angle_between, geodesic_angle
-from pano_mvs.scene import TwoView
 
 MAX_CONTRADICTED = 0.3
 """Greatest share of the significance of the pairs across a cut that may contradict the cameras. Of 34 groups of a real
 tour and seven rendered houses, none of the 28 right ones has such a cut, and three of the six others do, from .42."""
 
-_SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(3.0)), float(np.deg2rad(10.0))
-_MOST = 200.0  # −log₁₀ of the false alarms that one pair counts at most
-_STARTS = 20
-# Where the images confirm more than this share of the texture, matches that contradict a part come from what repeats.
-_MOSTLY_CONFIRMED = 0.5
-
 
 @dataclass(frozen=True)
 class ContradictedPart:
-    """A part of a model, no larger than the rest, whose place verified pairs contradict.
+    """A part of a model, no larger than the rest, whose place verified pairs contradict."""
 
-    Attributes:
-        images: of the part; all images of the model if both sides of the cut are equally large.
-        share: of the significance of all verified pairs across the cut, that of those that contradict the cameras.
-        pair: the most significant pair that contradicts.
-    """
-
-    images: tuple[int, ...]
-    share: float
-    pair: Edge
+    images: tuple[int, ...]  # of the part; all images of the model if both sides of the cut are equally large
+    share: float  # of the significance of all verified pairs across the cut, that of those that contradict the cameras
+    pair: Edge  # the most significant pair that contradicts
 
 
 def contradicted_parts(
@@ -60,7 +47,9 @@ def contradicted_parts(
     left = set(model.cameras)
     found = []
     while (part := _most_contradicted(significance, left, more_than)) is not None:
-        if np.nan_to_num([shares.get(image, np.nan) for image in part.images]).mean() <= _MOSTLY_CONFIRMED:
+        # Where the images confirm more than this share of the texture, matches that contradict a part come from what
+        # repeats.
+        if np.nan_to_num([shares.get(image, np.nan) for image in part.images]).mean() <= 0.5:
             found.append(part)
         left -= {*part.images}
     return found
@@ -77,19 +66,16 @@ def _significance(model: PlacedModel) -> dict[Edge, tuple[float, float]]:
         if view and model.cameras.keys() >= {*edge}:
             matches = {True: 0, False: 0}
             for one in (view, *view.alternatives):
-                agrees = _agrees(model, edge, one)
+                relative = model.cameras[edge[1]] @ model.cameras[edge[0]].inverse()
+                agrees = bool(
+                    geodesic_angle(one.rotation, relative.rotation) < float(np.deg2rad(3.0))
+                    and angle_between(one.direction, relative.translation) < float(np.deg2rad(10.0))
+                )
                 matches[agrees] = max(matches[agrees], len(one))
-            margin = min(-view.log10_false_alarms, _MOST) * (matches[True] - matches[False]) / max(matches.values())
+            # −log₁₀ of the false alarms that one pair counts at most
+            margin = min(-view.log10_false_alarms, 200.0) * (matches[True] - matches[False]) / max(matches.values())
             found[edge] = max(margin, 0.0), max(-margin, 0.0)
     return found
-
-
-def _agrees(model: PlacedModel, edge: Edge, view: TwoView) -> bool:
-    relative = model.cameras[edge[1]] @ model.cameras[edge[0]].inverse()
-    return bool(
-        geodesic_angle(view.rotation, relative.rotation) < _SAME_TURN_RAD
-        and angle_between(view.direction, relative.translation) < _SAME_DIRECTION_RAD
-    )
 
 
 def _most_contradicted(
@@ -105,7 +91,7 @@ def _most_contradicted(
     agreeing, against = np.array([significance[edge] for edge in edges]).T
     gains = (1 - more_than) * against - more_than * agreeing
     graph = csr_array(coo_array((np.tile(gains, 2), np.concatenate([ends, ends[::-1]], axis=1)), (len(members),) * 2))
-    heaviest = [idx for idx in np.argsort(-against, kind="stable")[:_STARTS] if against[idx] > 0]
+    heaviest = [idx for idx in np.argsort(-against, kind="stable")[:20] if against[idx] > 0]
     cuts = [_best_cut(graph, start) for start in dict.fromkeys(ends[:, heaviest].T.ravel().tolist())]
     scores = [float(gains[sides[ends[0]] != sides[ends[1]]].sum()) for sides in cuts]
     if not scores or max(scores) <= 0:

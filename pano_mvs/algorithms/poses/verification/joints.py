@@ -19,24 +19,17 @@ from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_gri
 
 FloatArray = NDArray[np.float64]
 
-_LINKED = 30  # two pairs of an image that share this many key points have a common scale
 _CAMERAS, _PARTNERS = 3, 2  # cameras of a part that are compared, the nearest to the other part; partners of each
-_SAME_RANGE, _BEYOND = 0.1, 1.2
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Two parts of a model that meet.
+    """Two parts of a model that meet."""
 
-    Attributes:
-        parts: images of either part.
-        matches: number of matches between them with which their cameras agree.
-        contradicting: solid angle in which one part looks through a surface of the other one, relative to all in which
-            both see one; NaN if a part has one camera only, or if they see nothing in common.
-    """
-
-    parts: tuple[tuple[int, ...], tuple[int, ...]]
-    matches: int
+    parts: tuple[tuple[int, ...], tuple[int, ...]]  # images of either part
+    matches: int  # number of matches between them with which their cameras agree
+    # solid angle in which one part looks through a surface of the other one, relative to all in which both see one; NaN
+    # if a part has one camera only, or if they see nothing in common
     contradicting: float
 
 
@@ -80,7 +73,8 @@ def linked_parts(model: PlacedModel) -> list[list[int]]:
                 images = {*one, *other}
                 if len({label[idx] for idx in images}) > 1:
                     shared = np.intersect1d(mine[one], mine[other], assume_unique=True)
-                    if len(shared) >= _LINKED:
+                    # Two pairs of an image that share this many key points have a common scale.
+                    if len(shared) >= 30:
                         union(images)
     for edge in sorted(views, key=lambda edge: (-len(views[edge]), edge)):
         alone = [sum(one == label[image] for one in label.values()) == 1 for image in edge]
@@ -151,9 +145,9 @@ def _compared(
     x, y = pixels[..., 0] % width, pixels[..., 1].clip(0, height - 1)
     around = np.stack([other[(y + dy).clip(0, height - 1), (x + dx) % width] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     with np.errstate(invalid="ignore"):
-        agrees = known & (np.abs(around / distances - 1) < _SAME_RANGE).any(axis=0)
+        agrees = known & (np.abs(around / distances - 1) < 0.1).any(axis=0)
         nearest = np.where(np.isfinite(around), around, np.inf).min(axis=0)
-        contradicts = known & np.isfinite(other[y, x]) & (nearest > _BEYOND * distances)
+        contradicts = known & np.isfinite(other[y, x]) & (nearest > 1.2 * distances)
     return agrees, contradicts & ~agrees
 
 

@@ -12,13 +12,7 @@ from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-# A pair is ambiguous if its second geometry has more than this share of the first one's weight.
-_RIVAL = 0.25
 _MIN_AMBIGUOUS = 1 / 3
-_ASKED_PARTNERS = 6
-# Factor on the weight of an ambiguous pair that is not checked because other pairs suffice.
-_UNDECIDED = 0.3
-_SHARPNESS = 3
 
 
 def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
@@ -40,7 +34,7 @@ def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
     asked = {
         (min(image, partner), max(image, partner))
         for image, partners in enumerate(pairs.partners)
-        for partner in partners[:_ASKED_PARTNERS]
+        for partner in partners[:6]
     }
     geometries: dict[Edge, tuple[Geometry, ...]] = {}
     for edge, found in pairs.geometries.items():
@@ -49,13 +43,15 @@ def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
         elif edge in asked:
             geometries[edge] = _weighed(edge, found, confirmation)
         else:
-            geometries[edge] = tuple(replace(one, weight=_UNDECIDED * one.weight) for one in found)
+            # Factor on the weight of an ambiguous pair that is not checked because other pairs suffice.
+            geometries[edge] = tuple(replace(one, weight=0.3 * one.weight) for one in found)
     return Pairs(pairs.features, geometries, pairs.estimator, pairs.kappa, pairs.compared)
 
 
 def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
     """Return whether the second geometry of a pair is a rival of the first."""
-    return len(found) > 1 and found[1].weight > _RIVAL * found[0].weight
+    # A pair is ambiguous if its second geometry has more than this share of the first one's weight.
+    return len(found) > 1 and found[1].weight > 0.25 * found[0].weight
 
 
 def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> list[float]:
@@ -78,7 +74,7 @@ def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation
     weighed = [
         # The best geometry by the images gets the weight of the best one by matches: its number of matches says little
         # here.
-        replace(one, weight=max(one.weight, heaviest * share / most) * (share / most) ** _SHARPNESS)
+        replace(one, weight=max(one.weight, heaviest * share / most) * (share / most) ** 3)
         for one, share in zip(found, shares, strict=True)
     ]
     return tuple(sorted(weighed, key=lambda one: -one.weight))

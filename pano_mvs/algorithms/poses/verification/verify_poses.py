@@ -17,8 +17,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
-_MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
-
 
 @checks_settings
 def verify_poses(
@@ -46,7 +44,6 @@ def verify_poses(
         load: returns the panorama and the mask of an image by its name.
         features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
-        correct: False only reports.
         miss_cost: a camera is doubted if its probability to be right is below miss_cost / (1 + miss_cost), and left out
             if it is doubted and below 1 / (1 + miss_cost).
 
@@ -67,19 +64,12 @@ def verify_poses(
 
 @dataclass(frozen=True, eq=False)
 class VerifiedGroup:
-    """Checked poses of one group, and what they were checked with.
+    """Checked poses of one group, and what they were checked with."""
 
-    Attributes:
-        poses: the poses, with their doubts.
-        model: the same cameras with their pairs.
-        checks: the evidence of the images for each of them.
-        confirmation: of the capture.
-    """
-
-    poses: Poses
-    model: PlacedModel
-    checks: CameraChecks
-    confirmation: Confirmation
+    poses: Poses  # the poses, with their doubts
+    model: PlacedModel  # the same cameras with their pairs
+    checks: CameraChecks  # the evidence of the images for each of them
+    confirmation: Confirmation  # of the capture
 
 
 def verified_group(
@@ -106,8 +96,10 @@ def verified_group(
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
-    """Return a model with the given cameras, whose names are those of the pairs, and the geometries that agree."""
-    model = PlacedModel(pairs, {idx: poses.cam_from_world(idx) for idx in range(len(poses.names))})
+    """Return a model with the cameras that the pairs know by name, and the geometries that agree with them."""
+    position = {name: idx for idx, name in enumerate(pairs.names)}
+    cameras = {position[name]: poses.cam_from_world(idx) for idx, name in enumerate(poses.names) if name in position}
+    model = PlacedModel(pairs, cameras)
     model.choose_again()
     model.learn_ranges()
     model.choose_again()
@@ -123,7 +115,7 @@ def poses_of(model: PlacedModel) -> Poses:
         scale="the first reference–neighbour baseline is 1",
         metric=False,
     )
-    return poses_with_points(poses, tracks, max_error_deg=_MAX_ERROR_DEG, min_angle_deg=_MIN_ANGLE_DEG)
+    return poses_with_points(poses, tracks, max_error_deg=0.4, min_angle_deg=1.0)
 
 
 def with_camera_checks(poses: Poses, pairs: Pairs, checks: CameraChecks) -> Poses:

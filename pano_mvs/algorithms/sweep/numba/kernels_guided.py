@@ -21,6 +21,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_band import combine_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import silence, source_cost, store_row
 from pano_mvs.algorithms.sweep.numba.kernels_lookup import place_row, sample_row, vote_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I16, I64, U8, U16, Guide, Lookup, Sweep
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import OUTSIDE
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import fast_azimuth, fast_dip
 
@@ -145,7 +146,6 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
 
 
 _H = np.uint16
-_OUTSIDE = np.uint16(60000)  # as in kernels_sgm
 _BARRED, _OPEN = np.uint16(65535), np.uint16(0)
 
 PER_PLANE = 4
@@ -267,8 +267,8 @@ def follow_guided_strip(
     count = depth // 2
     costs = Costs(volume, total, guides, penalties, p1)
     buffers = np.zeros((2, 2, count + 2, lines), np.uint16)
-    buffers[:, :, 0, :] = _OUTSIDE
-    buffers[:, :, count + 1, :] = _OUTSIDE
+    buffers[:, :, 0, :] = OUTSIDE
+    buffers[:, :, count + 1, :] = OUTSIDE
     least = np.zeros((2, lines), np.uint16)
     passed = np.zeros((2, 2, lines), np.int16)
     nearby, barred = np.empty((2, count, lines), np.uint16), np.empty((2, 2, lines), np.uint16)
@@ -278,7 +278,7 @@ def follow_guided_strip(
         row = height - 1 - row if upward else row
         column = first + drift * i + (width // 2 if beyond_pole and i < 0 else 0)
         column = (column % width + width) % width
-        least[now, :] = _OUTSIDE
+        least[now, :] = OUTSIDE
         direct = min(lines, width - column)
         fronts = Front(buffers[before], least[before], passed[before]), Front(buffers[now], least[now], passed[now])
         _step(costs, (row, column), (0, direct), fronts[0], fronts[1], nearby, barred, i >= 0)

@@ -21,7 +21,7 @@ from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 _H = np.uint16
-_OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
+OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
 _ALL = -1
 
 DRIFTS = (0, 1, -1)
@@ -115,7 +115,7 @@ def step_plain(
     row, column, first, way = _U(place[0]), _U(place[1]), _U(line), _U(direction)
     row_before, row_after = _U(place[0] - sums.first_before), _U(place[0] - sums.first_after)
     for k in range(_U(lines)):
-        scratch[0, k], scratch[1, k] = _OUTSIDE, _OUTSIDE
+        scratch[0, k], scratch[1, k] = OUTSIDE, OUTSIDE
     for d in range(_U(volume.shape[1])):
         for k in range(_U(lines)):
             floor = least[way, first + k]
@@ -270,7 +270,7 @@ def follow_block(
     (first_step, count), (first, lines) = steps, strip
     beyond = first_step < 0
     least = np.empty((3, state.shape[2]), np.uint16)
-    state[:, depth] = _OUTSIDE
+    state[:, depth] = OUTSIDE
     scratch = np.empty((2, lines + 2 * count), np.uint16)
     _take_front(front, first - count, lines + 2 * count, state, least)
     turn = width // 2 if beyond else 0

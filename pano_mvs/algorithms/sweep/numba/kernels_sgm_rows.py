@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import U8, U16
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import OUTSIDE
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, SIDE, step_planes, turn_bytes, turn_sums
 from pano_mvs.core.kernels import kernel
 
 _U = np.uint64
 _H = np.uint16
-_OUTSIDE = np.uint16(60000)  # as in kernels_sgm
 _BLOCK = 32  # columns of which all planes fit the nearest cache
 _COMPARED = 8  # after how many pixels it is tried whether a path carries what it did before
 
@@ -84,7 +84,7 @@ def step_pixel(
     of the paths of both directions, written; pixel W is where they start, and the one after it is there because
     registers are read ahead. `way`: 0 or 1, the direction. `before`: the pixel before, or W. `now`: the pixel.
     `penalty`: P2 of the step. `floor`: the least cost of the pixel before. `p1`: uint16. `barred`: (P,) uint16, 0 for
-    planes and `_OUTSIDE` for what only fills registers. `scratch`: (2, D + 2) uint16, for each direction the costs in
+    planes and `OUTSIDE` for what only fills registers. `scratch`: (2, D + 2) uint16, for each direction the costs in
     the pixel before, between two planes that do not exist; written; not used by vector instructions.
     """
     jump = _H(floor + penalty)
@@ -104,7 +104,7 @@ def step_pixel(
         near = near if near < jump else jump
         near = stay if stay < near else near
         paths[direction, pixel, d] = _H(_H(near - floor) + _H(costs[pixel, d]))
-    least = _OUTSIDE
+    least = OUTSIDE
     for d in range(depth):
         value = paths[direction, pixel, d]
         least = value if value < least else least
@@ -156,8 +156,8 @@ def follow_rows(volume: U8, penalties: U16, p1: np.uint16, rows: tuple[int, int]
     costs = np.zeros((width, padded), np.uint8)
     paths = np.zeros((2, width + 2, padded), np.uint16)
     barred, earlier = np.zeros(padded, np.uint16), np.empty(padded, np.uint16)
-    barred[depth:] = _OUTSIDE
-    scratch = np.full((2, depth + 2), _OUTSIDE, np.uint16)
+    barred[depth:] = OUTSIDE
+    scratch = np.full((2, depth + 2), OUTSIDE, np.uint16)
     for y in range(rows[0], rows[0] + rows[1]):
         _turn_row(volume, y, costs)
         for d in range(_U(padded)):

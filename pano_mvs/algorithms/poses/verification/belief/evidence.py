@@ -17,9 +17,6 @@ from pano_mvs.geometry import geodesic_angle
 FloatArray = NDArray[np.float64]
 Row = dict[str, float]
 
-# A place counts as another one beyond this share of the distance to the nearest camera, or this rotation.
-_ELSEWHERE, _TURNED_RAD = 0.1, 0.07
-
 
 def camera_evidence(
     model: PlacedModel,
@@ -112,11 +109,12 @@ def _place_rival(model: PlacedModel, image: int, own: float) -> float:
         return np.nan
     here = model.cameras[image]
     nearest = min(float(np.linalg.norm(pose.center - here.center)) for i, pose in model.cameras.items() if i != image)
+    # A place counts as another one beyond this share of the distance to the nearest camera, or this rotation.
     elsewhere = (
         place.score
         for place in places
-        if float(np.linalg.norm(place.cam_from_world.center - here.center)) > _ELSEWHERE * nearest
-        or float(geodesic_angle(place.cam_from_world.rotation, here.rotation)) > _TURNED_RAD
+        if float(np.linalg.norm(place.cam_from_world.center - here.center)) > 0.1 * nearest
+        or float(geodesic_angle(place.cam_from_world.rotation, here.rotation)) > 0.07
     )
     return next(elsewhere, 0.0) / own
 

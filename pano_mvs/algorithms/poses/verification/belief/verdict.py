@@ -12,7 +12,6 @@ from pano_mvs.core.text import plural
 MISS_COST = 5.0
 """Cost of a wrong camera that is not doubted, relative to that of a right one that is."""
 
-_NAMED = 2
 _CLOSER, _BETWEEN = "take panoramas closer to one another there", "take panoramas in between"
 _Row = Mapping[str, float]
 
@@ -91,7 +90,7 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
     lost = {name: value for name, value in model.contributions(row).items() if value < 0}
     if "ratio" in lost:  # both are about what other images confirm
         lost["ratio"] += lost.pop("share", 0.0)
-    worst = sorted(lost, key=lambda name: (lost[name], name))[:_NAMED]
+    worst = sorted(lost, key=lambda name: (lost[name], name))[:2]
     said = [_SAID[name][0](row) if np.isfinite(row.get(name, np.nan)) else _SAID[name][1] for name in worst]
     advice = dict.fromkeys(_SAID[name][2] for name in worst)
     why = ", and ".join(dict.fromkeys(filter(None, said)))

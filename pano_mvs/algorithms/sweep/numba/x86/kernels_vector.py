@@ -47,7 +47,7 @@ REGISTER_BYTES: Final = 16 * max(_LANES, 1)
 _BITS = {1: "128", 2: "", 4: "512"}
 # Where a patch of `packing.pack_colors` has {upper, lower} left, {upper, lower} right of R, of G, of B and of nothing.
 _COLOR_PAIRS = [0, 1, 8, 9, 2, 3, 10, 11, 4, 5, 12, 13, 6, 7, 14, 15]
-_I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 _NAMES = {
     "pairs": {1: "llvm.x86.sse2.pmadd.wd", 2: "llvm.x86.avx2.pmadd.wd", 4: "llvm.x86.avx512.pmaddw.d.512"},
     "to_words": {1: "llvm.x86.sse2.packssdw.128", 2: "llvm.x86.avx2.packssdw", 4: "llvm.x86.avx512.packssdw.512"},
@@ -67,7 +67,7 @@ def _call(builder: Any, what: str, to: ir.IntType, *operands: Any) -> Any:
 
 
 def _shuffle(builder: Any, first: Any, second: Any, mask: list[int]) -> Any:
-    kind = ir.VectorType(_I32, len(mask))
+    kind = ir.VectorType(I32, len(mask))
     return builder.shuffle_vector(first, second, ir.Constant(kind, mask))
 
 
@@ -102,18 +102,18 @@ def _blend(builder: Any, patches: Any, order: list[int], weights_y: tuple[Any, A
     {upper, lower}, left and right in turn. `weights_y`: the weights of the first and of the second half of the pairs of
     each lane. `weight_x`: the weights of the pairs {left, right} that the rows' blending leaves.
     """
-    zero = _constant(_I8, 0)
+    zero = _constant(I8, 0)
     sides = []
     for half, weight in zip((order[:8], order[8:]), weights_y, strict=True):
         # A byte behind a zero is a word 256 times as large, sign and all.
         mask = _in_lanes([place for byte in half for place in (16, byte)])
-        words = builder.bitcast(_shuffle(builder, patches, zero, mask), _vector(_I16))
-        side = _call(builder, "pairs", _I32, words, builder.bitcast(weight, _vector(_I16)))
-        side = builder.add(side, _constant(_I32, HALFWAY_ROUND << 8))
-        sides.append(builder.ashr(side, _constant(_I32, HALFWAY_SHIFT + 8)))
-    both = _call(builder, "to_words", _I16, *sides)
-    blended = _call(builder, "pairs", _I32, both, builder.bitcast(weight_x, _vector(_I16)))
-    return builder.ashr(builder.add(blended, _constant(_I32, ROUND)), _constant(_I32, SHIFT))
+        words = builder.bitcast(_shuffle(builder, patches, zero, mask), _vector(I16))
+        side = _call(builder, "pairs", I32, words, builder.bitcast(weight, _vector(I16)))
+        side = builder.add(side, _constant(I32, HALFWAY_ROUND << 8))
+        sides.append(builder.ashr(side, _constant(I32, HALFWAY_SHIFT + 8)))
+    both = _call(builder, "to_words", I16, *sides)
+    blended = _call(builder, "pairs", I32, both, builder.bitcast(weight_x, _vector(I16)))
+    return builder.ashr(builder.add(blended, _constant(I32, ROUND)), _constant(I32, SHIFT))
 
 
 def _spread(builder: Any, weights: Any, within: list[int]) -> Any:
@@ -124,7 +124,7 @@ def _spread(builder: Any, weights: Any, within: list[int]) -> Any:
 
 def _unsigned_byte(builder: Any, values: Any) -> Any:
     """Return int32 around 0 as bytes around 128."""
-    kind = ir.VectorType(_I8, values.type.count)
+    kind = ir.VectorType(I8, values.type.count)
     return builder.xor(builder.trunc(values, kind), ir.Constant(kind, [128] * kind.count))
 
 
@@ -134,14 +134,14 @@ def blend_grey_block(typingctx: Any, patches: Any, weight_y: Any, weight_x: Any,
     signature = types.void(patches, weight_y, weight_x, types.uint64, out, types.uint64)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = _vector(_I32)
+        whole = _vector(I32)
         loaded = [
             load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[3], whole))
             for k in range(3)
         ]
         weights_y = _spread(builder, loaded[1], [0, 0, 1, 1]), _spread(builder, loaded[1], [2, 2, 3, 3])
-        values = _blend(builder, builder.bitcast(loaded[0], _vector(_I8)), list(range(16)), weights_y, loaded[2])
-        target = element_pointer(context, builder, sig.args[4], args[4], args[5], ir.VectorType(_I8, whole.count))
+        values = _blend(builder, builder.bitcast(loaded[0], _vector(I8)), list(range(16)), weights_y, loaded[2])
+        target = element_pointer(context, builder, sig.args[4], args[4], args[5], ir.VectorType(I8, whole.count))
         builder.store(_unsigned_byte(builder, values), target, align=1)
 
     return signature, emit
@@ -151,8 +151,8 @@ def _patches(context: Any, builder: Any, packed: tuple[Any, Any], base: Any, pla
     """Return the patches at `places`, one to a lane."""
     loaded = []
     for place in places:
-        position = builder.add(base, builder.zext(place, _I64))
-        pointer = element_pointer(context, builder, *packed, position, ir.VectorType(_I8, 16))
+        position = builder.add(base, builder.zext(place, I64))
+        pointer = element_pointer(context, builder, *packed, position, ir.VectorType(I8, 16))
         loaded.append(load_unaligned(builder, pointer))
     while len(loaded) > 1:
         both = list(range(2 * loaded[0].type.count))
@@ -170,13 +170,13 @@ def _rgb_bytes(context: Any, builder: Any, packed: tuple[Any, Any], base: Any, r
     blended = []
     for m in range(4):
         pixels = [4 * lane + m for lane in range(_LANES)]
-        places = [builder.load(builder.gep(index, [ir.Constant(_I32, pixel)])) for pixel in pixels]
+        places = [builder.load(builder.gep(index, [ir.Constant(I32, pixel)])) for pixel in pixels]
         patches = _patches(context, builder, packed, base, places)
         down, across = (_spread(builder, weight, [m] * 4) for weight in (weight_y, weight_x))
         blended.append(_blend(builder, patches, _COLOR_PAIRS, (down, down), across))
-    low = _call(builder, "to_words", _I16, blended[0], blended[1])
-    high = _call(builder, "to_words", _I16, blended[2], blended[3])
-    return builder.bitcast(_call(builder, "to_bytes", _I8, low, high), _vector(_I32))
+    low = _call(builder, "to_words", I16, blended[0], blended[1])
+    high = _call(builder, "to_words", I16, blended[2], blended[3])
+    return builder.bitcast(_call(builder, "to_bytes", I8, low, high), _vector(I32))
 
 
 @intrinsic
@@ -197,8 +197,8 @@ def sample_rgb_block(
     signature = types.void(packed, place, index, weight_y, weight_x, place, out, place, place)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = _vector(_I32)
-        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
+        whole = _vector(I32)
+        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], I32)]
         rows += [
             load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[5], whole))
             for k in (3, 4)
@@ -206,8 +206,8 @@ def sample_rgb_block(
         pixels = _rgb_bytes(context, builder, (sig.args[0], args[0]), args[1], rows)
         target = args[7]
         for color in range(3):
-            values = builder.lshr(pixels, _constant(_I32, 8 * color))
-            place = element_pointer(context, builder, sig.args[6], args[6], target, ir.VectorType(_I8, whole.count))
+            values = builder.lshr(pixels, _constant(I32, 8 * color))
+            place = element_pointer(context, builder, sig.args[6], args[6], target, ir.VectorType(I8, whole.count))
             builder.store(_unsigned_byte(builder, values), place, align=1)
             target = builder.add(target, args[8])
 
@@ -236,22 +236,22 @@ def difference_rgb_block(
     signature = types.void(packed, place, index, weight_y, weight_x, place, reference, place, total, place)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole, byte = _vector(_I32), _constant(_I32, 255)
-        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
+        whole, byte = _vector(I32), _constant(I32, 255)
+        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], I32)]
         for k in (3, 4):
             rows.append(
                 load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[5], whole))
             )
         pixels = _rgb_bytes(context, builder, (sig.args[0], args[0]), args[1], rows)
-        theirs = builder.bitcast(builder.xor(pixels, _constant(_I32, 0x808080)), _vector(_I8))
-        ours = load_unaligned(builder, element_pointer(context, builder, sig.args[6], args[6], args[7], _vector(_I8)))
+        theirs = builder.bitcast(builder.xor(pixels, _constant(I32, 0x808080)), _vector(I8))
+        ours = load_unaligned(builder, element_pointer(context, builder, sig.args[6], args[6], args[7], _vector(I8)))
         larger = builder.icmp_unsigned(">", ours, theirs)
         both = builder.select(larger, ours, theirs), builder.select(larger, theirs, ours)
         difference = builder.bitcast(builder.sub(*both), whole)
         added = builder.and_(difference, byte)
         for color in (1, 2):
-            added = builder.add(added, builder.and_(builder.lshr(difference, _constant(_I32, 8 * color)), byte))
-        narrow = ir.VectorType(_I16, whole.count)
+            added = builder.add(added, builder.and_(builder.lshr(difference, _constant(I32, 8 * color)), byte))
+        narrow = ir.VectorType(I16, whole.count)
         target = element_pointer(context, builder, sig.args[8], args[8], args[9], narrow)
         builder.store(builder.add(load_unaligned(builder, target), builder.trunc(added, narrow)), target, align=1)
 
@@ -285,17 +285,17 @@ def census_block(
     signature = types.void(reference, place, warped, place, place, offsets, place, out, place)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = _vector(_I8)
+        whole = _vector(I8)
         pictures = ((sig.args[0], args[0], args[1]), (sig.args[2], args[2], args[3]))
         centers = [
             load_unaligned(builder, element_pointer(context, builder, kind, data, at, whole))
             for kind, data, at in pictures
         ]
-        count = cgutils.alloca_once_value(builder, _constant(_I8, 0))
-        half = builder.lshr(args[6], ir.Constant(_I64, 1))
+        count = cgutils.alloca_once_value(builder, _constant(I8, 0))
+        half = builder.lshr(args[6], ir.Constant(I64, 1))
         with cgutils.for_range(builder, args[6]) as rows, cgutils.for_range(builder, args[6]) as columns:
             below = builder.mul(builder.sub(rows.index, half), args[4])
-            column = builder.load(element_pointer(context, builder, sig.args[5], args[5], columns.index, _I64))
+            column = builder.load(element_pointer(context, builder, sig.args[5], args[5], columns.index, I64))
             shift = builder.add(below, column)
             larger = []
             for (kind, data, at), center in zip(pictures, centers, strict=True):

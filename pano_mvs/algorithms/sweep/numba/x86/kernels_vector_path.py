@@ -19,20 +19,27 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import (
+    I8,
+    I16,
+    I32,
+    I64,
+    REGISTER_BYTES,
+    element_pointer,
+    load_unaligned,
+)
 
 LINES: Final = REGISTER_BYTES // 2
 """How many paths of each direction one call advances."""
 
-_I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
-_WORDS, _BYTES = ir.VectorType(_I16, LINES), ir.VectorType(_I8, LINES)
+_WORDS, _BYTES = ir.VectorType(I16, LINES), ir.VectorType(I8, LINES)
 _OUTSIDE = ir.Constant(_WORDS, [60000] * LINES)
 
 
 def everywhere(builder: Any, value: Any) -> Any:
     """Return a register filled with one value."""
-    first = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_I32, LINES), [0] * LINES))
+    first = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), value, ir.Constant(I32, 0))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(I32, LINES), [0] * LINES))
 
 
 def least_of(builder: Any, first: Any, second: Any) -> Any:
@@ -43,7 +50,7 @@ def least_of(builder: Any, first: Any, second: Any) -> Any:
 def _inside(builder: Any, first: Any, last: Any) -> Any:
     """Return which of the lines are from `first` to before `last`."""
     lines = ir.Constant(_WORDS, list(range(LINES)))
-    bounds = [everywhere(builder, builder.trunc(bound, _I16)) for bound in (first, last)]
+    bounds = [everywhere(builder, builder.trunc(bound, I16)) for bound in (first, last)]
     return builder.and_(builder.icmp_unsigned(">=", lines, bounds[0]), builder.icmp_unsigned("<", lines, bounds[1]))
 
 
@@ -61,13 +68,13 @@ class _Paths:
         """Start with the first plane."""
         self.builder.store(_OUTSIDE, self.before)
         self.builder.store(_OUTSIDE, self.lowest)
-        self.builder.store(load_unaligned(self.builder, self.paths_in(ir.Constant(_I64, 0))), self.here)
+        self.builder.store(load_unaligned(self.builder, self.paths_in(ir.Constant(I64, 0))), self.here)
 
     def step(self, plane: Any, cost: Any, inside: Any) -> Any:
         """Write and return the costs of a plane; where not `inside`, if that is given, nothing is written."""
         builder = self.builder
         stay = builder.load(self.here)
-        after = load_unaligned(builder, self.paths_in(builder.add(plane, ir.Constant(_I64, 1))))
+        after = load_unaligned(builder, self.paths_in(builder.add(plane, ir.Constant(I64, 1))))
         near = builder.add(least_of(builder, builder.load(self.before), after), self.p1)
         near = least_of(builder, stay, least_of(builder, near, self.jump))
         value = builder.add(builder.sub(near, self.floor), cost)
@@ -87,9 +94,9 @@ class _Paths:
 
 def _store_some(builder: Any, value: Any, pointer: Any, inside: Any) -> None:
     """Write nothing outside: another thread may be at work there."""
-    kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, _I32, inside.type])
+    kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, I32, inside.type])
     store = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LINES}i16.p0")
-    builder.call(store, [value, pointer, ir.Constant(_I32, 1), inside])
+    builder.call(store, [value, pointer, ir.Constant(I32, 1), inside])
 
 
 def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
@@ -113,7 +120,7 @@ def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
         for penalty, line, least in zip(unpack(4), unpack(7)[::2], unpack(7)[1::2], strict=True)
     ]
     inside = _inside(builder, first, last)
-    keeps = builder.icmp_unsigned("!=", keep, ir.Constant(_I64, 0))
+    keeps = builder.icmp_unsigned("!=", keep, ir.Constant(I64, 0))
 
     def all_planes(within: Any) -> None:
         for direction in directions:
@@ -135,7 +142,7 @@ def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
         for direction in directions:
             direction.finish(within)
 
-    whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(_I64, LINES))
+    whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(I64, LINES))
     with builder.if_else(whole) as (all_lines, some):
         with all_lines:
             all_planes(None)
@@ -185,7 +192,7 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
     """Return the columns of a square block."""
     side = len(rows)
     masks = [
-        ir.Constant(ir.VectorType(_I32, side), [half * side // 2 + k // 2 + (k % 2) * side for k in range(side)])
+        ir.Constant(ir.VectorType(I32, side), [half * side // 2 + k // 2 + (k % 2) * side for k in range(side)])
         for half in (0, 1)
     ]
     for _ in range(side.bit_length() - 1):
@@ -200,14 +207,14 @@ def _emit_turn(context: Any, builder: Any, sig: Any, args: Any, *, element: Any,
     source, start, apart, step, target, target_at, target_step = args
 
     def loaded(k: int, position: Any) -> Any:
-        place = builder.add(position, builder.mul(step, ir.Constant(_I64, k)))
+        place = builder.add(position, builder.mul(step, ir.Constant(I64, k)))
         return load_unaligned(builder, element_pointer(context, builder, sig.args[0], source, place, kind))
 
     rows = [loaded(k, start) for k in range(SIDE)]
     if sources == 2:
         rows = [builder.add(row, loaded(k, builder.add(start, apart))) for k, row in enumerate(rows)]
     for k, column in enumerate(_turned(builder, rows)):
-        place = builder.add(target_at, builder.mul(target_step, ir.Constant(_I64, k)))
+        place = builder.add(target_at, builder.mul(target_step, ir.Constant(I64, k)))
         pointer = element_pointer(context, builder, sig.args[4], target, place, kind)
         builder.store(column, pointer, align=1)
 
@@ -221,7 +228,7 @@ def turn_bytes(
     signature = types.void(source, place, place, place, target, place, place)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _emit_turn(context, builder, sig, args, element=_I8, sources=1)
+        _emit_turn(context, builder, sig, args, element=I8, sources=1)
 
     return signature, emit
 
@@ -235,7 +242,7 @@ def turn_sums(
     signature = types.void(source, place, place, place, target, place, place)
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _emit_turn(context, builder, sig, args, element=_I16, sources=2)
+        _emit_turn(context, builder, sig, args, element=I16, sources=2)
 
     return signature, emit
 
@@ -248,7 +255,7 @@ def _emit_step_planes(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return element_pointer(context, builder, sig.args[k], array, position, kind)
 
     def shifted(first: Any, second: Any, start: int) -> Any:
-        mask = ir.Constant(ir.VectorType(_I32, LINES), [start + k for k in range(LINES)])
+        mask = ir.Constant(ir.VectorType(I32, LINES), [start + k for k in range(LINES)])
         return builder.shuffle_vector(first, second, mask)
 
     outside = ir.Constant(_WORDS, [60000] * LINES)
@@ -257,12 +264,12 @@ def _emit_step_planes(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     before = cgutils.alloca_once_value(builder, outside)
     here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(2, paths, before_at)))
     with cgutils.for_range(builder, registers) as loop:
-        plane = builder.mul(loop.index, ir.Constant(_I64, LINES))
-        following = builder.add(plane, ir.Constant(_I64, LINES))
+        plane = builder.mul(loop.index, ir.Constant(I64, LINES))
+        following = builder.add(plane, ir.Constant(I64, LINES))
         stay = builder.load(here)
         # The row after the last one is there, but not its planes.
         after = load_unaligned(builder, at(2, paths, builder.add(before_at, following)))
-        is_last = builder.icmp_unsigned("==", builder.add(loop.index, ir.Constant(_I64, 1)), registers)
+        is_last = builder.icmp_unsigned("==", builder.add(loop.index, ir.Constant(I64, 1)), registers)
         after = builder.select(is_last, outside, after)
         down, up = shifted(builder.load(before), stay, LINES - 1), shifted(stay, after, 1)
         near = builder.add(least_of(builder, down, up), steps)
@@ -275,7 +282,7 @@ def _emit_step_planes(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         builder.store(least_of(builder, value, builder.load(lowest)), lowest)
         builder.store(stay, before)
         builder.store(after, here)
-    kind = ir.FunctionType(_I16, [_WORDS])
+    kind = ir.FunctionType(I16, [_WORDS])
     reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.umin.v{LINES}i16")
     return builder.call(reduce, [builder.load(lowest)])
 

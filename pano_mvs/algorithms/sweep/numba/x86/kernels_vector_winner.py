@@ -12,13 +12,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import I64, REGISTER_BYTES, element_pointer, load_unaligned
 
 # The rows of the running state.
 BEST, BEFORE, AFTER, RIVAL, LAST, LAST_BUT_ONE, EARLIER = range(7)
 STATES: Final = 7
-
-_I64 = ir.IntType(64)
 
 
 def _less(builder: Any, first: Any, second: Any) -> Any:
@@ -85,7 +83,7 @@ def take_planes(
         kind, indices = ir.VectorType(element, lanes), ir.VectorType(index, lanes)
         places = []
         for row in range(STATES):
-            at = builder.add(args[6], builder.mul(args[7], ir.Constant(_I64, row)))
+            at = builder.add(args[6], builder.mul(args[7], ir.Constant(I64, row)))
             places.append(element_pointer(context, builder, sig.args[5], args[5], at, kind))
         kept = [cgutils.alloca_once_value(builder, load_unaligned(builder, pointer)) for pointer in places]
         pointer = element_pointer(context, builder, sig.args[8], args[8], args[9], indices)
