@@ -7,14 +7,16 @@ from typing import Annotated
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, poses_with_points
-from pano_mvs.algorithms.poses.growth import add_images
-from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, poses_with_points
+from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
 from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
 from pano_mvs.algorithms.poses.placement.resection import refine_resection
-from pano_mvs.algorithms.poses.verification.verify_poses import model_of
+from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
+
+_ROUNDS = 3
+_RESECTION_SCALE_RAD = float(np.deg2rad(0.1))
 
 
 @checks_settings
@@ -41,21 +43,25 @@ def extend_poses(
         Poses of all registered images in the capture's order, in the frame and unit of the known poses. Images that
         cannot be registered are in `rejected`, with the reason.
     """
-    pairs = pairs_of(features, two_views)
-    model = model_of(known, pairs)
-    fixed = frozenset(model.cameras)
-    joined = {image for edge in pairs.geometries for image in edge}
-    reasons = {
-        image: why_no_pair(name, two_views) or "its pairs contradict the pairs around them"
-        for image, name in enumerate(pairs.names)
-        if image not in joined | fixed
-    }
-    if fixed:
-        reasons |= add_images(model, joined - fixed, adjust=False, confirmation=None)
-    tracks = _settled(model, [image for image in model.cameras if image not in fixed])
+    names = tuple(features)
+    edges = consistent_edges(names, two_views)
+    kept = {(names[a], names[b]): view for (a, b), view in edges.items()}
+    tracks = build_tracks(features, kept)
+    model = GrowingModel(tracks, edges, "cauchy", kappa=0.01)
+    position = {name: idx for idx, name in enumerate(names)}
+    fixed = {position[name]: known.cam_from_world(i) for i, name in enumerate(known.names) if name in position}
+    model.cameras.update(fixed)
+    model.triangulate()
+    reasons = {position[name]: reason for name in names if (reason := why_no_pair(name, two_views))}
+    joined = {idx for edge in edges for idx in edge}
+    for idx in range(len(names)):
+        if idx not in joined:
+            reasons.setdefault(idx, "its pairs contradict the pairs around them")
+    reasons |= model.attach_all(sorted(joined - fixed.keys()))
+    _settled(model, [idx for idx in model.cameras if idx not in fixed])
     poses = Poses.without_points(
-        {pairs.names[image]: model.cameras[image] for image in sorted(model.cameras)},
-        rejected={pairs.names[image]: reason for image, reason in sorted(reasons.items())},
+        {names[idx]: model.cameras[idx] for idx in sorted(model.cameras)},
+        rejected={names[idx]: reason for idx, reason in sorted(reasons.items()) if idx not in fixed},
         frame=known.frame,
         scale=known.scale,
         metric=known.metric,
@@ -63,16 +69,12 @@ def extend_poses(
     return poses_with_points(poses, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
 
 
-def _settled(model: PlacedModel, new: list[int]) -> Tracks:
-    """Refine new cameras and points in turn, while the other cameras stay fixed, and return the tracks."""
-    model.choose_again()
-    tracks, members = model.tracks()
-    for _ in range(3 if new else 0):
-        points = model.triangulated(tracks, members).points_in_world[tracks.track_idx]
-        known = np.isfinite(points[:, 0])
+def _settled(model: GrowingModel, new: list[int]) -> None:
+    """Refine new cameras and points in turn; the other cameras stay fixed."""
+    for _ in range(_ROUNDS if new else 0):
+        model.triangulate()
         for image in new:
-            mine = known & (tracks.image_idx == members.index(image))
+            points, bearings = model.known_points(image)
             model.cameras[image] = refine_resection(
-                model.cameras[image], points[mine], tracks.bearings[mine], scale_rad=float(np.deg2rad(0.1))
+                model.cameras[image], points, bearings, scale_rad=_RESECTION_SCALE_RAD
             )
-    return tracks

@@ -151,8 +151,23 @@ def _grown(
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
-    reasons = add_images(model, left, adjust=adjust, confirmation=confirmation)
-    left -= model.cameras.keys()
+    weights: dict[int, float] = {}
+    for image in edge:
+        _count_pairs(pairs, image, left, weights=weights)
+    if not adjust:
+        model.adjust(cameras=False)
+    adjusted = 2
+    reasons: dict[int, str] = {}
+    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
+        image, pose = step
+        model.add(image, pose)
+        left.discard(image)
+        del weights[image]
+        _count_pairs(pairs, image, left, weights=weights)
+        # All cameras are adjusted each time their number has grown by this factor.
+        if not adjust or len(model.cameras) > 1.25 * adjusted:
+            model.adjust(cameras=adjust)
+            adjusted = len(model.cameras)
     for image in edge:
         if image in model.cameras and (reason := _unsupported(model, image)):
             for other in model.held_by([image]):
@@ -163,45 +178,13 @@ def _grown(
             left.add(image)
             reasons[image] = reason
     settle(model, adjust=adjust)
-    refused = {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
+    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
     # The images are not consulted if the model explains this share of the pairs.
     if left or aliased or model.explained_share() < 0.97:
         checks = check_cameras(model, confirmation)
     return GrownModel(model, refused, checks, aliased)
-
-
-def add_images(
-    model: PlacedModel, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
-) -> dict[int, str]:
-    """Add images one at a time, the clearest first, while any can be added; return why others could not be.
-
-    Args:
-        model: two or more registered cameras.
-        images: those to add.
-        adjust: whether all cameras are adjusted at intervals; if False, the cameras stay as they were added.
-        confirmation: decides between rival placements by the images; None if the pairs alone decide.
-    """
-    left = set(images)
-    weights: dict[int, float] = {}
-    for image in model.cameras:
-        _count_pairs(model.pairs, image, left, weights=weights)
-    if not adjust:
-        model.adjust(cameras=False)
-    adjusted = len(model.cameras)
-    reasons: dict[int, str] = {}
-    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
-        image, pose = step
-        model.add(image, pose)
-        left.discard(image)
-        del weights[image]
-        _count_pairs(model.pairs, image, left, weights=weights)
-        # All cameras are adjusted each time their number has grown by this factor.
-        if not adjust or len(model.cameras) > 1.25 * adjusted:
-            model.adjust(cameras=adjust)
-            adjusted = len(model.cameras)
-    return {image: reasons.get(image) or _why_nothing(model, image) for image in sorted(left)}
 
 
 def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:

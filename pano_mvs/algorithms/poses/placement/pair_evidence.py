@@ -16,10 +16,11 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
-_MIN_RATIOS = 6
+_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
+MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
-_AGREEING, _MIN_AGREEING = 1.25, 0.4
+_AGREEING, MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
 _SHUFFLES = 50
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
@@ -183,11 +184,11 @@ def _length(
     ratios = known_ranges / unit_ranges
     known = np.isfinite(ratios)
     ratios = ratios[known]
-    if len(ratios) < _MIN_RATIOS:
+    if len(ratios) < MIN_RATIOS:
         return np.nan
     length = estimate_scale(ratios, np.sin(parallax[known]) ** 2, estimator=estimator, kappa=kappa)
     agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
-    return length if agreeing >= max(_MIN_RATIOS, _MIN_AGREEING * len(ratios)) else np.nan
+    return length if agreeing >= max(MIN_RATIOS, MIN_AGREEING * len(ratios)) else np.nan
 
 
 def significant_length(

@@ -96,10 +96,8 @@ def verified_group(
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
-    """Return a model with the cameras that the pairs know by name, and the geometries that agree with them."""
-    position = {name: idx for idx, name in enumerate(pairs.names)}
-    cameras = {position[name]: poses.cam_from_world(idx) for idx, name in enumerate(poses.names) if name in position}
-    model = PlacedModel(pairs, cameras)
+    """Return a model with the given cameras, whose names are those of the pairs, and the geometries that agree."""
+    model = PlacedModel(pairs, {idx: poses.cam_from_world(idx) for idx in range(len(poses.names))})
     model.choose_again()
     model.learn_ranges()
     model.choose_again()
