@@ -21,11 +21,11 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation, ranges_from_bearings
 from pano_mvs.scene import Features
 
-_UNIT = 50.0  # log₁₀ of the false alarms is counted in this unit
-_ALIKE_DEG = 5.0
-_MOST_DEG = 8.0  # tilt and climb count up to here
+_UNIT = 50.0  # log₁₀ of the false alarms is counted in doublings of this
+CERTAIN = -250.0
+"""Enough whatever the marks: in ten places, no false pair has as few false alarms (10⁻²¹¹); equal offices have some."""
+_ALIKE_DEG = 5.0  # what a rotation leaves counts below this
 _BELOW = 0.25  # sine of how far below the horizon a match may lie on a floor
-_MOST_DOUBLINGS = 20.0
 
 
 class Marks(NamedTuple):
@@ -46,7 +46,10 @@ class Marks(NamedTuple):
     near: float
 
 
-WEIGHTS = (0.453, 0.585, -0.671, -0.561, -0.365, 3.739, -1.488)
+_MOST_DEG = 4.0
+"""Tilt and climb count up to here: verticals may be unknown, and stairs climb."""
+
+WEIGHTS = (0.847, 0.634, -0.718, -0.609, -0.706, 3.504, -1.377)
 """Of `terms_of` in the logarithm of the odds that a pose is right, as `poses.tours.pair_evidence` of the tools fits."""
 
 ACCEPTED_ODDS = float(np.log(5.0))
@@ -70,27 +73,29 @@ def marks_of(first: Features, second: Features, pose: Rigid3, *, rays: tuple[Flo
     """
     p, q = rays
     left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
-    # Of the likely zeniths of turned cameras, those that agree best.
-    one, other = min(
-        ((np.array(up), np.array(above) @ pose.rotation) for up, above in product(first.ups, second.ups)),
-        key=lambda ups: -float(ups[0] @ ups[1]),
-    )
-    up = (one + other) / max(float(np.linalg.norm(one + other)), 1e-12)
+    alike = float(np.log2(max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1))))
     ranges, others = ranges_from_bearings(p, q, pose)
     seen = (ranges > 0) & (others > 0)
-    floor = floor_below(ranges[seen, None] * p[seen], np.stack([np.zeros(3), pose.center]), up)
-    below = min(int((p @ one < -_BELOW).sum()), int((q @ pose.rotation @ other < -_BELOW).sum()))
-    return Marks(
-        alike=float(np.log2(max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1)))),
-        tilt=float(np.rad2deg(angle_between(one, other))),
-        climb=float(np.rad2deg(np.arcsin(min(abs(float(pose.center @ up)), 1.0)))),
-        floor=min(1.0, floor.points / below) if floor and below else 0.0,
-        near=float(np.log2(max(1.0, floor.depth))),
-    )
+    points = ranges[seen, None] * p[seen]
+    found = []
+    for one, other in product(np.array(first.ups), np.array(second.ups) @ pose.rotation):
+        up = (one + other) / max(float(np.linalg.norm(one + other)), 1e-12)
+        floor = floor_below(points, np.stack([np.zeros(3), pose.center]), up)
+        below = min(int((p @ one < -_BELOW).sum()), int((q @ pose.rotation @ other < -_BELOW).sum()))
+        marks = Marks(
+            alike=alike,
+            tilt=float(np.rad2deg(angle_between(one, other))),
+            climb=float(np.rad2deg(np.arcsin(min(abs(float(pose.center @ up)), 1.0)))),
+            floor=min(1.0, floor.points / below) if floor and below else 0.0,
+            near=float(np.log2(max(1.0, floor.depth))),
+        )
+        found.append(marks)
+    # Of the likely zeniths of turned cameras, those that speak most for the pose.
+    return max(found, key=lambda marks: float(terms_of(-_UNIT, marks) @ WEIGHTS))
 
 
 def max_log10_of_learned(marks: Marks) -> float:
     """Return log₁₀ of the most false alarms with which a pair of learned matches is accepted by itself."""
     odds = float(terms_of(-_UNIT, marks) @ WEIGHTS)
-    doublings = min((ACCEPTED_ODDS - odds) / WEIGHTS[1], _MOST_DOUBLINGS)
-    return float(min(-_UNIT * 2.0**doublings, MAX_LOG10_FALSE_ALARMS))
+    demanded = -_UNIT * 2.0 ** ((ACCEPTED_ODDS - odds) / WEIGHTS[1])
+    return float(np.clip(demanded, CERTAIN, MAX_LOG10_FALSE_ALARMS))

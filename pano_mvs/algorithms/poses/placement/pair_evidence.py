@@ -16,7 +16,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, Marks, marks_of, terms_of
+from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, CERTAIN, Marks, marks_of, terms_of
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 from pano_mvs.scene import Features, TwoView
@@ -124,7 +124,8 @@ def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
         own = [row for row in rows if row.capture == capture]
         right = np.array([row.right for row in own])
         odds = np.array([terms_of(row.log10_false_alarms, row.marks) for row in own]) @ weights
-        fit, plain = odds >= ACCEPTED_ODDS, np.array([row.log10_false_alarms <= -50 for row in own])
+        exponents = np.array([row.log10_false_alarms for row in own])
+        fit, plain = (odds >= ACCEPTED_ODDS) | (exponents <= CERTAIN), exponents <= -50
         counts = (right, fit & right, fit & ~right, plain & right, plain & ~right)
         found[capture] = tuple(int(one.sum()) for one in counts)
     return found
@@ -134,7 +135,7 @@ def main() -> None:
     """Print the tables of the captures that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="*", type=Path, metavar="DIR")
-    parser.add_argument("--runs", type=Path, metavar="OUT", help="results of poses.tours.measure")
+    parser.add_argument("--runs", type=Path, default=Path(), metavar="OUT", help="results of poses.tours.measure")
     parser.add_argument("--table", type=Path, required=True, metavar="FILE")
     given = parser.parse_args()
     if given.captures:
