@@ -15,8 +15,8 @@ from pano_mvs import api
 from pano_mvs.api import Context, RunStoppedError, TwoView
 from pano_mvs.cli.app import app
 from pano_mvs.cli.plugins.new import KINDS, rendered
-from pano_mvs.engine.stages.registry import declared_names
-from pano_mvs.scene import Record
+from pano_mvs.engine.stages.registry import Registry, declared_names
+from pano_mvs.scene import RangeMap, Record
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
@@ -52,6 +52,25 @@ def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_the_test_on_the_page_is_what_is_written() -> None:
     lines = block("plugins.md", "test").splitlines()
     assert set(lines) <= set(rendered("filter", "any")[1].splitlines())
+
+
+def test_the_stage_with_the_settings_of_a_function_keeps_the_contract(tmp_path: Path) -> None:
+    example = block("plugins.md", "settings")
+    named = ", ".join(name for name in api.__all__ if re.search(rf"\b{name}\b", example))
+    plugin = tmp_path / "beyond.py"
+    imports = f"from typing import Annotated\nimport numpy as np\nfrom pano_mvs.api import {named}\n"
+    plugin.write_text(imports + example)
+    for contract_test in stage_contract_tests(plugin):
+        contract_test.check()
+    registry = Registry()
+    registry.add_file(plugin)
+    stage = registry.stages["filters.beyond"]
+    seen = RangeMap(np.array([[0.2, 1.0, 3.0, np.nan]] * 2, np.float32), np.array([[200, 200, 200, 0]] * 2, np.uint8))
+    settings: tuple[tuple[dict[str, float], int], ...] = (({}, 2), ({"near": 2.0}, 1))
+    for given, count in settings:
+        left = stage.function(range_map=seen, params=stage.params_type.model_validate(given))
+        assert isinstance(left, RangeMap)
+        assert left.valid.sum(axis=1).tolist() == [count, count]
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar, Union, 
 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.memory import bytes_from_size
+from pano_mvs.core.settings import settings_of
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params, settings_model
 from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
@@ -236,12 +237,14 @@ def stage(
     `stored_bytes` is the expected size of its result; 0 if no earlier run shows it.
 
     Raises:
-        PluginError: if the function does not have the signature of a stage.
+        PluginError: if the function does not have the signature of a stage, or `settings` cannot be its parameters.
     """
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        if sources := settings if isinstance(settings, Sequence) else (settings,):
+        if settings != ():
+            _check_settings(settings, signature, _label(name, function))
+            sources = settings if isinstance(settings, Sequence) else (settings,)
             signature = replace(signature, params_type=settings_model(name, *sources))
         spec = _spec(name, function, signature, version=version, memory=memory)
         if every_image and not {Cardinality.EACH, Cardinality.NEAR} <= {port.cardinality for port in spec.ports}:
@@ -316,9 +319,13 @@ def _origin(function: Callable[..., Any]) -> str:
     return f"{code.co_filename}:{code.co_firstlineno}"
 
 
+def _label(name: str, function: Callable[..., Any]) -> str:
+    return f"stage {name!r} ({_origin(function)})"
+
+
 def _read_signature(function: Callable[..., Any], name: str, *, leading: str = "") -> _Signature:
     """Read ports, params and output from the annotations."""
-    where = f"stage {name!r} ({_origin(function)})"
+    where = _label(name, function)
     try:
         hints = typing.get_type_hints(function, include_extras=True)
     except NameError as error:
@@ -349,3 +356,46 @@ def _read_signature(function: Callable[..., Any], name: str, *, leading: str = "
     if not (isinstance(output, type) and issubclass(output, Record)):
         raise PluginError(f"{where}: the result must be annotated with a kind (a Record), got {output!r}")
     return _Signature(tuple(ports), params_type, output, extras)
+
+
+def _check_settings(settings: object, signature: _Signature, where: str) -> None:
+    """Raise PluginError unless `settings` can be all parameters of a stage with the signature."""
+    arguments = [name for name, role in signature.extras.items() if role == "params"]
+    if len(arguments) != 1 or signature.params_type is not Params:
+        one = f"{arguments[0]}: {signature.params_type.__name__}" if len(arguments) == 1 else ""
+        got = one or ", ".join(arguments) or "none"
+        raise PluginError(
+            f"{where}: settings= needs exactly one argument annotated Params itself (`params: Params`), got {got}; for "
+            "a model with further fields, leave out settings= and decorate the model with params_from"
+        )
+    sources = settings if isinstance(settings, Sequence) and not isinstance(settings, str) else (settings,)
+    if not sources:
+        raise PluginError(f"{where}: settings= names no function; name one, or leave it out")
+    found: dict[str, str] = {}
+    for source in sources:
+        if not callable(source):
+            raise PluginError(
+                f"{where}: settings= must be a function or a dataclass with settings, or a tuple or list of them, got "
+                f"{source!r}"
+            )
+        called = getattr(source, "__qualname__", repr(source))
+        for setting in _settings_in(source, called, where):
+            if setting in found:
+                raise PluginError(
+                    f"{where}: both {found[setting]} and {called} in settings= have a setting {setting!r}; rename one "
+                    "of the two"
+                )
+            found[setting] = called
+
+
+def _settings_in(source: Callable[..., Any], called: str, where: str) -> Iterable[str]:
+    try:
+        names = settings_of(source)
+    except (TypeError, NameError) as error:
+        raise PluginError(f"{where}: the settings of {called} in settings= cannot be read: {error}") from error
+    if not names:
+        raise PluginError(
+            f"{where}: {called} in settings= has no settings; annotate its keyword-only parameters with Setting, or "
+            "declare the fields of a dataclass by setting()"
+        )
+    return names

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field, ValidationError
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import PluginError, UsageError
 from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.settings import Setting, check_settings, checks_settings, setting, settings_of
 from pano_mvs.engine.stages.params import Params, arguments_from, params_from, settings_from
@@ -124,6 +126,80 @@ def test_a_stage_may_have_the_settings_of_algorithms_as_its_only_parameters() ->
     assert one.__doc__ == "Settings of zoo.open."
     with pytest.raises(ValidationError, match="less than or equal to 9"):
         one.model_validate({"count": 10})
+
+
+def feed_again(*, hour: int = 12, pieces: Annotated[int, Setting("how many")] = 1) -> None: ...
+
+
+def eat(pieces: Annotated[int, Setting("how many", ge=1)] = 3) -> None: ...
+
+
+def sleep(hours: int) -> None: ...
+
+
+class Keeper: ...
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (None, "must be a function or a dataclass with settings, .* got None"),
+        ("feed", "must be a function .* got 'feed'"),
+        ("", "must be a function .* got ''"),
+        (("feed",), "must be a function .* got 'feed'"),
+        ({feed}, r"must be a function .* or a tuple or list of them, got \{<function feed"),
+        ((feed, None), "must be a function .* got None"),
+        ([], "settings= names no function; name one, or leave it out"),
+        (sleep, "sleep in settings= has no settings; annotate its keyword-only parameters with Setting"),
+        ((feed, sleep), "sleep in settings= has no settings"),
+        (FeedParams, "FeedParams in settings= cannot be read"),
+        (Keeper, "the settings of Keeper in settings= cannot be read: .*dataclass"),
+        (eat, "eat in settings= cannot be read: .* must be a keyword-only parameter"),
+        (partial(feed, "cow"), "in settings= cannot be read"),
+        ((feed, feed_again), "both feed and feed_again in settings= have a setting 'pieces'; rename one"),
+        ([feed, feed], "both feed and feed in settings= have a setting 'pieces'"),
+    ],
+)
+def test_what_cannot_be_the_settings_of_a_stage_is_refused(settings: Any, why: str) -> None:
+    """Equal names hid each other, an empty model was accepted, and other values raised a bare TypeError."""
+
+    def fed(features: Each[Features], params: Params) -> Features:
+        return features
+
+    with pytest.raises(PluginError, match=rf"stage 'zoo\.fed' \(.*test_settings\.py:\d+\): .*{why}"):
+        stage("zoo.fed", settings=settings)(fed)
+
+
+def without_params(features: Each[Features]) -> Features:
+    return features
+
+
+def with_a_model_of_its_own(features: Each[Features], params: ZooParams) -> Features:
+    return features
+
+
+def with_two(features: Each[Features], params: Params, others: Params) -> Features:
+    return features
+
+
+def with_two_models(features: Each[Features], others: ZooParams, params: Params) -> Features:
+    return features
+
+
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (without_params, "none"),
+        (with_a_model_of_its_own, "params: ZooParams"),
+        (with_two, "params, others"),
+        (with_two_models, "others, params"),
+    ],
+)
+def test_a_stage_with_settings_of_algorithms_has_one_argument_for_them(function: Callable[..., Any], got: str) -> None:
+    """Without one they were shown and never used, and the fields of another model were missing at run time."""
+    why = rf"'zoo\.fed' .* exactly one argument annotated Params itself .* got {got}; .* with params_from"
+    with pytest.raises(PluginError, match=why):
+        stage("zoo.fed", settings=feed)(function)
 
 
 @pytest.mark.parametrize(
