@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from pano_mvs.algorithms.poses.frame.vertical_lines import directions_around
 from pano_mvs.core.arrays import FloatArray
@@ -102,8 +103,6 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
         centers: (N, 3) camera centres in the world, all at about the same height above one floor.
         up: (3,) unit vector away from gravity.
     """
-    from scipy.ndimage import gaussian_filter1d  # slow to import
-
     heights = centers @ up
     depths = float(np.median(heights)) - points @ up
     lowest = float(np.median(heights) - heights.min())
@@ -129,8 +128,6 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
 
 def _concentration(heights: FloatArray, width: float) -> float:
     """Return the integral of the squared density of heights, smoothed to a given width."""
-    from scipy.ndimage import gaussian_filter1d  # slow to import
-
     step = width / _BINS_PER_WIDTH
     positions = (heights - heights.min()) / step
     lower = positions.astype(np.int64)
