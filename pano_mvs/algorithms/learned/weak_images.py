@@ -79,6 +79,6 @@ def learned_pairs(
         name: vlad_descriptor(one.only_learned(), sample=1000) for name, one in features.items() if one.learned
     }
     found = retrieval_pairs(list(descriptors), descriptors, neighbours=neighbours)
-    verified = {pair for pair, view in (matches or {}).items() if view and descriptors.keys() >= {*pair}}
+    verified = {pair for pair, view in (matches or {}).items() if descriptors.keys() >= {*pair} and view}
     place = {name: idx for idx, name in enumerate(features)}
     return Pairs(tuple(sorted({*found.pairs, *verified}, key=lambda pair: (place[pair[0]], place[pair[1]]))))

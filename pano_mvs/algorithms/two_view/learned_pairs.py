@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation, ranges_from_bearings
@@ -70,8 +71,6 @@ def marks_of(first: Features, second: Features, pose: Rigid3, *, rays: tuple[Flo
         pose: second_from_first, |t| = 1.
         rays: (M, 3) unit rays of the matches that agree, in either image.
     """
-    from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below  # imports scipy, which plugins await
-
     p, q = rays
     left_deg = np.rad2deg(np.median(angle_between(p @ nearest_rotation(q.T @ p).T, q)))
     alike = float(np.log2(max(1.0, _ALIKE_DEG / max(float(left_deg), 0.1))))

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from pano_mvs.algorithms.points.floor import Floor, floor_below
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.horizontal_layers import Floor, floor_below
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Similarity3

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
+from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.poses.frame.vertical_lines import (
     SIDES,
     Picture,

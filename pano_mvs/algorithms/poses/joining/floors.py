@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below
+from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ranges_from_bearings

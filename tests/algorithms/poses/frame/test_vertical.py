@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
+from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below, sharpest_up
+from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
 from pano_mvs.algorithms.poses.frame.vertical import (
