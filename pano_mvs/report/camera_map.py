@@ -13,8 +13,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
 from pano_mvs.results.figures import significant
 from pano_mvs.results.records import Direction, PairLink, PosesSummary
-from pano_mvs.scene.poses import states_y_down
-from pano_mvs.scene.upright import states_z_north
+from pano_mvs.scene.upright import states_y_down, states_z_north
 
 _WINDOW = 10  # cameras whose positions in the capture differ by at most this follow each other closely
 

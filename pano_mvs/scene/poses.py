@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Final, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +21,12 @@ class Pose(Record):
         cam_from_world: the rigid transform into the camera frame.
         group: number of the group whose world this is (see `Poses.group_idx`). Poses of different groups are
             unrelated.
-        level: whether the y axis of this world points down along gravity.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
     cam_from_world: Rigid3
     group: int = 0
-    level: bool = False
 
     def check(self) -> None:
         """Raise ContractError unless the pose is a finite rigid transform."""
@@ -43,8 +40,7 @@ class Pose(Record):
         """Return the pose as one JSON object (floats without loss of precision)."""
         pose = self.cam_from_world
         meta = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-        known = {"group": self.group, "level": self.level}
-        return {"meta": meta | {name: value for name, value in known.items() if value}}
+        return {"meta": meta | ({"group": self.group} if self.group else {})}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
@@ -52,19 +48,11 @@ class Pose(Record):
         meta = parts["meta"]
         assert isinstance(meta, dict)
         pose = Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64))
-        return cls(pose, meta.get("group", 0), meta.get("level", False))
+        return cls(pose, meta.get("group", 0))
 
 
 PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares", "right_probabilities")
 """Fields of `Poses` that may hold a number for each camera."""
-
-
-_STATES_DOWN: Final = re.compile(r"\by down\b")
-
-
-def states_y_down(frame: str) -> bool:
-    """Return whether the description of a world frame states that y points down, along gravity."""
-    return _STATES_DOWN.search(frame) is not None
 
 
 class World(NamedTuple):
@@ -202,11 +190,8 @@ class Poses(Record):
 
     def explode(self) -> Mapping[str, Pose]:
         """Return the pose of each registered image."""
-        level = [states_y_down(world.frame) for world in self.worlds]
         groups = self.groups.tolist()
-        return {
-            name: Pose(self.cam_from_world(idx), groups[idx], level[groups[idx]]) for idx, name in enumerate(self.names)
-        }
+        return {name: Pose(self.cam_from_world(idx), groups[idx]) for idx, name in enumerate(self.names)}
 
     def doubted(self) -> Mapping[str, str]:
         """Return the images whose poses are doubtful, with the reason."""

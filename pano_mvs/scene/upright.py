@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_two_vectors
-from pano_mvs.scene.poses import Poses, states_y_down
+from pano_mvs.scene.poses import Poses
 
 WORLD_UP: Final = (0.0, -1.0, 0.0)
 """The up direction of a world that nothing has levelled: −y, that of the first camera."""
@@ -36,6 +36,7 @@ def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
 
 _Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+_STATES_DOWN: Final = re.compile(r"\by down\b")
 _STATES_NORTH: Final = re.compile(r"\bz north\b")
 
 
@@ -53,6 +54,11 @@ def world_up(poses: Poses) -> FloatArray:
     axis = np.zeros(3)
     axis[largest] = np.sign(mean[largest])
     return axis if float(axis @ mean) >= np.cos(np.deg2rad(20.0)) else mean
+
+
+def states_y_down(frame: str) -> bool:
+    """Return whether the description of a world frame states that y points down, along gravity."""
+    return _STATES_DOWN.search(frame) is not None
 
 
 def states_z_north(frame: str) -> bool:

@@ -21,8 +21,7 @@ from pano_mvs.results.summary import INTERRUPTED
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.poses import states_y_down
-from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 from pano_mvs.share.maps import run_plans
 from pano_mvs.share.mesh_file import run_mesh, thinned
 from pano_mvs.share.page_folder import PageFolder

@@ -20,8 +20,7 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
-from pano_mvs.scene.poses import states_y_down
-from pano_mvs.scene.upright import WORLD_UP, mean_up_direction
+from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 

@@ -9,8 +9,14 @@ from hypothesis import strategies as st
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Poses
-from pano_mvs.scene.poses import states_y_down
-from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, world_up, y_up_from_world, z_up_from_world
+from pano_mvs.scene.upright import (
+    WORLD_UP,
+    mean_up_direction,
+    states_y_down,
+    world_up,
+    y_up_from_world,
+    z_up_from_world,
+)
 
 LEVELLED = "origin at the first registered camera; y down along gravity, by the cameras; z as before"
 

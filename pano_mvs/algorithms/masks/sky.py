@@ -211,9 +211,7 @@ def judged_areas(view: View, models: tuple[Model, Model]) -> tuple[Mask, list[tu
     smooth = view.valid & (far | (contrast_around(view.picture, 1) < _SMOOTH))
     areas = _numbered(area_labels(smooth), view, min_share=_MIN_SHARE)
     sky: Mask = np.zeros_like(view.valid)
-    done: list[tuple[Labels, dict[str, FloatArray]]] = []
-    if not (areas >= 0).any():
-        return sky, done
+    done = []
     features = area_features(view, areas)
     for number in range(_ROUNDS):
         done.append((areas, features))

@@ -22,9 +22,9 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import UP
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.poses import states_y_down
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
+from pano_mvs.scene.upright import states_y_down
 
 _LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 64, 200, 5
 _ALONG_NORMAL = 0.7

@@ -29,8 +29,7 @@ from pano_mvs.io.tour_players import (
 )
 from pano_mvs.scene.files import LevelPanorama, group_file, item_stems
 from pano_mvs.scene.pose_groups import split_groups
-from pano_mvs.scene.poses import states_y_down
-from pano_mvs.scene.upright import states_z_north
+from pano_mvs.scene.upright import states_y_down, states_z_north
 
 _FOLDER = "panoramas"
 Player = Literal["pannellum", "marzipano", "krpano"]
