@@ -94,8 +94,13 @@ def marks_of(first: Features, second: Features, pose: Rigid3, *, rays: tuple[Flo
     return max(found, key=lambda marks: float(terms_of(-_UNIT, marks) @ WEIGHTS))
 
 
-def max_log10_of_learned(marks: Marks) -> float:
-    """Return log₁₀ of the most false alarms with which a pair of learned matches is accepted by itself."""
+def max_log10_of_learned(marks: Marks, *, weak: bool = False) -> float:
+    """Return log₁₀ of the most false alarms with which a pair of learned matches is accepted by itself.
+
+    Args:
+        marks: what else speaks for its pose.
+        weak: without `CERTAIN`: relative to what do weak pairs count?
+    """
     odds = float(terms_of(-_UNIT, marks) @ WEIGHTS)
     demanded = -_UNIT * 2.0 ** ((ACCEPTED_ODDS - odds) / WEIGHTS[1])
-    return float(np.clip(demanded, CERTAIN, MAX_LOG10_FALSE_ALARMS))
+    return float(min(demanded if weak else max(demanded, CERTAIN), MAX_LOG10_FALSE_ALARMS))

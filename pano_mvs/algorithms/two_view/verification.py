@@ -191,11 +191,13 @@ def pose_near(
     view, parallax = pair.view(evidence)
     if _why_no_parallax(parallax, pair.threshold_rad) or _why_open(view.direction_std_deg):
         return None
-    return near, evidence.log10_false_alarms, evidence.most
+    agree = agreement(near, p, q, threshold_rad=pair.threshold_rad)[1]
+    most = max_log10_false_alarms(first, second, near, rays=(p[agree], q[agree]), weak=True)
+    return near, evidence.log10_false_alarms, most
 
 
 def max_log10_false_alarms(
-    first: Features, second: Features, pose: Rigid3, *, rays: tuple[FloatArray, FloatArray]
+    first: Features, second: Features, pose: Rigid3, *, rays: tuple[FloatArray, FloatArray], weak: bool = False
 ) -> float:
     """Return log₁₀ of the most false alarms with which the relative pose of a pair is accepted by itself.
 
@@ -204,10 +206,11 @@ def max_log10_false_alarms(
         second: those of the second image.
         pose: second_from_first, |t| = 1.
         rays: (M, 3) unit rays of the matches that agree, in either image.
+        weak: whether the pair was not accepted, and counts relative to this beside others.
     """
     if not (first.learned and second.learned):
         return MAX_LOG10_FALSE_ALARMS
-    return max_log10_of_learned(marks_of(first, second, pose, rays=rays))
+    return max_log10_of_learned(marks_of(first, second, pose, rays=rays), weak=weak)
 
 
 @dataclass(frozen=True, eq=False)

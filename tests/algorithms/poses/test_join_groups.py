@@ -209,7 +209,7 @@ def test_rooms_that_fit_in_two_places_stay_two_groups() -> None:
 @pytest.mark.parametrize(("pairs", "groups"), [([("a1", "b1")], 2), ([("a1", "b1"), ("a2", "b2")], 1)])
 def test_learned_pairs_that_are_weak_by_themselves_add_up(pairs: list[tuple[str, str]], groups: int) -> None:
     truth = room_poses()
-    features = with_points_of_pairs(room_features(truth, door=1), truth, pairs, count=75)
+    features = with_points_of_pairs(room_features(truth, door=1), truth, pairs, count=80)
     learned = {name: replace(one, learned=len(one)) for name, one in features.items()}
     views = matched(learned)
     assert not any(views[pair] for pair in pairs)

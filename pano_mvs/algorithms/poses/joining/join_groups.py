@@ -255,16 +255,18 @@ def _evidence_of_pairs(
     for (i, j), view in views.items():
         if view.geometry == "rotation":
             continue
-        features = [first.pairs.features[first.pairs.names[image]] for image in (i, j)]
+        features = first.pairs.features[first.pairs.names[i]], first.pairs.features[first.pairs.names[j]]
         relative = joined.cameras[j] @ joined.cameras[i].inverse()
         own, limit = 0.0, MAX_LOG10_FALSE_ALARMS
         geometry = view if view else next(iter(view.alternatives), None)
         if geometry is not None and view.log10_false_alarms < 0:
             pose, matches = oriented(geometry, i, j)
             p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
-            own, limit = view.log10_false_alarms, max_log10_false_alarms(features[0], features[1], pose, rays=(p, q))
+            own, limit = view.log10_false_alarms, max_log10_false_alarms(*features, pose, rays=(p, q))
             if not view and own <= limit:
                 continue  # it was refused since its direction is open, such as for distant scenery alone
+            if not view:
+                limit = max_log10_false_alarms(*features, pose, rays=(p, q), weak=True)
             if _is_same(pose, relative):
                 by_pair[i, j] = own / limit
                 alarms.append(own)
