@@ -61,10 +61,3 @@ class Model:
     def probability(self, row: Mapping[str, float]) -> float:
         """Return the probability for one row of measurements."""
         return float(1 / (1 + np.exp(-self.intercept - sum(self.contributions(row).values()))))
-
-    def probabilities(self, columns: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the probabilities (N,) for columns (N,) of measurements, NaN where missing."""
-        logit = np.full(len(next(iter(columns.values()))), self.intercept)
-        for name, term in self.terms.items():
-            logit += term.contributions(columns[name])
-        return np.asarray(1 / (1 + np.exp(-logit)))
