@@ -85,6 +85,12 @@ def distinct_geometries(
     return [geometry.pose for geometry in known]
 
 
+def are_distinct(pose: Rigid3, other: Rigid3) -> bool:
+    """Return whether two relative poses differ by 1.5° of rotation or 2.5° of direction."""
+    turn = float(geodesic_angle(pose.rotation, other.rotation))
+    return turn > _MIN_TURN_RAD or float(angle_between(pose.translation, other.translation)) > _MIN_DIRECTION_RAD
+
+
 @dataclass(frozen=True, eq=False)
 class _Search:
     """The search for further geometries of a pair."""
@@ -114,7 +120,7 @@ class _Search:
         poses = [best]
         for essential in least_essentials(twins, p, q, threshold_rad=2 * self.threshold_rad, count=_PEAKS):
             rough = facing_pose(essential, p, q, threshold_rad=2 * self.threshold_rad)
-            if _differ(rough, best):
+            if are_distinct(rough, best):
                 poses.append(self._settled(rough, p, q, widths=(2.0, 1.0)))
         costs = facing_costs(poses, self.first, self.second, threshold_rad=self.threshold_rad)
         return poses[int(np.argmin(costs))], twins
@@ -139,7 +145,7 @@ class _Search:
             # Number of candidates that are verified.
             if support[idx] < needed or len(chosen) == 4:
                 break
-            if all(_differ(rough[idx], other) for other in chosen):
+            if all(are_distinct(rough[idx], other) for other in chosen):
                 chosen.append(rough[idx])
         found = [self.geometry(self._settled(pose, self.first, self.second, widths=(1.5, 1.0))) for pose in chosen]
         found.sort(key=lambda geometry: -int((geometry.agreeing & searched).sum()))
@@ -204,18 +210,13 @@ def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArr
     """Return whether a geometry differs from all known ones, and is not one of them adapted to a few more matches."""
     mostly_own = 2 * (geometry.agreeing & searched).sum() > geometry.agreeing.sum()
     for other in known:
-        if not _differ(geometry.pose, other.pose):
+        if not are_distinct(geometry.pose, other.pose):
             return False
         turn = float(geodesic_angle(geometry.pose.rotation, other.pose.rotation))
         between = float(angle_between(geometry.pose.translation, other.pose.translation))
         if turn < float(np.deg2rad(5.0)) and between < float(np.deg2rad(20.0)) and not mostly_own:
             return False
     return True
-
-
-def _differ(pose: Rigid3, other: Rigid3) -> bool:
-    turn = float(geodesic_angle(pose.rotation, other.rotation))
-    return turn > _MIN_TURN_RAD or float(angle_between(pose.translation, other.translation)) > _MIN_DIRECTION_RAD
 
 
 def _distinct_rotations(known: Sequence[_Geometry]) -> list[FloatArray]:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
+from pano_mvs.algorithms.two_view.alternatives import are_distinct, distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
-from pano_mvs.algorithms.two_view.learned_pairs import marks_of, max_log10_of_learned
+from pano_mvs.algorithms.two_view.learned_pairs import (
+    ACCEPTED_ODDS,
+    CERTAIN,
+    Marks,
+    log_odds_of,
+    marks_of,
+    weight_of_learned,
+)
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose
@@ -26,12 +34,13 @@ from pano_mvs.algorithms.two_view.upright import upright_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3, angle_between
+from pano_mvs.geometry import UP, Rigid3, angle_between, rotation_from_two_vectors
 from pano_mvs.scene import Features, TwoView
 
 MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""
 
+_THRESHOLD_RAD = float(np.deg2rad(0.2))
 _MIN_WITH_PARALLAX = 8
 _NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 
@@ -62,8 +71,8 @@ def verify_pair(
     determine a relative pose, so that far fewer true matches are more than chance (see `upright_poses`).
 
     If a network has found key points in both images, false matches agree with one another far more often than shuffled
-    ones. How significant a pose must be then depends on what else speaks for it, such as a floor (see `learned_pairs`),
-    and upright poses are not sought.
+    ones. How significant a pose must be then depends on what else speaks for it, such as a floor (see `learned_pairs`).
+    Of the best pose, its runners-up and upright poses, the most probable one counts.
 
     Args:
         first: key points of the first image.
@@ -95,15 +104,14 @@ def verify_pair(
     minimal = SOLVERS[solver]
     tried = [pair.evidence(pose.second_from_first, sample=minimal.sample, models=minimal.models)] if pose else []
     if refine and not learned and not any(tried):
-        tried += [
-            pair.evidence(upright, sample=3, models=4)
-            for upright in upright_poses(p, q, rng=rng, threshold_rad=pair.threshold_rad)
-        ]
-    tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
+        tried += pair.upright()
+        tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
     if turned.sum() >= max(min_inliers, 0.9 * (tried[0].inliers if tried else 0)):
         return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
     if not tried:
         return pair.failed(pose.reason)
+    if refine and learned:
+        return pair.most_probable(tried[0], most=max_alternatives)
     best = pair.judged(tried[0])
     if not best:
         hypotheses = [pair.view(one)[0] for one in tried if np.isfinite(one.log10_false_alarms)]
@@ -111,15 +119,7 @@ def verify_pair(
         return replace(best, log10_false_alarms=alarms).with_alternatives(hypotheses)
     if not (refine and max_alternatives):
         return best
-    poses = distinct_geometries(
-        tried[0].pose,
-        p,
-        q,
-        rng=rng,
-        threshold_rad=pair.threshold_rad,
-        min_inliers=min_inliers,
-        most=max_alternatives,
-    )
+    poses = pair.distinct(tried[0].pose, most=max_alternatives)
     costs = facing_costs(poses, p, q, threshold_rad=pair.threshold_rad)
     # Their significance is that of the pair: each was found to be more than chance.
     ranked = [replace(tried[0], pose=poses[idx]) for idx in np.argsort(costs, kind="stable")]
@@ -147,7 +147,7 @@ def verify_pose(
         rng: draws false matches.
     """
     min_inliers = 8
-    pair = _Pair(first, second, matches_idx, rng, float(np.deg2rad(0.2)), min_inliers, known=True)
+    pair = _Pair(first, second, matches_idx, rng, _THRESHOLD_RAD, min_inliers, known=True)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0 or len(matches_idx) < min_inliers:
@@ -171,10 +171,10 @@ def pose_near(
         pose: second_from_first; its length is ignored.
 
     Returns:
-        The pose, |t| = 1; log₁₀ of its false alarms among all poses; and the most with which a pair is accepted by
-        itself. None if hardly any match agrees, or those that do leave the direction open.
+        The pose, |t| = 1; log₁₀ of its false alarms among all poses; and its weight (see `weight_of_pair`). None if
+        hardly any match agrees, or those that do leave the direction open.
     """
-    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), float(np.deg2rad(0.2)), _MIN_NEAR)
+    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, _MIN_NEAR)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0:
@@ -188,29 +188,47 @@ def pose_near(
     evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
     if not np.isfinite(evidence.log10_false_alarms):
         return None
-    view, parallax = pair.view(evidence)
-    if _why_no_parallax(parallax, pair.threshold_rad) or _why_open(view.direction_std_deg):
+    if pair.why_open(evidence):
         return None
-    agree = agreement(near, p, q, threshold_rad=pair.threshold_rad)[1]
-    most = max_log10_false_alarms(first, second, near, rays=(p[agree], q[agree]), weak=True)
-    return near, evidence.log10_false_alarms, most
+    alarms = evidence.log10_false_alarms
+    return near, alarms, weight_of_pair(first, second, pair.view(evidence)[0], log10_false_alarms=alarms)
 
 
-def max_log10_false_alarms(
-    first: Features, second: Features, pose: Rigid3, *, rays: tuple[FloatArray, FloatArray], weak: bool = False
-) -> float:
-    """Return log₁₀ of the most false alarms with which the relative pose of a pair is accepted by itself.
+def weight_of_pair(first: Features, second: Features, view: TwoView, *, log10_false_alarms: float) -> float:
+    """Return how significant the geometry of a pair is, relative to what is required of one that is accepted by itself.
 
     Args:
         first: key points of the first image.
         second: those of the second image.
-        pose: second_from_first, |t| = 1.
-        rays: (M, 3) unit rays of the matches that agree, in either image.
-        weak: whether the pair was not accepted, and counts relative to this beside others.
+        view: the geometry, or a hypothesis.
+        log10_false_alarms: how significant it is by its matches.
     """
     if not (first.learned and second.learned):
-        return MAX_LOG10_FALSE_ALARMS
-    return max_log10_of_learned(marks_of(first, second, pose, rays=rays), weak=weak)
+        return max(0.0, log10_false_alarms / MAX_LOG10_FALSE_ALARMS)
+    return weight_of_learned(log10_false_alarms, pair_marks(first, second, view))
+
+
+def pair_marks(first: Features, second: Features, view: TwoView) -> Marks:
+    """Return what speaks for the geometry of a pair of learned matches, or for a hypothesis, beside their number."""
+    pose = Rigid3(view.rotation, view.direction)
+    rays = first.bearings[view.matches_idx[:, 0]], second.bearings[view.matches_idx[:, 1]]
+    _, direction_std_deg = _determination(pose, rays, view.residuals_rad)
+    return marks_of(first, second, pose, rays=rays, direction_std_deg=direction_std_deg)
+
+
+def _determination(
+    pose: Rigid3,
+    rays: tuple[FloatArray, FloatArray],
+    residuals_rad: FloatArray | NDArray[np.float32],
+    *,
+    threshold_rad: float = _THRESHOLD_RAD,
+) -> tuple[float, float]:
+    """Return the standard deviations of rotation and direction of a pose, in degrees, by matches that agree with it."""
+    noise_rad = max(float(np.sqrt(np.mean(residuals_rad**2))), 0.1 * threshold_rad)
+    # Clustered matches count as one.
+    noise_rad *= float(np.sqrt(len(rays[0]) / independent_count(*rays)))
+    rotation_std, direction_std = pose_uncertainty(pose, *rays, noise_rad=noise_rad)
+    return float(np.rad2deg(rotation_std)), float(np.rad2deg(direction_std))
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,10 +240,11 @@ class _Evidence:
     witnesses: int
     log10_false_alarms: float
     enough: bool
-    most: float = MAX_LOG10_FALSE_ALARMS
+    likely: bool = True
+    log_odds: float = 0.0  # that it is right, if a network has found the matches
 
     def __bool__(self) -> bool:
-        return self.enough and self.log10_false_alarms <= self.most
+        return self.enough and self.likely and self.log10_false_alarms <= MAX_LOG10_FALSE_ALARMS
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,20 +299,19 @@ class _Pair:
             models_per_sample=models,
         )
         enough = witnesses >= self.min_inliers
-        most = MAX_LOG10_FALSE_ALARMS
-        if not self.known:
-            most = max_log10_false_alarms(self.first, self.second, pose, rays=(self.p[inliers], self.q[inliers]))
-        return _Evidence(pose, count, witnesses, alarms, enough, most)
+        found = _Evidence(pose, count, witnesses, alarms, enough)
+        if self.known or not (self.first.learned and self.second.learned):
+            return found
+        marks = pair_marks(self.first, self.second, self.view(found)[0])
+        log_odds = log_odds_of(alarms, marks)
+        return replace(found, log_odds=log_odds, likely=log_odds >= ACCEPTED_ODDS or alarms <= CERTAIN)
 
     def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
         """Return the geometry of a pose with inliers, and the parallax of each inlier in radians."""
         pose = evidence.pose
         residuals, kept = agreement(pose, self.p, self.q, threshold_rad=self.threshold_rad)
         p, q, residuals = self.p[kept], self.q[kept], residuals[kept]
-        noise_rad = max(float(np.sqrt(np.mean(residuals**2))), 0.1 * self.threshold_rad)
-        # Clustered matches count as one.
-        noise_rad *= float(np.sqrt(len(p) / independent_count(p, q)))
-        rotation_std_deg, direction_std_deg = np.rad2deg(pose_uncertainty(pose, p, q, noise_rad=noise_rad))
+        rotation_std_deg, direction_std_deg = _determination(pose, (p, q), residuals, threshold_rad=self.threshold_rad)
         parallax = angle_between(p @ pose.rotation.T, q)
         view = TwoView(
             matches_idx=self.matches_idx[kept],
@@ -303,12 +321,68 @@ class _Pair:
             geometry="general",
             candidates=len(self.p),
             parallax_deg=float(np.rad2deg(np.median(parallax))),
-            rotation_std_deg=float(rotation_std_deg),
-            direction_std_deg=float(direction_std_deg),
+            rotation_std_deg=rotation_std_deg,
+            direction_std_deg=direction_std_deg,
             log10_false_alarms=evidence.log10_false_alarms,
             unverified_idx=self.matches_idx[~kept],
         )
         return view, parallax
+
+    def upright(self) -> list[_Evidence]:
+        """Return poses of the pair as of two upright images, for each direction that may be up."""
+        found = []
+        for one, other in product(self.first.ups, self.second.ups):
+            level, other_level = (rotation_from_two_vectors(np.array(up), UP) for up in (one, other))
+            for pose in upright_poses(
+                self.p @ level.T, self.q @ other_level.T, rng=self.rng, threshold_rad=self.threshold_rad
+            ):
+                turned = Rigid3(other_level.T @ pose.rotation @ level, other_level.T @ pose.translation)
+                found.append(self.evidence(turned, sample=3, models=4))
+        return found
+
+    def distinct(self, pose: Rigid3, *, most: int) -> list[Rigid3]:
+        """Return the pose, or its better twin, and at most `most` others with enough matches of their own."""
+        return distinct_geometries(
+            pose,
+            self.p,
+            self.q,
+            rng=self.rng,
+            threshold_rad=self.threshold_rad,
+            min_inliers=self.min_inliers,
+            most=most,
+        )
+
+    def most_probable(self, best: _Evidence, *, most: int) -> TwoView:
+        """Return the most probable geometry of a pair of learned matches, with others that would be accepted as well.
+
+        Args:
+            best: the pose with which most matches agree.
+            most: number of others, or of hypotheses if none is accepted.
+        """
+        minimal = SOLVERS["five_point"]
+        tried = [best, *self.upright()]
+        tried += [
+            self.evidence(pose, sample=minimal.sample, models=minimal.models)
+            for pose in self.distinct(best.pose, most=most)
+        ]
+        known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not self.why_open(one)]
+        if not known:
+            return self.judged(best)
+        ranked: list[_Evidence] = []
+        for one in sorted(known, key=lambda one: -one.log_odds):
+            if all(are_distinct(one.pose, other.pose) for other in ranked):
+                ranked.append(one)
+        first, *others = [one for one in ranked if one] or ranked
+        views = [self.view(one)[0] for one in others[:most]]
+        if first:
+            return self.view(first)[0].with_alternatives(views)
+        failed = replace(self.judged(first), log10_false_alarms=first.log10_false_alarms)
+        return failed.with_alternatives([self.view(first)[0], *views])
+
+    def why_open(self, evidence: _Evidence) -> str:
+        """Return a reason if the matches that agree with a pose do not determine it; "" otherwise."""
+        view, parallax = self.view(evidence)
+        return _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)
 
     def judged(self, evidence: _Evidence) -> TwoView:
         """Return the geometry of a pose, or why its matches do not determine it."""
@@ -319,9 +393,8 @@ class _Pair:
             if evidence.log10_false_alarms <= MAX_LOG10_FALSE_ALARMS:
                 chance = "but the images may show two things that look alike"
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
-        view, parallax = self.view(evidence)
-        reason = _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)
-        return self.failed(reason) if reason else view
+        reason = self.why_open(evidence)
+        return self.failed(reason) if reason else self.view(evidence)[0]
 
 
 def _from_one_place(

@@ -8,11 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, CERTAIN, WEIGHTS, marks_of, max_log10_of_learned
+from pano_mvs.algorithms.two_view.learned_pairs import (
+    ACCEPTED_ODDS,
+    CERTAIN,
+    PRIOR_ODDS,
+    WEIGHTS,
+    Marks,
+    log_odds_of,
+    marks_of,
+    weight_of_learned,
+)
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import features_from_bearings
-from tools.benchmarks.poses.tours.pair_evidence import fitted, left_out, read_table
+from tools.benchmarks.poses.tours.pair_evidence import fitted, left_out, prior_odds, read_table
 
 HEIGHT, DISTANCE = 1.6, 2.4
 POSE = Rigid3.from_center(rotation_from_rotvec((0.0, 0.7, 0.0)), np.array([DISTANCE, 0.0, 0.0]))
@@ -36,35 +45,36 @@ def _unit(pose: Rigid3) -> Rigid3:
     return Rigid3(pose.rotation, pose.translation / np.linalg.norm(pose.translation))
 
 
-def test_a_true_pose_shows_the_floor_level_cameras_and_their_distance() -> None:
-    rays = _rays(_room())
+def _marks(rays: tuple[FloatArray, FloatArray], pose: Rigid3 = POSE, *, std_deg: float = 0.5) -> Marks:
     first, second = (features_from_bearings(one) for one in rays)
-    marks = marks_of(first, second, _unit(POSE), rays=rays)
-    assert marks.alike == 0
+    return marks_of(first, second, _unit(pose), rays=rays, direction_std_deg=std_deg)
+
+
+def test_a_true_pose_shows_the_floor_level_cameras_and_their_distance() -> None:
+    marks = _marks(_rays(_room()))
     assert marks.tilt == pytest.approx(0, abs=1e-3)
-    assert marks.climb == pytest.approx(0, abs=1e-3)
     assert marks.floor > 0.7
     assert marks.near == 0  # 1.6 m above the floor, 2.4 m apart
-    close = Rigid3.from_center(POSE.rotation, np.array([0.2, 0.0, 0.0]))
-    marks = marks_of(first, second, _unit(close), rays=_rays(_room(), close))
-    assert marks.near == pytest.approx(np.log2(HEIGHT / 0.2), abs=0.01)
-    assert marks.alike > 0
+    assert marks.parallax > np.log2(20)
+    assert marks.open == -1
+    close = Rigid3.from_center(POSE.rotation, np.array([1.0, 0.0, 0.0]))
+    marks = _marks(_rays(_room(), close), close, std_deg=4.0)
+    assert marks.near == pytest.approx(np.log2(HEIGHT), abs=0.01)
+    assert marks.parallax < np.log2(20)
+    assert marks.open == 2
 
 
-def test_a_tilted_or_climbing_pose_and_one_without_a_floor_have_less_to_say_for_them() -> None:
+def test_a_tilted_pose_and_one_without_a_floor_or_parallax_have_less_to_say_for_them() -> None:
     rays = _rays(_room())
-    first, second = (features_from_bearings(one) for one in rays)
-    true = marks_of(first, second, _unit(POSE), rays=rays)
-    tilted = Rigid3(rotation_from_rotvec((0.0, 0.0, 0.1)) @ POSE.rotation, POSE.translation)
-    assert marks_of(first, second, _unit(tilted), rays=rays).tilt == pytest.approx(np.rad2deg(0.1), abs=1e-3)
-    stair = Rigid3.from_center(POSE.rotation, np.array([1.5, -1.5, 0.0]))
-    assert marks_of(first, second, _unit(stair), rays=_rays(_room(), stair)).climb == pytest.approx(45, abs=1e-3)
-    walls = _rays(_room(below=0))
-    without = marks_of(first, second, _unit(POSE), rays=walls)
+    true = _marks(rays)
+    tilted = Rigid3(rotation_from_rotvec((0.0, 0.0, 0.03)) @ POSE.rotation, POSE.translation)
+    assert _marks(rays, tilted).tilt == pytest.approx(np.rad2deg(0.03), abs=1e-3)
+    without = _marks(_rays(_room(below=0)))
     assert without.floor == 0
-    assert max_log10_of_learned(true) > 5 * max_log10_of_learned(without)
-    for worse in (true._replace(tilt=5.0), true._replace(climb=5.0), true._replace(alike=2.0), true._replace(near=2.0)):
-        assert max_log10_of_learned(worse) < max_log10_of_learned(true)
+    assert log_odds_of(-50, without) < log_odds_of(-50, true) - 2
+    worse = [true._replace(**{name: value}) for name, value in (("tilt", 4.0), ("near", 1.0), ("open", 1.0))]
+    for marks in (*worse, true._replace(parallax=0.0)):
+        assert log_odds_of(-50, marks) < log_odds_of(-50, true)
 
 
 def test_of_several_likely_zeniths_those_that_agree_count() -> None:
@@ -72,20 +82,24 @@ def test_of_several_likely_zeniths_those_that_agree_count() -> None:
     first, second = (features_from_bearings(one) for one in rays)
     ups = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
     turned = [replace(one, ups=ups, per_up=(0, 0, len(one)), learned=len(one)) for one in (first, second)]
-    found = marks_of(turned[0], turned[1], _unit(POSE), rays=rays)
-    assert found == marks_of(first, second, _unit(POSE), rays=rays)
+    assert marks_of(turned[0], turned[1], _unit(POSE), rays=rays, direction_std_deg=0.5) == _marks(rays)
 
 
-def test_a_certain_pair_is_accepted_whatever_its_marks() -> None:
-    rays = _rays(_room())
-    first, second = (features_from_bearings(one) for one in rays)
-    marks = marks_of(first, second, _unit(POSE), rays=rays)._replace(tilt=180.0, climb=90.0, floor=0.0, near=20.0)
-    assert max_log10_of_learned(marks) == CERTAIN
+def test_what_a_pair_weighs_beside_others() -> None:
+    marks = _marks(_rays(_room()))
+    accepted = next(exponent for exponent in range(3, 400) if log_odds_of(-exponent, marks) >= ACCEPTED_ODDS)
+    assert weight_of_learned(-accepted, marks) == pytest.approx(1, abs=0.02)
+    assert weight_of_learned(-accepted - 100.0, marks) > 1
+    bad = marks._replace(tilt=4.0, floor=0.0, near=1.0)
+    assert weight_of_learned(-20.0, bad) == 0  # less probable than any pair
+    assert weight_of_learned(CERTAIN, bad) == 1
+    assert weight_of_learned(-1.0, marks) == 0
 
 
 def test_the_weights_are_those_of_the_table() -> None:
     rows = read_table(TABLE)
     assert fitted(rows) == pytest.approx(WEIGHTS, abs=0.02)
+    assert prior_odds(rows) == pytest.approx(PRIOR_ODDS, abs=0.02)
     assert pytest.approx(np.log(5)) == ACCEPTED_ODDS
 
 

@@ -102,14 +102,14 @@ def test_learned_matches_that_a_rotation_explains_must_be_more_significant(
     """A network matches what looks alike in two places as if both were seen from one place."""
     rng = np.random.default_rng(4)
     pose = Rigid3(rotation_from_rotvec((0.0, 0.9, 0.0)), np.array([0.6, 0.0, 0.8]))
-    points = _unit(rng.normal(size=(130, 3))) * rng.uniform(*depth_m, (130, 1))
+    points = _unit(rng.normal(size=(100, 3))) * rng.uniform(*depth_m, (100, 1))
     seen = pose.apply(points)
-    seen[104:] = rng.normal(size=(26, 3))
+    seen[80:] = rng.normal(size=(20, 3))
     first, second = (features_from_bearings(_unit(rays)) for rays in (points, seen))
-    plain = verify_pair(first, second, _all(130), rng=np.random.default_rng(0))
+    plain = verify_pair(first, second, _all(100), rng=np.random.default_rng(0))
     assert plain.log10_false_alarms < -60
     first, second = (replace(one, learned=len(one)) for one in (first, second))
-    found = verify_pair(first, second, _all(130), rng=np.random.default_rng(0))
+    found = verify_pair(first, second, _all(100), rng=np.random.default_rng(0))
     assert bool(found) is verified
     assert verified or "two things that look alike" in found.reason
     assert verified or found.alternatives

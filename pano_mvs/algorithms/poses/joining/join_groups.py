@@ -18,7 +18,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, signific
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
-from pano_mvs.algorithms.two_view.verification import max_log10_false_alarms, pose_near
+from pano_mvs.algorithms.two_view.verification import pose_near, weight_of_pair
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
@@ -92,11 +92,13 @@ class _Joint(NamedTuple):
 
     alignment: Alignment
     pairs: _PairEvidence
+    learned: bool
 
     @property
     def strength(self) -> float:
         """How significant it is, by matches with known points or by pairs, relative to what is required."""
-        return max(self.alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS, self.pairs.agreeing)
+        by_matches = self.alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS
+        return self.pairs.agreeing if self.learned else max(by_matches, self.pairs.agreeing)
 
 
 def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
@@ -149,13 +151,16 @@ def _by_matches(
         if scale and _has_known_length(one, first, second, views=views, lengths=lengths):
             evidence = evidence._replace(has_length=True)
         if _is_significant(one, evidence, learned=learned):
-            certain.append(_Joint(one, evidence))
+            certain.append(_Joint(one, evidence, learned))
     if not certain:
         return None
     best = max(certain, key=lambda joint: joint.strength)
     # Where structure repeats, an alignment with another, similar place has matches of its own.
     rest = _aligned(matches[np.flatnonzero(~best.alignment.inliers)], hypotheses, known, has_scale=has_scale)
-    rivals = [*certain, *(_Joint(other, _evidence_of_pairs(other, first, second, views=views)) for other in rest[:1])]
+    rivals = [
+        *certain,
+        *(_Joint(other, _evidence_of_pairs(other, first, second, views=views), learned) for other in rest[:1]),
+    ]
     for other in rivals:
         places = best.alignment.first_from_second, other.alignment.first_from_second
         if are_apart(places, first, second) and _is_rival(best, other, matches):
@@ -217,7 +222,7 @@ def _is_significant(alignment: Alignment, evidence: _PairEvidence, *, learned: b
     Learned matches count only with such pairs, because false ones agree with one another.
     """
     by_matches = alignment.log10_false_alarms / _MAX_LOG10_FALSE_ALARMS
-    if learned and evidence.agreeing < 1:
+    if learned and evidence.agreeing < max(1.0, evidence.disagreeing):
         return False
     by_pairs = evidence.agreeing if evidence.has_length else 0.0
     return max(by_matches, by_pairs) >= 1 and max(by_matches, evidence.agreeing) >= evidence.disagreeing
@@ -227,7 +232,7 @@ class _PairEvidence(NamedTuple):
     """What the pairs between two models say about an alignment.
 
     Attributes:
-        by_pair: significance of each pair that agrees, relative to that which verifies a pair.
+        by_pair: significance of each pair that agrees, relative to that which verifies a pair (`weight_of_pair`).
         disagreeing: sum of that of those that do not agree.
         has_length: whether the matches of one that agrees determine its length, the floor does, or others that agree.
     """
@@ -257,32 +262,29 @@ def _evidence_of_pairs(
             continue
         features = first.pairs.features[first.pairs.names[i]], first.pairs.features[first.pairs.names[j]]
         relative = joined.cameras[j] @ joined.cameras[i].inverse()
-        own, limit = 0.0, MAX_LOG10_FALSE_ALARMS
+        own = 0.0
         geometry = view if view else next(iter(view.alternatives), None)
         if geometry is not None and view.log10_false_alarms < 0:
-            pose, matches = oriented(geometry, i, j)
-            p, q = (one.bearings[idx] for one, idx in zip(features, matches.T, strict=True))
-            own, limit = view.log10_false_alarms, max_log10_false_alarms(*features, pose, rays=(p, q))
-            if not view and own <= limit:
+            ordered = features if i < j else features[::-1]
+            own = weight_of_pair(*ordered, geometry, log10_false_alarms=view.log10_false_alarms)
+            if not view and own >= 1:
                 continue  # it was refused since its direction is open, such as for distant scenery alone
-            if not view:
-                limit = max_log10_false_alarms(*features, pose, rays=(p, q), weak=True)
-            if _is_same(pose, relative):
-                by_pair[i, j] = own / limit
-                alarms.append(own)
+            if _is_same(oriented(geometry, i, j)[0], relative):
+                by_pair[i, j] = own
+                alarms.append(view.log10_false_alarms)
                 has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
                 continue
         if not all(one.learned for one in features):
-            disagreeing += own / limit
+            disagreeing += own
             continue
         # The best pose of weak matches is a matter of chance; they may agree with the alignment nearly as well. Those
         # of SIFT are not weak but repeat: in a colonnade, they agree with several alignments.
         near = pose_near(features[0], features[1], view.all_matches_idx[:, :: 1 if i < j else -1], pose=relative)
-        here = min(near[1], 0.0) if near and _is_same(near[0], relative) else 0.0
-        if near and here < 0:
-            by_pair[i, j] = here / near[2]
-            alarms.append(here)
-        disagreeing += max(0.0, (own - here) / limit)
+        here = near[2] if near and _is_same(near[0], relative) else 0.0
+        if near and here > 0:
+            by_pair[i, j] = here
+            alarms.append(near[1])
+        disagreeing += max(0.0, own - here)
     has_length |= sum(sorted(alarms)[1:]) <= MAX_LOG10_FALSE_ALARMS
     return _PairEvidence(by_pair, disagreeing, has_length)
 

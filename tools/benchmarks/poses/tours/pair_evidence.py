@@ -4,16 +4,17 @@ Each DIR is a capture with truth.json, which `tools.benchmarks.poses.tours.measu
 relative pose of each pair that a network has matched is right if it agrees with the truth to 3° and 10°, or to 5° and
 15° where the truth was drawn by hand. `--table FILE` gets a row for each pair; without DIR, the rows are read from it.
 
-A logistic regression gives the odds that a pair is right by its false alarms and its `Marks`, which are the
-coefficients of `pano_mvs.algorithms.two_view.learned_pairs`. The table shows the pairs that these accept, fitted to
-all captures but the one of the row, beside those with at most 10⁻⁵⁰ false alarms.
+A logistic regression gives the odds that a pair is right by its false alarms and its `Marks`, which are
+the coefficients of `pano_mvs.algorithms.two_view.learned_pairs`. Which pose of a pair counts depends on them, so the
+table is written anew with new ones, until they stay. The table shows the pairs that they accept, fitted to all captures
+but the one of the row, beside those with at most 10⁻⁵⁰ false alarms.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -21,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, CERTAIN, Marks, marks_of, terms_of
+from pano_mvs.algorithms.two_view.learned_pairs import ACCEPTED_ODDS, CERTAIN, WEAKEST, Marks, terms_of
+from pano_mvs.algorithms.two_view.verification import pair_marks
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 from pano_mvs.scene import Features, TwoView
@@ -29,7 +31,6 @@ from pano_mvs.scene.record import Record
 from tools.benchmarks.poses.tours.measure import read_truth
 
 _EXACT_DEG, _DRAWN_DEG = (3.0, 10.0), (5.0, 15.0)
-_MIN_EXPONENT = 3.0  # weaker pairs are hardly ever right, and many
 _RIDGE = 0.025
 _Kind = TypeVar("_Kind", bound=Record)
 
@@ -49,8 +50,6 @@ def pair_rows(capture: Path, out: Path) -> Iterator[PairRow]:
     """Yield the learned pairs of a finished run."""
     truth = read_truth(capture)
     assert truth is not None, f"{capture} has no truth.json with headings"
-    poses, limits = truth
-    most = _EXACT_DEG if limits[0] < 2 else _DRAWN_DEG
     store = Store(out / "cache")
     keys = next(run.keys for run in store.runs.entries() if run.out == str((out / "run").resolve()))
 
@@ -61,18 +60,38 @@ def pair_rows(capture: Path, out: Path) -> Iterator[PairRow]:
         assert isinstance(value, kind)
         return value
 
-    for pair in keys.get("rematched", {}):
-        first, second = (name.strip() for name in pair.split("|"))
-        view = load("rematched", pair, TwoView)
-        ends = load("learned", first, Features), load("learned", second, Features)
-        best, true = view if view else next(iter(view.alternatives), None), poses[second] @ poses[first].inverse()
-        if best is None or view.geometry == "rotation":
+    features = {image: load("learned", image, Features) for image in keys.get("learned", {})}
+    views = {pair: load("rematched", pair, TwoView) for pair in keys.get("rematched", {})}
+    named = {(pair.split("|")[0].strip(), pair.split("|")[1].strip()): view for pair, view in views.items()}
+    yield from rows_of(capture.name, features, named, truth=truth)
+
+
+def rows_of(
+    capture: str,
+    features: Mapping[str, Features],
+    views: Mapping[tuple[str, str], TwoView],
+    *,
+    truth: tuple[Mapping[str, Rigid3], tuple[float, float]],
+) -> Iterator[PairRow]:
+    """Yield the learned pairs of a capture by their most probable pose.
+
+    Args:
+        capture: its name.
+        features: key points of the images.
+        views: geometry of the pairs.
+        truth: true poses, and how exact they are (see `read_truth`).
+    """
+    poses, limits = truth
+    most = _EXACT_DEG if limits[0] < 2 else _DRAWN_DEG
+    for (first, second), view in views.items():
+        ends = features[first], features[second]
+        best = view if view else next(iter(view.alternatives), None)
+        if best is None or view.geometry == "rotation" or not (ends[0].learned and ends[1].learned):
             continue
-        pose = Rigid3(best.rotation, best.direction)
-        rays = ends[0].bearings[best.matches_idx[:, 0]], ends[1].bearings[best.matches_idx[:, 1]]
-        off = geodesic_angle(pose.rotation, true.rotation), angle_between(pose.translation, true.translation)
+        true = poses[second] @ poses[first].inverse()
+        off = geodesic_angle(best.rotation, true.rotation), angle_between(best.direction, true.translation)
         right = bool(np.all(np.rad2deg(off) < most))
-        yield PairRow(capture.name, first, second, view.log10_false_alarms, marks_of(*ends, pose, rays=rays), right)
+        yield PairRow(capture, first, second, view.log10_false_alarms, pair_marks(*ends, best), right)
 
 
 def read_table(file: Path) -> list[PairRow]:
@@ -97,13 +116,13 @@ def write_table(file: Path, rows: Sequence[PairRow]) -> None:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow([*PairRow._fields[:4], *Marks._fields, "right"])
         for row in rows:
-            if row.log10_false_alarms <= -_MIN_EXPONENT:
+            if row.log10_false_alarms <= WEAKEST:
                 marks = [f"{mark:.3g}" for mark in row.marks]
                 writer.writerow([*row[:3], f"{row.log10_false_alarms:.1f}", *marks, int(row.right)])
 
 
 def fitted(rows: Sequence[PairRow]) -> NDArray[np.float64]:
-    """Return the coefficients: of one, of the logarithm of the exponent, and of the marks, each with its known sign."""
+    """Return the coefficients: of one, of the exponent, and of the marks, each with its known sign."""
     terms = np.array([terms_of(row.log10_false_alarms, row.marks) for row in rows])
     sign = np.where([row.right for row in rows], 1.0, -1.0)
 
@@ -111,9 +130,15 @@ def fitted(rows: Sequence[PairRow]) -> NDArray[np.float64]:
         # The weak prior keeps the weights finite if they separate all pairs.
         return float(np.logaddexp(0, -sign * (terms @ weights)).sum() + _RIDGE * np.sum(weights[1:] ** 2))
 
-    better = {"floor"}
+    better = {"floor", "parallax"}
     bounds = [(None, None), (0, None), *((0, None) if name in better else (None, 0) for name in Marks._fields)]
     return np.asarray(minimize(loss, np.zeros(terms.shape[1]), bounds=bounds).x)
+
+
+def prior_odds(rows: Sequence[PairRow]) -> float:
+    """Return the logarithm of the odds that any pair is right."""
+    right = sum(row.right for row in rows)
+    return float(np.log(right / (len(rows) - right)))
 
 
 def left_out(rows: Sequence[PairRow]) -> dict[str, tuple[int, ...]]:
@@ -148,6 +173,7 @@ def main() -> None:
         print(f"| {capture} | " + " | ".join(map(str, line)) + " |")
     print("| all | " + " | ".join(str(sum(column)) for column in zip(*counts.values(), strict=True)) + " |")
     print("coefficients:", ", ".join(f"{weight:.3f}" for weight in fitted(rows)))
+    print(f"prior: {prior_odds(rows):.2f}")
 
 
 if __name__ == "__main__":
