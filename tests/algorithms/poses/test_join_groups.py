@@ -240,7 +240,8 @@ def test_an_alignment_outweighs_the_pairs_that_contradict_it(
 ) -> None:
     evidence = _PairEvidence({(0, 1): agreeing}, disagreeing, has_length=True)
     assert _is_significant(_alignment(alarms), evidence, learned=False) == significant
-    assert _is_significant(_alignment(alarms), evidence, learned=True) == (significant and agreeing >= max(1, disagreeing))
+    enough = agreeing >= max(1, disagreeing)
+    assert _is_significant(_alignment(alarms), evidence, learned=True) == (significant and enough)
 
 
 @pytest.mark.parametrize(
