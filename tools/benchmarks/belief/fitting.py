@@ -24,6 +24,7 @@ SIGNS = {
     "place_rival": -1,
     "repeats": -1,
     "joint_contradicting": -1,
+    "linked": 1,
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 

@@ -109,7 +109,7 @@ def measure(capture: Capture) -> tuple[list[dict[str, Any]], dict[str, float]]:
         for group_number, group in enumerate(split_groups(poses)):
             if len(group.names) > 1:
                 found = verified_group(group, load, features=features, two_views=views, correct=not given)
-                rows = _rows(capture, variant, found, group=group_number, learned=learned)
+                rows = rows_of(capture, variant, found, group=group_number, learned=learned)
                 if not any(_is_same(rows, known) for known in groups):
                     groups.append(rows)
         spent[variant] = time.process_time() - start
@@ -188,8 +188,27 @@ def evidence_of(found: VerifiedGroup) -> dict[int, dict[str, float]]:
     }
 
 
-def _rows(capture: Capture, variant: str, found: VerifiedGroup, *, group: int, learned: bool) -> list[dict[str, Any]]:
-    placed, evidence = judge_placements(found.poses, capture.truth), evidence_of(found)
+def rows_of(
+    capture: Capture,
+    variant: str,
+    found: VerifiedGroup,
+    *,
+    group: int,
+    learned: bool,
+    limits: tuple[float, float] = (1.0, 0.02),
+) -> list[dict[str, Any]]:
+    """Return the cameras of a group (`Measured`) as JSON objects.
+
+    Args:
+        capture: with the truth.
+        variant: how the group was solved.
+        found: the group with what was measured.
+        group: its number.
+        learned: whether the capture has learned matches.
+        limits: errors up to which a camera is right, in degrees and as a share of the extent.
+    """
+    placed = judge_placements(found.poses, capture.truth, rotation_limit_deg=limits[0], center_limit=limits[1])
+    evidence = evidence_of(found)
     return [
         asdict(
             Measured(

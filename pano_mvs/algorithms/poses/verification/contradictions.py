@@ -17,6 +17,7 @@ from scipy.sparse import coo_array, csr_array
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.geometry import angle_between, geodesic_angle
+from pano_mvs.scene import TwoView
 
 MAX_CONTRADICTED = 0.3
 """Greatest share of the significance of the pairs across a cut that may contradict the cameras. Of 34 groups of a real
@@ -66,16 +67,22 @@ def _significance(model: PlacedModel) -> dict[Edge, tuple[float, float]]:
         if view and model.cameras.keys() >= {*edge}:
             matches = {True: 0, False: 0}
             for one in (view, *view.alternatives):
-                relative = model.cameras[edge[1]] @ model.cameras[edge[0]].inverse()
-                agrees = bool(
-                    geodesic_angle(one.rotation, relative.rotation) < float(np.deg2rad(3.0))
-                    and angle_between(one.direction, relative.translation) < float(np.deg2rad(10.0))
-                )
+                agrees = agrees_with(model, edge, one)
                 matches[agrees] = max(matches[agrees], len(one))
             # −log₁₀ of the false alarms that one pair counts at most
             margin = min(-view.log10_false_alarms, 200.0) * (matches[True] - matches[False]) / max(matches.values())
             found[edge] = max(margin, 0.0), max(-margin, 0.0)
     return found
+
+
+def agrees_with(model: PlacedModel, edge: Edge, view: TwoView) -> bool:
+    """Return whether the geometry of a pair agrees with the cameras of a model."""
+    relative = model.cameras[edge[1]] @ model.cameras[edge[0]].inverse()
+    turned = geodesic_angle(view.rotation, relative.rotation)
+    return bool(
+        turned < float(np.deg2rad(3.0))
+        and angle_between(view.direction, relative.translation) < float(np.deg2rad(10.0))
+    )
 
 
 def _most_contradicted(

@@ -50,6 +50,11 @@ def pair_rows(capture: Path, out: Path) -> Iterator[PairRow]:
     """Yield the learned pairs of a finished run."""
     truth = read_truth(capture)
     assert truth is not None, f"{capture} has no truth.json with headings"
+    yield from rows_of(capture.name, *learned_views(out), truth=truth)
+
+
+def learned_views(out: Path, *, merged: bool = False) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
+    """Return the key points of a finished run and the pairs that a network has matched, or all pairs as `merged`."""
     store = Store(out / "cache")
     keys = next(run.keys for run in store.runs.entries() if run.out == str((out / "run").resolve()))
 
@@ -61,9 +66,12 @@ def pair_rows(capture: Path, out: Path) -> Iterator[PairRow]:
         return value
 
     features = {image: load("learned", image, Features) for image in keys.get("learned", {})}
-    views = {pair: load("rematched", pair, TwoView) for pair in keys.get("rematched", {})}
-    named = {(pair.split("|")[0].strip(), pair.split("|")[1].strip()): view for pair, view in views.items()}
-    yield from rows_of(capture.name, features, named, truth=truth)
+    views = {}
+    for stage in ("matches", "rematched") if merged else ("rematched",):
+        for pair in keys.get(stage, {}):
+            first, second = (name.strip() for name in pair.split("|"))
+            views[first, second] = load(stage, pair, TwoView)
+    return features, views
 
 
 def rows_of(

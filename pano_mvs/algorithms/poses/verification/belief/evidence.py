@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.algorithms.poses.verification.joints import Joint
+from pano_mvs.algorithms.two_view.verification import weight_of_pair
 from pano_mvs.geometry import geodesic_angle
 
 FloatArray = NDArray[np.float64]
@@ -37,11 +39,12 @@ def camera_evidence(
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
         `agreeing` (number of pairs that agree), `scale_worst` (largest |log ratio| of a distance between cameras to the
         one that known points suggest), `place_rival` (weight of another place relative to its own), `repeats` (mean
-        weight of other geometries of the pairs of all cameras, relative to those in use), and `joint_contradicting`
-        (solid angle in which its part and the larger rest look through one another's surfaces, relative to all that
-        both see).
+        weight of other geometries of the pairs of all cameras, relative to those in use), `joint_contradicting` (solid
+        angle in which its part and the larger rest look through one another's surfaces, relative to all that both see),
+        and `linked` (weight of the learned pairs that agree less that of those that do not, across the weakest cut
+        between the camera and the larger part of the model; see `weight_of_pair`).
     """
-    contradicting, repeats = _contradicting_joints(joints), _repeats(model)
+    contradicting, repeats, linked = _contradicting_joints(joints), _repeats(model), _links(model)
     rows = {}
     for image in sorted(model.cameras):
         share = shares.get(image, np.nan)
@@ -54,6 +57,7 @@ def camera_evidence(
             **(of_pairs if known else dict.fromkeys(of_pairs, np.nan)),
             "repeats": repeats,
             "joint_contradicting": contradicting.get(image, np.nan),
+            "linked": linked.get(image, np.nan),
         }
     return rows
 
@@ -134,3 +138,45 @@ def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
         previous = parts[before[idx]]
         worst[parts[idx]] = float(np.fmax(worst[previous], share[frozenset((previous, parts[idx]))]))
     return {image: value for part, value in worst.items() for image in part}
+
+
+def _links(model: PlacedModel) -> dict[int, float]:
+    """Return what learned pairs say for the weakest cut between each camera and the larger part of a model."""
+    images = sorted(model.cameras)
+    number = {image: idx for idx, image in enumerate(images)}
+    features = [model.pairs.features.get(name) for name in model.pairs.names]
+    ends, weights = list[tuple[int, int]](), list[float]()
+    for (i, j), view in (model.pairs.compared or {}).items():
+        one, other = features[i], features[j]
+        geometry = view if view else next(iter(view.alternatives), None)
+        if one and other and one.learned and other.learned and geometry is not None and number.keys() >= {i, j}:
+            weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
+            ends.append((number[i], number[j]))
+            weights.append(weight if agrees_with(model, (i, j), geometry) else -weight)
+    if not ends:
+        return {}
+    both = np.concatenate([np.array(ends), np.array(ends)[:, ::-1]]).T
+    graph = csr_array(coo_array((np.tile(weights, 2), both), (len(images),) * 2))
+    # Strong pairs first: the weakest cuts are among those of the edges of the maximum spanning tree.
+    strong = graph.maximum(0)
+    strong.eliminate_zeros()
+    strong.data *= -1
+    tree = minimum_spanning_tree(strong)
+    parts = connected_components(tree, directed=False)[1]
+    found = np.full(len(images), np.inf)
+    for part in range(parts.max() + 1):
+        order, before = breadth_first_order(tree, int(np.argmax(parts == part)), directed=False)
+        inside = np.eye(len(images), dtype=np.bool_)[order]  # of each camera, the branch that hangs on it
+        place = {image: idx for idx, image in enumerate(order.tolist())}
+        for idx in range(len(order) - 1, 0, -1):
+            inside[place[before[order[idx]]]] |= inside[idx]
+        for branch in inside:
+            if branch.all():
+                continue
+            cut = float((graph @ (1.0 - branch))[branch].sum())
+            for side in (branch, ~branch):
+                if 2 * side.sum() <= len(images):
+                    found[side] = np.minimum(found[side], cut)
+    # Cameras that are in the larger part beside every cut.
+    found[np.isinf(found)] = found[np.isfinite(found)].max(initial=0.0)
+    return {image: float(found[idx]) for image, idx in number.items()}

@@ -15,7 +15,7 @@ MISS_COST = 5.0
 _CLOSER, _BETWEEN = "take panoramas closer to one another there", "take panoramas in between"
 _Row = Mapping[str, float]
 
-# For each measurement: what it says, what is said if it is missing, and what to do.
+# For each measurement: what it says, what is said if it is missing (nothing if that is no fault), and what to do.
 _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
     "ratio": (
         lambda row: (
@@ -66,6 +66,14 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
         "nothing that two parts of the capture see in common confirms how they are joined",
         _BETWEEN,
     ),
+    "linked": (
+        lambda row: (
+            f"the pairs that connect it with the others weigh {max(row['linked'], 0.0):.1f} times as much as one pair "
+            "must"
+        ),
+        "",
+        _BETWEEN,
+    ),
 }
 
 
@@ -87,7 +95,11 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
         row: the evidence for the camera.
         ambiguity: description of another arrangement that the images would confirm about as much; "" if none is known.
     """
-    lost = {name: value for name, value in model.contributions(row).items() if value < 0}
+    lost = {
+        name: value
+        for name, value in model.contributions(row).items()
+        if value < 0 and (np.isfinite(row.get(name, np.nan)) or _SAID[name][1])
+    }
     if "ratio" in lost:  # both are about what other images confirm
         lost["ratio"] += lost.pop("share", 0.0)
     worst = sorted(lost, key=lambda name: (lost[name], name))[:2]

@@ -10,6 +10,7 @@ import pytest
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import geometries_of
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
+from pano_mvs.algorithms.poses.verification.belief import evidence
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.joints import Joint
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
@@ -74,3 +75,33 @@ def test_a_contradicted_joint_counts_for_all_parts_beyond_it() -> None:
     rows = camera_evidence(placed({}, agreeing=True), NOTHING, NOTHING, joints=joints)
     found = [rows[idx]["joint_contradicting"] for idx in range(6)]
     np.testing.assert_array_equal(found, [np.nan] * 3 + [0.4] * 3)
+
+
+def linked(weights: Mapping[Edge, float], monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Return what is measured if learned pairs have these weights, negative where they do not agree."""
+    matches = np.stack([np.arange(30)] * 2, axis=1).astype(np.int32)
+    away = Rigid3(rotation_from_rotvec((0.0, 1.0, 0.0)), np.array([0.0, 1.0, 0.0]))
+    compared = {}
+    for (a, b), weight in weights.items():
+        relative = CAMERAS[b] @ CAMERAS[a].inverse()
+        view = view_of(relative if weight > 0 else away @ relative, matches)
+        compared[a, b] = replace(view, log10_false_alarms=-abs(weight))
+    monkeypatch.setattr(evidence, "weight_of_pair", lambda *_, log10_false_alarms: -log10_false_alarms)
+    learned = replace(features_from_bearings(RAYS), learned=len(RAYS))
+    pairs = Pairs({f"{idx}.png": learned for idx in CAMERAS}, {}, compared=compared)
+    rows = camera_evidence(PlacedModel(pairs, dict(CAMERAS), {}), NOTHING, NOTHING)
+    return [rows[idx]["linked"] for idx in CAMERAS]
+
+
+def test_a_part_is_linked_by_what_crosses_its_weakest_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms: dict[Edge, float] = {(0, 1): 5, (1, 2): 5, (0, 2): 5, (2, 3): 5, (4, 5): 4, (3, 4): 2}
+    assert linked(rooms, monkeypatch) == [5, 5, 5, 5, 2, 2]
+    # What contradicts counts against it; pairs inside of the part do not.
+    assert linked({**rooms, (1, 5): -1.5}, monkeypatch)[4:] == [0.5, 0.5]
+    assert linked({**rooms, (0, 5): 3}, monkeypatch)[4:] == [5, 5]
+
+
+def test_a_camera_without_a_pair_that_agrees_is_not_linked(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = linked({(0, 1): 5, (1, 2): 5, (2, 3): 5, (3, 4): 5, (4, 5): -2}, monkeypatch)
+    assert found[5] == -2
+    assert np.isnan(linked({}, monkeypatch)).all()
