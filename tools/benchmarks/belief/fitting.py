@@ -25,6 +25,7 @@ SIGNS = {
     "repeats": -1,
     "joint_contradicting": -1,
     "linked": 1,
+    "links_contradicting": -1,
 }
 """Each measurement, and whether more of it speaks for a camera (1) or against it (−1)."""
 

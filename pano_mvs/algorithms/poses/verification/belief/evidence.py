@@ -41,10 +41,12 @@ def camera_evidence(
         one that known points suggest), `place_rival` (weight of another place relative to its own), `repeats` (mean
         weight of other geometries of the pairs of all cameras, relative to those in use), `joint_contradicting` (solid
         angle in which its part and the larger rest look through one another's surfaces, relative to all that both see),
-        and `linked` (weight of the learned pairs that agree less that of those that do not, across the weakest cut
-        between the camera and the larger part of the model; see `weight_of_pair`).
+        `linked` (weight of the learned pairs that agree less that of those that do not, across the weakest cut between
+        the camera and the larger part of the model; see `weight_of_pair`), and `links_contradicting` (share of the
+        weight of all learned pairs of the model that does not agree with its cameras).
     """
-    contradicting, repeats, linked = _contradicting_joints(joints), _repeats(model), _links(model)
+    contradicting, repeats = _contradicting_joints(joints), _repeats(model)
+    linked, links_contradicting = _links(model)
     rows = {}
     for image in sorted(model.cameras):
         share = shares.get(image, np.nan)
@@ -58,6 +60,7 @@ def camera_evidence(
             "repeats": repeats,
             "joint_contradicting": contradicting.get(image, np.nan),
             "linked": linked.get(image, np.nan),
+            "links_contradicting": links_contradicting,
         }
     return rows
 
@@ -140,8 +143,11 @@ def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
     return {image: value for part, value in worst.items() for image in part}
 
 
-def _links(model: PlacedModel) -> dict[int, float]:
-    """Return what learned pairs say for the weakest cut between each camera and the larger part of a model."""
+def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
+    """Return what learned pairs say for the weakest cut between each camera and the larger part of a model.
+
+    Also returned is the share of their weight that does not agree with the cameras; NaN without any.
+    """
     images = sorted(model.cameras)
     number = {image: idx for idx, image in enumerate(images)}
     features = [model.pairs.features.get(name) for name in model.pairs.names]
@@ -150,11 +156,12 @@ def _links(model: PlacedModel) -> dict[int, float]:
         one, other = features[i], features[j]
         geometry = view if view else next(iter(view.alternatives), None)
         if one and other and one.learned and other.learned and geometry is not None and number.keys() >= {i, j}:
-            weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
+            own = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
             ends.append((number[i], number[j]))
-            weights.append(weight if agrees_with(model, (i, j), geometry) else -weight)
-    if not ends:
-        return {}
+            weights.append(own if agrees_with(model, (i, j), geometry) else -own)
+    weight = np.abs(weights).sum()
+    if not weight:
+        return {}, np.nan
     both = np.concatenate([np.array(ends), np.array(ends)[:, ::-1]]).T
     graph = csr_array(coo_array((np.tile(weights, 2), both), (len(images),) * 2))
     # Strong pairs first: the weakest cuts are among those of the edges of the maximum spanning tree.
@@ -179,4 +186,4 @@ def _links(model: PlacedModel) -> dict[int, float]:
                     found[side] = np.minimum(found[side], cut)
     # Cameras that are in the larger part beside every cut.
     found[np.isinf(found)] = found[np.isfinite(found)].max(initial=0.0)
-    return {image: float(found[idx]) for image, idx in number.items()}
+    return {image: float(found[idx]) for image, idx in number.items()}, float(-np.minimum(weights, 0).sum() / weight)

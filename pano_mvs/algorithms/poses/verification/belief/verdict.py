@@ -74,6 +74,13 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
         "",
         _BETWEEN,
     ),
+    "links_contradicting": (
+        lambda row: (
+            f"{_percent(row['links_contradicting'])} of the weight of the group's pairs contradicts its cameras"
+        ),
+        "",
+        _BETWEEN,
+    ),
 }
 
 

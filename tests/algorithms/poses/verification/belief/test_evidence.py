@@ -90,18 +90,19 @@ def linked(weights: Mapping[Edge, float], monkeypatch: pytest.MonkeyPatch) -> li
     learned = replace(features_from_bearings(RAYS), learned=len(RAYS))
     pairs = Pairs({f"{idx}.png": learned for idx in CAMERAS}, {}, compared=compared)
     rows = camera_evidence(PlacedModel(pairs, dict(CAMERAS), {}), NOTHING, NOTHING)
-    return [rows[idx]["linked"] for idx in CAMERAS]
+    assert len({str(row["links_contradicting"]) for row in rows.values()}) == 1
+    return [*(rows[idx]["linked"] for idx in CAMERAS), rows[0]["links_contradicting"]]
 
 
 def test_a_part_is_linked_by_what_crosses_its_weakest_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     rooms: dict[Edge, float] = {(0, 1): 5, (1, 2): 5, (0, 2): 5, (2, 3): 5, (4, 5): 4, (3, 4): 2}
-    assert linked(rooms, monkeypatch) == [5, 5, 5, 5, 2, 2]
+    assert linked(rooms, monkeypatch) == [5, 5, 5, 5, 2, 2, 0]
     # What contradicts counts against it; pairs inside of the part do not.
-    assert linked({**rooms, (1, 5): -1.5}, monkeypatch)[4:] == [0.5, 0.5]
-    assert linked({**rooms, (0, 5): 3}, monkeypatch)[4:] == [5, 5]
+    assert linked({**rooms, (1, 5): -1.5}, monkeypatch)[4:] == [0.5, 0.5, pytest.approx(1.5 / 27.5)]
+    assert linked({**rooms, (0, 5): 3}, monkeypatch)[4:] == [5, 5, 0]
 
 
 def test_a_camera_without_a_pair_that_agrees_is_not_linked(monkeypatch: pytest.MonkeyPatch) -> None:
     found = linked({(0, 1): 5, (1, 2): 5, (2, 3): 5, (3, 4): 5, (4, 5): -2}, monkeypatch)
-    assert found[5] == -2
+    assert found[5:] == [-2, pytest.approx(2 / 22)]
     assert np.isnan(linked({}, monkeypatch)).all()
