@@ -21,28 +21,18 @@ from pano_mvs.io.images.names import pair_image_names
 
 @dataclass(frozen=True, eq=False)
 class PoseEvaluation:
-    """Errors of poses against the truth; image names are those of the truth.
+    """Errors of poses against the truth; image names are those of the truth."""
 
-    Attributes:
-        model: name of the estimates' source.
-        truth: name of the truth's source.
-        unit: unit of lengths, for display.
-        pairs: errors over all pairs of the truth's images; a pair with an unregistered image is 180° off.
-        registered_pairs: errors over the pairs of registered images.
-        centers: errors of the camera centres after similarity alignment, or None if no alignment is possible.
-        no_centers: why there is no alignment; otherwise "".
-        without_truth: registered images without truth, by their own names.
-        other_groups: number of images in each further group of the model, which count as not registered.
-    """
-
-    model: str
-    truth: str
-    unit: str
-    pairs: PoseErrors
-    registered_pairs: PoseErrors
+    model: str  # name of the estimates' source
+    truth: str  # name of the truth's source
+    unit: str  # unit of lengths, for display
+    pairs: PoseErrors  # errors over all pairs of the truth's images; a pair with an unregistered image is 180° off
+    registered_pairs: PoseErrors  # errors over the pairs of registered images
+    # errors of the camera centres after similarity alignment, or None if no alignment is possible
     centers: CenterErrors | None
-    no_centers: str = ""
-    without_truth: tuple[str, ...] = ()
+    no_centers: str = ""  # why there is no alignment; otherwise ""
+    without_truth: tuple[str, ...] = ()  # registered images without truth, by their own names
+    # number of images in each further group of the model, which count as not registered
     other_groups: tuple[int, ...] = ()
 
     def __repr__(self) -> str:

@@ -40,29 +40,20 @@ MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
 @dataclass(frozen=True, slots=True)
 class Execution:
-    """How the units of a run are computed.
+    """How the units of a run are computed."""
 
-    Attributes:
-        executor: `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by
-            the other settings and this machine.
-        workers: number of units at a time; 0 for one per core, if memory permits.
-        threads: of each worker; 0 for an equal share of the cores.
-        scheduler: address of a dask scheduler.
-        queue: YAML file with the settings of jobs, for a queueing system.
-        min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
-            of $PANO_MVS_MIN_FREE, or else 200 MB.
-        durable: whether to flush every result to disk.
-        otel: whether to send the run, its stages and units as spans to an OpenTelemetry collector.
-    """
-
+    # `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by the other
+    # settings and this machine
     executor: str = ""
-    workers: int = 0
-    threads: int = 0
-    scheduler: str = ""
-    queue: Path | None = None
+    workers: int = 0  # number of units at a time; 0 for one per core, if memory permits
+    threads: int = 0  # of each worker; 0 for an equal share of the cores
+    scheduler: str = ""  # address of a dask scheduler
+    queue: Path | None = None  # YAML file with the settings of jobs, for a queueing system
+    # free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value of
+    # $PANO_MVS_MIN_FREE, or else 200 MB
     min_free: str = ""
-    durable: bool = False
-    otel: bool = False
+    durable: bool = False  # whether to flush every result to disk
+    otel: bool = False  # whether to send the run, its stages and units as spans to an OpenTelemetry collector
 
 
 def _check_not_merged(out: Path) -> None:

@@ -65,23 +65,15 @@ Progress = Callable[[int, int], None]  # receives the number of panoramas that a
 
 @dataclass(frozen=True)
 class Shared:
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        page: the page to open, which needs its folder.
-        single_file: the same as one file; None if it would be too large.
-        triangles: number of triangles of the mesh; 0 without one.
-        total_bytes: size of the data.
-        notes: what is missing.
-    """
-
-    page: Path
-    single_file: Path | None
+    page: Path  # the page to open, which needs its folder
+    single_file: Path | None  # the same as one file; None if it would be too large
     points: int
     panoramas: int
-    triangles: int
-    total_bytes: int
-    notes: tuple[str, ...] = ()
+    triangles: int  # number of triangles of the mesh; 0 without one
+    total_bytes: int  # size of the data
+    notes: tuple[str, ...] = ()  # what is missing
 
     def _repr_html_(self) -> str:
         """Return the page for a notebook, which keeps it; only where it is if it is too large for one file."""

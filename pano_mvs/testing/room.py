@@ -17,25 +17,19 @@ _RAYS_AT_ONCE = 1 << 17
 
 @dataclass(frozen=True)
 class Room:
-    """Surfaces with a texture, and one lamp.
-
-    Attributes:
-        texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
-            "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
-        lamp: position of the light; the shading is diffuse, without shadows.
-        textures: texture of each surface, if they differ; empty: all have `texture`.
-        sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
-            away; None: black.
-        clouds: strength of the clouds; 0 is a clear sky.
-    """
+    """Surfaces with a texture, and one lamp."""
 
     surfaces: tuple[Surface, ...]
+    # texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic", "outdoor"
+    # (coarse and fine, the fine part fading with distance) or "none" (paint)
     texture: Texture = "strong"
     seed: int = 0
-    lamp: Vector = (0.4, -1.2, 0.3)
-    textures: tuple[Texture | Pattern, ...] = ()
+    lamp: Vector = (0.4, -1.2, 0.3)  # position of the light; the shading is diffuse, without shadows
+    textures: tuple[Texture | Pattern, ...] = ()  # texture of each surface, if they differ; empty: all have `texture`
+    # colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far away;
+    # None: black
     sky: tuple[Vector, Vector] | None = None
-    clouds: float = 0.35
+    clouds: float = 0.35  # strength of the clouds; 0 is a clear sky
 
 
 def default_room(seed: int = 0, texture: Texture = "strong") -> Room:

@@ -27,35 +27,20 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What a window or an image shows, and how; the options of `pano-mvs view`.
+    """What a window or an image shows, and how; the options of `pano-mvs view`."""
 
-    Attributes:
-        images: folder of the panoramas; None: where the run read them.
-        screenshot: image file to write instead of opening a window.
-        view: "overview", "top", "front" or "inside:NAME".
-        color: of the cloud, see `COLORINGS`.
-        surface: "cloud", "mesh" or "both"; empty for the cloud if it exists.
-        points: maximum number of points to draw; 0: all.
-        size: WIDTHxHEIGHT of the window in pixels.
-        labels: whether cameras are named.
-        blended: whether the cloud is shown within a panorama.
-        backs: whether points and triangles that face away from the viewer are shown.
-        group: group of poses to show; 0 is the largest.
-        ranges: whether a camera's ranges are shown inside it instead of its panorama.
-    """
-
-    images: str | Path | None = None
-    screenshot: str | Path | None = None
-    view: str = "overview"
-    color: str = "rgb"
-    surface: str = ""
-    points: int = POINT_BUDGET
-    size: str = "1280x860"
-    labels: bool = False
-    blended: bool = False
-    backs: bool = False
-    group: int = 0
-    ranges: bool = False
+    images: str | Path | None = None  # folder of the panoramas; None: where the run read them
+    screenshot: str | Path | None = None  # image file to write instead of opening a window
+    view: str = "overview"  # "overview", "top", "front" or "inside:NAME"
+    color: str = "rgb"  # of the cloud, see `COLORINGS`
+    surface: str = ""  # "cloud", "mesh" or "both"; empty for the cloud if it exists
+    points: int = POINT_BUDGET  # maximum number of points to draw; 0: all
+    size: str = "1280x860"  # WIDTHxHEIGHT of the window in pixels
+    labels: bool = False  # whether cameras are named
+    blended: bool = False  # whether the cloud is shown within a panorama
+    backs: bool = False  # whether points and triangles that face away from the viewer are shown
+    group: int = 0  # group of poses to show; 0 is the largest
+    ranges: bool = False  # whether a camera's ranges are shown inside it instead of its panorama
 
 
 def view_run(

@@ -36,19 +36,12 @@ _ADJUST_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """The pose of an image relative to the current model; falsy, with the reason, if it is not reliable.
+    """The pose of an image relative to the current model; falsy, with the reason, if it is not reliable."""
 
-    Attributes:
-        cam_from_world: the pose.
-        support: number of known points that it sees where they should be.
-        known: number of known points that its tracks contain.
-        reason: why the pose is not reliable.
-    """
-
-    cam_from_world: Rigid3
-    support: int = 0
-    known: int = 0
-    reason: str = ""
+    cam_from_world: Rigid3  # the pose
+    support: int = 0  # number of known points that it sees where they should be
+    known: int = 0  # number of known points that its tracks contain
+    reason: str = ""  # why the pose is not reliable
 
     def __bool__(self) -> bool:
         """Return whether the image may be added."""
@@ -57,21 +50,13 @@ class Attachment:
 
 @dataclass(eq=False)
 class GrowingModel:
-    """Registered cameras and triangulated tracks; the world frame is the first camera of the seed pair.
+    """Registered cameras and triangulated tracks; the world frame is the first camera of the seed pair."""
 
-    Attributes:
-        tracks: all tracks of the capture.
-        edges: verified pairs by positions of images.
-        estimator: how translation scale factors are estimated from the ratios of single features.
-        kappa: the paper's κ.
-        cameras: image position to cam_from_world.
-    """
-
-    tracks: Tracks
-    edges: Mapping[Edge, TwoView]
-    estimator: ScaleEstimator
-    kappa: float
-    cameras: dict[int, Rigid3] = field(default_factory=dict)
+    tracks: Tracks  # all tracks of the capture
+    edges: Mapping[Edge, TwoView]  # verified pairs by positions of images
+    estimator: ScaleEstimator  # how translation scale factors are estimated from the ratios of single features
+    kappa: float  # the paper's κ
+    cameras: dict[int, Rigid3] = field(default_factory=dict)  # image position to cam_from_world
 
     def __post_init__(self) -> None:
         self._points = np.full((self.tracks.count, 3), np.nan)
