@@ -12,12 +12,12 @@ from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.neighbours import (
     automatic_pairs,
     east_north_m,
+    exhaustive_pairs,
     loop_closing_pairs,
     most_pairs,
     position_pairs,
     retrieval_pairs,
 )
-from pano_mvs.algorithms.matching.pairs import exhaustive_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.api import (
     All,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
 from typing import Annotated
 
 import numpy as np
@@ -16,9 +17,9 @@ from pano_mvs.algorithms.matching.integer_descriptors import (
     nearest_two_packed,
 )
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
-from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry.geodesy import local_from_lla
 from pano_mvs.scene import Features, GlobalDescriptor, Pairs
@@ -348,3 +349,32 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
 def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
     """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
     return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
+
+
+def exhaustive_pairs(names: Sequence[str]) -> Pairs:
+    """Return every pair of images, in the order of the capture."""
+    return Pairs(tuple(combinations(names, 2)))
+
+
+def sequential_pairs(names: Sequence[str], *, window: int = 5, loop: bool = False) -> Pairs:
+    """Return the pairs of images that are at most `window` positions apart.
+
+    Args:
+        names: image names in the order in which they were taken.
+        window: each image is paired with this number of following images.
+        loop: whether the first image follows the last one.
+
+    Raises:
+        UsageError: if the window is less than 1.
+    """
+    if window < 1:
+        raise UsageError(f"the window of sequential pairs must be at least 1, got {window}")
+    count = len(names)
+    pairs = {
+        (min(first, second), max(first, second))
+        for first in range(count)
+        for second in (first + step for step in range(1, window + 1))
+        for second in ([second] if second < count else [second % count] if loop else [])
+        if first != second
+    }
+    return Pairs(tuple((names[first], names[second]) for first, second in sorted(pairs)))

@@ -14,7 +14,7 @@ from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
+from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas
 from pano_mvs.algorithms.poses.photograph_points import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
