@@ -87,17 +87,13 @@ class _LenientRaw(io.RawIOBase):
             ) is None:  # another process made the terminal or the pipe non-blocking
                 select.select([], [self._raw], [])
         except OSError as error:
-            if self._is_closed(error):
+            hung_up = self._is_terminal and error.errno == errno.EIO
+            if error.errno in _READER_LEFT or hung_up or (os.name == "nt" and error.errno == errno.EINVAL):
                 self._state.reader_left = True
             else:
                 self._state.failure = error.strerror or str(error)
             return size
         return written
-
-    def _is_closed(self, error: OSError) -> bool:
-        """Return whether the reader has gone: a closed pipe or terminal."""
-        hung_up = self._is_terminal and error.errno == errno.EIO
-        return error.errno in _READER_LEFT or hung_up or (os.name == "nt" and error.errno == errno.EINVAL)
 
 
 def protect_standard_streams() -> StreamState:

@@ -37,7 +37,14 @@ class CameraGroup:
         centers = np.array(poses.centers, np.float64).reshape(-1, 3)
         if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
             return None
-        return CameraGroup(number, poses, centers, nearest_neighbours(centers), coverage)
+        count = len(centers)
+        found = cKDTree(centers).query(centers, k=min(count, 7))
+        distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
+        near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
+        own = near == np.arange(count)[:, None]
+        own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
+        neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
+        return CameraGroup(number, poses, centers, neighbours, coverage)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,18 +72,6 @@ class CameraGroup:
         """Return the median range of a view, or None if it is unknown."""
         known = self.coverage.get(self.names[idx])
         return None if known is None else known.typical_range
-
-
-def nearest_neighbours(centers: FloatArray) -> NDArray[np.intp]:
-    """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
-    count = len(centers)
-    found = cKDTree(centers).query(centers, k=min(count, 7))
-    distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
-    near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
-    own = near == np.arange(count)[:, None]
-    own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
-    neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
-    return neighbours
 
 
 def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:

@@ -164,6 +164,7 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
     points = [group.track_point_idx + np.int32(first) for group, first in zip(groups, first_point, strict=False)]
     images = [group.track_image_idx + np.int32(first) for group, first in zip(groups, first_camera, strict=False)]
     numbers = np.repeat(np.arange(len(groups), dtype=np.int32), np.diff(first_camera))
+    known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
     return replace(
         groups[0],
         names=tuple(names[idx] for idx in order),
@@ -175,18 +176,12 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         track_point_idx=np.concatenate(points),
         track_image_idx=place[np.concatenate(images)],
         track_bearings=joined("track_bearings"),
-        track_sigmas_rad=_joined_sigmas(groups),
+        track_sigmas_rad=np.concatenate(known) if len(known) == len(groups) else None,
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
         doubts={name: why for group in groups for name, why in group.doubts.items()},
         **_joined_values(groups, order),
     )
-
-
-def _joined_sigmas(groups: Sequence[Poses]) -> NDArray[np.float32] | None:
-    """Return the sigmas of all groups' observations, or None if those of a group are unknown."""
-    known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
-    return np.concatenate(known) if len(known) == len(groups) else None
 
 
 def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:

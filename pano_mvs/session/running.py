@@ -73,7 +73,10 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
     """Run an open session, all images at once; see `pano_mvs.run`."""
     check_output(session)
     _check_not_merged(session.out)
-    set_aside_foreign_files(session.out)
+    if not exists(session.out / OUTPUT_MARK):
+        for path in (session.out / RUN_JSON, session.out / "report.html"):
+            if is_file(path):
+                set_aside(path)
     min_free = min_free_bytes(execution.min_free)
     store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)
     executor = make_executor(
@@ -180,14 +183,6 @@ def _counted(run: Run | None, end: RunFinished) -> RunFinished:
     return replace(end, **{name: sum(getattr(stage, name) for stage in stages) for name in names})
 
 
-def set_aside_foreign_files(out: Path) -> None:
-    """Rename files that the run is about to write, unless an earlier run wrote into the folder."""
-    if not exists(out / OUTPUT_MARK):
-        for path in (out / RUN_JSON, out / "report.html"):
-            if is_file(path):
-                set_aside(path)
-
-
 def earlier_files(out: Path) -> dict[str, str]:
     """Return the files that an earlier run wrote into a folder, with their digests; empty if unknown."""
     try:
@@ -208,7 +203,17 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
     Raises:
         StoreError: if a file cannot be written; run.json is written first.
     """
-    add_dense_doubts(run)
+    poses = latest(run, Poses)
+    stage = _compared_stage(run)
+    if poses is not None and stage:
+        name, figures = stage
+        groups, centers = poses.groups, poses.centers
+        for group in range(len(poses.worlds)):
+            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
+            for image, reason in view_doubts(figures, inside).items():
+                run.result.doubts.setdefault(image, (name, reason))
+    if run.result.doubts and run.result.exit_code == 0:
+        run.result.exit_code = FAILED_ITEMS
     summary = summarise(run, started=started, seconds=time.perf_counter() - clock)
     values = StoredValues.of_run(run, summary.results)
     try:
@@ -235,25 +240,6 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
 
 
 _FIGURES = tuple(Agreement.__dataclass_fields__)
-
-
-def add_dense_doubts(run: Run) -> None:
-    """Mark views that other views contradict as doubtful, so that the run ends with exit code 3.
-
-    The figures of `Agreement` are used from the last stage of the range maps that reports them;
-    filters.consistency does. Cameras that are doubted already keep their reason.
-    """
-    poses = latest(run, Poses)
-    stage = _compared_stage(run)
-    if poses is not None and stage:
-        name, figures = stage
-        groups, centers = poses.groups, poses.centers
-        for group in range(len(poses.worlds)):
-            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
-            for image, reason in view_doubts(figures, inside).items():
-                run.result.doubts.setdefault(image, (name, reason))
-    if run.result.doubts and run.result.exit_code == 0:
-        run.result.exit_code = FAILED_ITEMS
 
 
 def _compared_stage(run: Run) -> tuple[str, Mapping[str, Agreement]] | None:

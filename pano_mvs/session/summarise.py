@@ -135,13 +135,16 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
     poses, result = latest(run, Poses), run.result
     if poses is None:
         return PosesSummary()
+    cloud = latest(run, PointCloud)
+    clouds = [] if cloud is None else cloud.groups()
+    found = {number: camera_height(*pair) for number, pair in enumerate(zip(split_groups(poses), clouds, strict=False))}
     return poses_summary(
         poses,
         blocked=blocked,
         rejected={image: why for image, (_, why) in result.rejected.items()},
         doubts={image: result.doubts[image][1] for image in poses.names if image in result.doubts},
         links=_links(run),
-        heights=_camera_heights(split_groups(poses), latest(run, PointCloud)),
+        heights={number: float(f"{height:.4g}") for number, height in found.items() if height is not None},
     )
 
 
@@ -280,13 +283,6 @@ def _up(poses: Poses) -> Direction | None:
         return None
     x, y, z = (round(float(value), 6) for value in up)
     return x, y, z
-
-
-def _camera_heights(groups: Sequence[Poses], cloud: PointCloud | None) -> dict[int, float]:
-    """Return the height of the cameras above the floor, by group, where it is known."""
-    clouds = [] if cloud is None else cloud.groups()
-    found = {number: camera_height(*pair) for number, pair in enumerate(zip(groups, clouds, strict=False))}
-    return {number: float(f"{height:.4g}") for number, height in found.items() if height is not None}
 
 
 def _scale_notes(poses: PosesSummary) -> tuple[str, ...]:

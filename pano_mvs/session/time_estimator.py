@@ -185,7 +185,11 @@ class TimeEstimator:
     def _estimate(self) -> TimeLeft:
         if self._is_over:
             return TimeLeft(0.0, at_least=False, done=1.0)
-        now, speed = self._clock(), self._speed()
+        timed = [stage for stage in self.stages.values() if stage.forecast.unit_s is not None and stage.computed]
+        taken_s = sum(stage.seconds for stage in timed)
+        expected_s = sum(stage.computed * (stage.forecast.unit_s or 0.0) for stage in timed)
+        least, most = _SPEED_LIMITS  # earlier runs may have been slower
+        now, speed = self._clock(), min(most, max(least, (taken_s + _SPEED_PRIOR_S) / (expected_s + _SPEED_PRIOR_S)))
         work = {name: stage.work_s(now, speed) for name, stage in self.stages.items()}
         known = {name: found for name, found in work.items() if found is not None}
         unknown = tuple(name for name, found in work.items() if found is None)
@@ -202,14 +206,6 @@ class TimeEstimator:
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))
-
-    def _speed(self) -> float:
-        """Return the time of the computed units divided by their forecast: earlier runs may have been slower."""
-        known = [stage for stage in self.stages.values() if stage.forecast.unit_s is not None and stage.computed]
-        taken_s = sum(stage.seconds for stage in known)
-        expected_s = sum(stage.computed * (stage.forecast.unit_s or 0.0) for stage in known)
-        least, most = _SPEED_LIMITS
-        return min(most, max(least, (taken_s + _SPEED_PRIOR_S) / (expected_s + _SPEED_PRIOR_S)))
 
     def _note_running(self) -> None:
         """Record how many units run at a time: memory may permit fewer than there are workers."""

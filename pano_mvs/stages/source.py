@@ -285,7 +285,9 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
     known by their names. Cubes are stored without loss, as `<scene>.png`, with the front face in the middle.
     """
     if _WHOLE in item.files:
-        return _equirectangular(item, params, ctx)
+        plain = FolderParams.model_validate(params.model_dump())
+        image = SourceItem(item.name, {"image": item.files[_WHOLE]}, digests={"image": item.digests.get(_WHOLE, "")})
+        return replace(folder(image, plain, ctx), links=item.links)
     faces, rearranged = arranged_faces({face: _joined(item, face) for face in FACES})
     if rearranged:
         ctx.note("the faces of {count} cubes did not fit together and were put in the order in which their edges do")
@@ -303,12 +305,6 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
         zenith_deg=params.zenith_deg,
         links=item.links,
     )
-
-
-def _equirectangular(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
-    plain = FolderParams.model_validate(params.model_dump())
-    image = SourceItem(item.name, {"image": item.files[_WHOLE]}, digests={"image": item.digests.get(_WHOLE, "")})
-    return replace(folder(image, plain, ctx), links=item.links)
 
 
 def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:

@@ -100,13 +100,17 @@ class TinyCapture:
         count = len(self.names)
         pairs = tuple((self.names[i], self.names[j]) for i in range(count) for j in range(i + 1, count))
         others = {name: tuple(other for other in self.names if other != name) for name in self.names}
+        pixels = np.zeros((8, 16), np.uint8)
+        pixels[5:, 2:6] = pixels[7:] = 1
+        pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
+        camera = camera_of(self.images[self.names[0]])
         return {
             Pairs: Pairs(pairs),
             Views: Views(others),
             Poses: self._poses_with_points(),
             PointCloud: self._cloud(),
             TrackedPoints: self._tracked_points(),
-            StaticMasks: self._static_masks(),
+            StaticMasks: frozen(StaticMasks(pixels[None], (camera,))),
             Structure: self._structure(),
             Scores: Scores({"registered": 1.0}, {}),
             Photographs: self._photographs(),
@@ -269,14 +273,6 @@ class TinyCapture:
                 pictures=(FilePart(self.folder / "phone" / "1.png"),),
             )
         )
-
-    def _static_masks(self) -> StaticMasks:
-        """Return a mask of two areas, which turn with the images."""
-        pixels = np.zeros((8, 16), np.uint8)
-        pixels[5:, 2:6] = pixels[7:] = 1
-        pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
-        camera = camera_of(self.images[self.names[0]])
-        return frozen(StaticMasks(pixels[None], (camera,)))
 
     def _structure(self) -> Structure:
         """Return the floor and one wall."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -77,27 +76,15 @@ class CloudActor:
         self.actor.GetProperty().SetPointSize(pixels)
 
 
-@dataclass(frozen=True, eq=False)
-class SphereMesh:
-    """Triangles of a sphere with texture coordinates."""
+def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
+    """Return the actor of a sphere that shows each pixel of a panorama, (H, W, 3) RGB, along that pixel's ray.
 
-    vertices: NDArray[np.float64]  # (V, 3) float64 in the world
-    triangles: NDArray[np.int64]  # (T, 3) int64; clockwise as seen from inside
-    # (V, 2) float32, u to the right, v upwards from the lower edge of the image
-    texture_uv: NDArray[np.float32]
-
-
-def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) -> SphereMesh:
-    """Return a sphere around a camera that shows each pixel of its panorama along that pixel's ray.
-
-    Drawn without the triangles that face the viewer, it shows from outside what lies behind it, like a crystal
-    ball. In neither case is text mirrored.
-
-    Args:
-        cam_from_world: pose.
-        radius: in scene units.
-        rows: of quadrilaterals from pole to pole, twice as many around.
+    Drawn without the triangles that face the viewer, it shows from outside what lies behind it, like a crystal ball. In
+    neither case is text mirrored.
     """
+    import pyvista
+
+    rows = 96 if surrounds else 24
     columns = 2 * rows
     y, x = np.mgrid[0 : rows + 1, 0 : columns + 1].astype(np.float64)
     rays = ray_from_pixel(np.stack([x, y], axis=-1), (rows, columns)).reshape(-1, 3)
@@ -106,18 +93,9 @@ def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) ->
     corners = np.stack([first, first + 1, first + columns + 2, first + columns + 1], axis=-1)
     # Seen from inside, the corners of a quadrilateral run clockwise: from left to right, then down.
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    texture_uv = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
-    return SphereMesh(vertices, triangles, texture_uv)
-
-
-def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
-    """Return the actor of a sphere that shows a panorama, (H, W, 3) RGB, around its camera."""
-    import pyvista
-
-    mesh = panorama_sphere(cam_from_world, radius, rows=96 if surrounds else 24)
-    faces = np.column_stack([np.full(len(mesh.triangles), 3), mesh.triangles])
-    data: Any = pyvista.PolyData(mesh.vertices, faces.ravel())
-    data.active_texture_coordinates = mesh.texture_uv
+    faces = np.column_stack([np.full(len(triangles), 3), triangles])
+    data: Any = pyvista.PolyData(vertices, faces.ravel())
+    data.active_texture_coordinates = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
     as_texture: Any = pyvista.numpy_to_texture  # has no types
     texture = as_texture(np.ascontiguousarray(picture))
     texture.SetInterpolate(True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +180,11 @@ def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100
     lines = ["cost, combined from the neighbours:", *_plot(curve.raw, group, steps)]
     if curve.aggregated is not None:
         lines += ["after semi-global matching:", *_plot(curve.aggregated, group, steps)]
-    marks = _marks(curve, true_range)
+    marks = {"winner": curve.winner}
+    if curve.runner_up is not None:
+        marks["next valley"] = curve.runner_up
+    if np.isfinite(true_range):
+        marks["truth"] = int(np.abs(np.log(curve.ranges / true_range)).argmin())
     bars = -(-len(curve.ranges) // group)
     row = [" "] * bars
     for name in reversed(list(marks)):
@@ -191,16 +195,11 @@ def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100
 
 
 def _plot(costs: NDArray[np.float64], group: int, steps: str) -> list[str]:
-    cheapest = _cheapest(costs, group)
+    padded = np.pad(costs, (0, -len(costs) % group), mode="edge")
+    cheapest: NDArray[np.float64] = padded.reshape(-1, group).min(axis=1)
     top = max(float(cheapest.max()), 1e-6)
     labels = {0: f"{top:5.2f} ", _ROWS // 2: f"{top / 2:5.2f} "}
     return [labels.get(row, " " * _MARGIN) + "".join(bars) for row, bars in enumerate(_bars(cheapest / top, steps))]
-
-
-def _cheapest(costs: NDArray[np.float64], group: int) -> NDArray[np.float64]:
-    padded = np.pad(costs, (0, -len(costs) % group), mode="edge")
-    cheapest: NDArray[np.float64] = padded.reshape(-1, group).min(axis=1)
-    return cheapest
 
 
 def _bars(heights: NDArray[np.float64], steps: str) -> NDArray[np.str_]:
@@ -209,15 +208,6 @@ def _bars(heights: NDArray[np.float64], steps: str) -> NDArray[np.str_]:
     filled = np.rint(heights * _ROWS * fine).astype(int)
     from_bottom = np.clip(filled[None, :] - fine * np.arange(_ROWS)[:, None], 0, fine)
     return np.array(list(steps))[from_bottom[::-1]]
-
-
-def _marks(curve: CostCurve, true_range: float) -> Mapping[str, int]:
-    marks = {"winner": curve.winner}
-    if curve.runner_up is not None:
-        marks["next valley"] = curve.runner_up
-    if np.isfinite(true_range):
-        marks["truth"] = int(np.abs(np.log(curve.ranges / true_range)).argmin())
-    return marks
 
 
 def _scale(ranges: Sequence[float] | NDArray[np.float64], group: int, bars: int) -> str:

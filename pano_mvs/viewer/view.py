@@ -108,18 +108,14 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     shown = {"labels": options.labels, "blended": options.blended, "backs": backs, "ranges": options.ranges}
     tour.begin(coloring=options.color, **shown)
     if options.surface:
-        tour.begin(surface=_surface(options.surface, scene))
+        if options.surface not in ("cloud", "mesh", "both"):
+            raise UsageError(f"--show {options.surface}: must be cloud, mesh or both")
+        missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
+        absent = [name for name in ("cloud", "mesh") if options.surface in (name, "both") and missing[name]]
+        if absent:
+            raise UsageError(f"--show {options.surface}: there is no {absent[0]}.ply in {scene.name}")
+        tour.begin(surface=options.surface)
     return tour
-
-
-def _surface(wanted: str, scene: ShownScene) -> str:
-    if wanted not in ("cloud", "mesh", "both"):
-        raise UsageError(f"--show {wanted}: must be cloud, mesh or both")
-    missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
-    absent = [name for name in ("cloud", "mesh") if wanted in (name, "both") and missing[name]]
-    if absent:
-        raise UsageError(f"--show {wanted}: there is no {absent[0]}.ply in {scene.name}")
-    return wanted
 
 
 def mesh_points(path: Path) -> NDArray[np.float32]:

@@ -124,7 +124,25 @@ def extract_orb(
         # A mask would change which key points ORB keeps as the best of each level.
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
-        return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
+        points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
+        levels = np.array([k.octave for k in keypoints], np.intp)
+        pixels = np.empty_like(points)
+        size_xy = np.array(tile_image.shape[1::-1], np.float64)
+        for level in np.unique(levels):
+            here = levels == level
+            nominal = _ORB_SCALE**level
+            level_size = np.rint(size_xy / nominal)
+            picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
+            whole = np.rint(points[here] / nominal).astype(np.intp)
+            smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
+            strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
+            x, y = whole.T
+            tops = [
+                _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx])
+                for dx, dy in ((1, 0), (0, 1))
+            ]
+            pixels[here] = ((whole.astype(np.float64) + np.stack(tops, axis=-1)) + 0.5) * (size_xy / level_size)
+        return _Found(pixels, *_sizes_and_scores(keypoints), described)
 
     _check(image, mask)
     return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming", clearance=_ORB_CLEARANCE)
@@ -222,40 +240,6 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(512 * np.sqrt(descriptors / total)).astype(np.float32)
     return rooted
-
-
-def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], tile_image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return ORB's key points in pixels with (0, 0) at the corner, with subpixel positions.
-
-    OpenCV multiplies the level's integer coordinates, counted from the CENTRE of its first pixel, by the level's scale;
-    so all but the lowest level are off by (s − 1) / 2 pixels. The actual scale of a level is that of its size.
-    """
-    points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
-    levels = np.array([k.octave for k in keypoints], np.intp)
-    pixels = np.empty_like(points)
-    size_xy = np.array(tile_image.shape[1::-1], np.float64)
-    for level in np.unique(levels):
-        here = levels == level
-        nominal = _ORB_SCALE**level
-        level_size = np.rint(size_xy / nominal)
-        picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
-        whole = np.rint(points[here] / nominal).astype(np.intp)
-        pixels[here] = (_blob_tops(picture, whole) + 0.5) * (size_xy / level_size)
-    return pixels
-
-
-def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the subpixel peaks of the Laplacian near pixels (N, 2), (0, 0) being the first pixel's centre.
-
-    These are the maxima of parabolas through its absolute value along x and along y, at most half a pixel away.
-    """
-    smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
-    strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
-    x, y = whole_px.T
-    tops = [
-        _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx]) for dx, dy in ((1, 0), (0, 1))
-    ]
-    return whole_px.astype(np.float64) + np.stack(tops, axis=-1)
 
 
 def _parabola_top(

@@ -162,7 +162,11 @@ def _plane_fits(
     weight = np.where(bare, 0.1, 1.0) * area
     margin = max(1, round(3 * height / 256))
     rays, inverse = ray_grid((height, width)), 1 / range_map.range.astype(np.float64)
-    for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
+    inside = labels >= 0
+    sizes = np.bincount(labels[inside], (area * np.degrees(1) ** 2)[inside], labels.size)
+    large = np.flatnonzero(sizes >= min_area_deg2)
+    for number in large[np.argsort(-sizes[large], kind="stable")]:
+        surface = labels == number
         support = squarely_dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
         if len(points) < _MIN_POINTS:
@@ -235,14 +239,6 @@ def fit_plane(
         if len(near) >= 3:
             plane = np.asarray(np.linalg.lstsq(near, np.ones(len(near)), rcond=None)[0], np.float64)
     return plane, np.abs(points @ plane - 1) < max_relative_error
-
-
-def _large_surfaces(labels: NDArray[np.int64], area: FloatArray, least: float) -> list[Mask]:
-    """Return the parts with at least the minimum area, largest first."""
-    inside = labels >= 0
-    sizes = np.bincount(labels[inside], area[inside], labels.size)
-    large = np.flatnonzero(sizes >= least)
-    return [labels == number for number in large[np.argsort(-sizes[large], kind="stable")]]
 
 
 def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:

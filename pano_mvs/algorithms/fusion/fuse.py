@@ -133,7 +133,9 @@ def _points_of(
     height, width = reference.ranges.shape
     rays = held_rays((height, width))
     written = _chosen_pixels((height, width), settings)
-    normals = _normals_or_views(reference, rays, written, threads=threads)
+    normals = normals_from_range(reference.ranges, given=reference.normals, wanted=written, threads=threads)
+    unknown = ~np.isfinite(normals[..., 0])
+    normals[unknown] = -rays[unknown]  # towards the camera
     tallies, grid = _own_tallies(reference, rays, normals), sines_of_grid((height, width))
     for window, idx, tie in sources:
         _compare_with(
@@ -245,16 +247,6 @@ def _tie(*, is_earlier: bool) -> float:
     # one must be 3 % better. Points between these limits are written twice, so that small errors of the footprints
     # leave no gap.
     return 0.97 if is_earlier else 1.05
-
-
-def _normals_or_views(
-    reference: ConfidentView, rays: NDArray[np.float64], wanted: NDArray[np.bool_], *, threads: int
-) -> NDArray[np.float32]:
-    """Return unit normals, (H, W, 3): given or, where wanted, fitted ones, else the direction to the camera."""
-    normals = normals_from_range(reference.ranges, given=reference.normals, wanted=wanted, threads=threads)
-    unknown = ~np.isfinite(normals[..., 0])
-    normals[unknown] = -rays[unknown]
-    return normals
 
 
 def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArray[np.bool_]:

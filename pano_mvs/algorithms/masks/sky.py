@@ -61,7 +61,12 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
     `picture`: (H, W, 3) uint8. `seeds`: (H, W), at least one pixel.
     """
     levels = picture.astype(np.float64)
-    mean = _polynomial(levels, seeds)
+    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
+    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
+    step = max(1, int(seeds.sum()) // 4000)
+    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
+    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
+    mean = np.asarray(np.clip(terms @ factors, low, high))
     spread = np.full(seeds.shape, np.sqrt(float(((levels - mean)[seeds] ** 2).max(axis=-1).mean())))
     for radius in _RADII:
         if 2 * radius >= picture.shape[0]:
@@ -98,16 +103,6 @@ def sharpened_sky(sky: Mask, colors: SkyColors, picture: Picture) -> Mask:
     limit = np.maximum(_resized(colors.tolerance, (height, width)), 0.5 * np.linalg.norm(between, axis=-1))
     nearer = np.where(total > 1, position > 0.5, wide) & (away <= limit)
     return np.where(band, nearer, wide)
-
-
-def _polynomial(levels: NDArray[np.float64], seeds: Mask) -> NDArray[np.float64]:
-    """Return the quadratic function of direction that fits the colours of the seeds, limited to their range."""
-    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
-    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
-    step = max(1, int(seeds.sum()) // 4000)
-    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
-    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
-    return np.asarray(np.clip(terms @ factors, low, high))
 
 
 def _resized(values: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
@@ -289,7 +284,10 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
     known = view.consistent & ~is_bare(view.picture)
     usual = float(np.median(parallax[known])) if known.any() else 0.0
     far = known & (parallax > 0) & (parallax < min(_FAR_PARALLAX, _MAX_FAR_RATIO * usual))
-    light = _could_be_light(view)
+    levels = view.picture.astype(np.float64)
+    brightness, blueness = largest_channel(view.picture), (levels[..., 2] + 4) / (levels[..., 0] + 4)
+    is_bright = brightness >= _quantile(brightness, _BRIGHTER_SHARE)
+    light = np.asarray(is_bright & (blueness >= _quantile(blueness, _BLUER_SHARE)))
     best, worst = np.fmin.reduce(at_infinity), np.nan_to_num(np.fmax.reduce(at_range))
     near_far = dilated(far, _BESIDE_PX)
     found: Mask = np.zeros(far.shape, np.bool_)
@@ -305,14 +303,6 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
         if is_open and moved and np.median(best[beside]) <= _MAX_BESIDE_ERROR:
             found |= area
     return found
-
-
-def _could_be_light(view: _View) -> Mask:
-    """Return the pixels (H, W) that are bright and not redder than most of the picture, as the sky is from indoors."""
-    levels = view.picture.astype(np.float64)
-    brightness, blueness = largest_channel(view.picture), (levels[..., 2] + 4) / (levels[..., 0] + 4)
-    is_bright = brightness >= _quantile(brightness, _BRIGHTER_SHARE)
-    return np.asarray(is_bright & (blueness >= _quantile(blueness, _BLUER_SHARE)))
 
 
 def _quantile(values: NDArray[Any], share: float) -> float:

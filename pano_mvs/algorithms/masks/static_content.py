@@ -249,7 +249,10 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
         # A part belongs to the content beside it if this share of its border lies on it, or on an outline.
         if weights[border & outline].sum() >= 0.5 * weights[border].sum():
             result |= area
-    result = _without_pinholes(result)
+    labels = area_labels(~result)
+    weights = pixel_weights(result.shape)
+    sizes = np.bincount(labels[~result], weights[~result], labels.size)
+    result[~result] = sizes[labels[~result]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
     # Windows that agree reach over the outline by most of their radius.
     return np.asarray((result & alike) | ~dilated(~result, _OVERHANG_PX))
 
@@ -259,13 +262,3 @@ def _gains(pictures: Sequence[Picture], pixels: Mask) -> NDArray[np.float64]:
     inner = pixels & ~dilated(~pixels, _CLOSING_PX)
     levels = np.array([picture[inner if inner.any() else pixels] for picture in pictures]) + DARK_LEVEL
     return np.asarray(np.median(np.median(levels, axis=0) / levels, axis=1))
-
-
-def _without_pinholes(found: Mask) -> Mask:
-    """Return areas with the small holes filled that no smaller area surrounds."""
-    labels = area_labels(~found)
-    weights = pixel_weights(found.shape)
-    sizes = np.bincount(labels[~found], weights[~found], labels.size)
-    filled = found.copy()
-    filled[~found] = sizes[labels[~found]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
-    return filled

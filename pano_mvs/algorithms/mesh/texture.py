@@ -58,19 +58,6 @@ def vertex_colors(
     return result.astype(np.float32)
 
 
-def fill_unseen(
-    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], of_vertices: FloatImage
-) -> None:
-    """Give the texels that are not seen the colour between those of their triangle's vertices, in place."""
-    for first in range(0, len(seen), _TEXELS_OF_PART):
-        part = slice(first, first + _TEXELS_OF_PART)
-        hidden = ~seen[part]
-        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
-        second, third = weights[:, :1], weights[:, 1:]
-        corners = of_vertices[faces[triangle]]
-        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
-
-
 def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Return a texture whose other texels have the colour of the nearest filled one.
 
@@ -239,7 +226,9 @@ def balanced_views(
     one at a time. `views`: number of panoramas. `threads`: number of threads; the result does not depend on it.
     """
     surface = Surface(vertices_in_world, faces)
-    centers = _triangle_centers(len(faces))
+    count = len(faces)
+    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
+    centers = Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
     colors = np.zeros((views, len(centers.triangle), 3), np.float32)
     weights = np.zeros((views, len(centers.triangle)), np.float32)
     density, sharp = np.zeros(len(centers.triangle)), np.zeros(views)
@@ -292,7 +281,13 @@ def _painted(
         painting.add(look, gain.astype(np.float32), threads=threads)
     colors, seen = painting.colors()
     of_vertices = vertex_colors(colors, seen, texels, faces=surface.faces, vertices=len(surface.vertices_in_world))
-    fill_unseen(colors, seen, texels, faces=surface.faces, of_vertices=of_vertices)
+    for first in range(0, len(seen), _TEXELS_OF_PART):
+        part = slice(first, first + _TEXELS_OF_PART)
+        hidden = ~seen[part]
+        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
+        second, third = weights[:, :1], weights[:, 1:]
+        corners = of_vertices[surface.faces[triangle]]
+        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
     np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
     return colors.astype(np.uint8), seen
 
@@ -329,12 +324,6 @@ class _Painting:
         np.divide(self._sums, total[:, None], out=self._sums)
         self._sums += self._detail
         return self._sums, seen
-
-
-def _triangle_centers(count: int) -> Texels:
-    """Return the centres of evenly spread triangles as if they were texels."""
-    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
-    return Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
 
 
 def _reduced(view: PaintView) -> PaintView:

@@ -118,7 +118,19 @@ def verify(store: Store) -> Verification:
     """
     found = Verification()
     intact: set[str] = set()
-    _verify_names(store, found)
+    for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
+        for file in _files(store.root / folder):
+            if _own_name(store, file, pattern):
+                continue
+            is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
+            if pattern.fullmatch(file.name) and is_special:
+                make_room(Path(file.path))
+                found.removed.append(file.path)
+            else:
+                found.foreign.append(file.path)
+    for index in store.blobs.packs.damaged_indexes():
+        store.blobs.packs.remove(index.with_suffix(".pack"))
+        found.removed.append(str(index))
     for value in _blobs(store):
         digest = _digest(value.place)
         if digest == value.digest:
@@ -135,23 +147,6 @@ def verify(store: Store) -> Verification:
     for entry in _sorted(store.blobs.temporary):
         found.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
     return found
-
-
-def _verify_names(store: Store, found: Verification) -> None:
-    """Remove what is not a file in the place of one, and indexes that cannot be read; list what is not of the cache."""
-    for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
-        for file in _files(store.root / folder):
-            if _own_name(store, file, pattern):
-                continue
-            is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
-            if pattern.fullmatch(file.name) and is_special:
-                make_room(Path(file.path))
-                found.removed.append(file.path)
-            else:
-                found.foreign.append(file.path)
-    for index in store.blobs.packs.damaged_indexes():
-        store.blobs.packs.remove(index.with_suffix(".pack"))
-        found.removed.append(str(index))
 
 
 def _remove_damaged(store: Store, value: _Value, found: Verification) -> None:

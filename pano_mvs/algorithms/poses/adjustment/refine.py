@@ -1,4 +1,4 @@
-"""Refine the poses of a whole capture by angular bundle adjustment, with rejection of outliers, and lengths by floors."""
+"""Refine the poses of a whole capture by angular bundle adjustment, with outliers rejected and lengths by floors."""
 
 from __future__ import annotations
 
@@ -220,7 +220,19 @@ def _adjusted(
     for round_idx in range(rounds):
         # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
         wider = 2 ** (rounds - 1 - round_idx) * widen
-        bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)))
+        world_from_cam = np.swapaxes(bundle.rotations, 1, 2)[bundle.image_idx]
+        starts = bundle.centers[bundle.image_idx]
+        if bundle.offsets_m is not None:
+            starts = starts + np.einsum("tij,tj->ti", world_from_cam, bundle.origins)
+        found = triangulate_observations(
+            starts,
+            np.einsum("tij,tj->ti", world_from_cam, bundle.bearings),
+            bundle.point_idx,
+            count=len(bundle.points),
+            max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)),
+            min_angle_rad=float(np.deg2rad(1.0)),
+        )
+        bundle, colors = _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
         scale_rad = float(np.deg2rad(settings.loss_scale_deg * wider))
         bundle = adjust_bundle(
             replace(bundle, lengths=floor_lengths(bundle, scale_rad=scale_rad)),
@@ -290,23 +302,6 @@ def _stitched_bearings(bundle: Bundle, rigs: Sequence[LensRig | None]) -> FloatA
             own = bundle.image_idx == idx
             bearings[own] = rig.bearings_from_rays(bundle.offsets_m[own], bundle.bearings[own])
     return bearings
-
-
-def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Triangulate all points again, and keep the observations and points that fit."""
-    world_from_cam = np.swapaxes(bundle.rotations, 1, 2)[bundle.image_idx]
-    starts = bundle.centers[bundle.image_idx]
-    if bundle.offsets_m is not None:
-        starts = starts + np.einsum("tij,tj->ti", world_from_cam, bundle.origins)
-    found = triangulate_observations(
-        starts,
-        np.einsum("tij,tj->ti", world_from_cam, bundle.bearings),
-        bundle.point_idx,
-        count=len(bundle.points),
-        max_error_rad=max_error_rad,
-        min_angle_rad=float(np.deg2rad(1.0)),
-    )
-    return _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
 
 
 def _selected(
