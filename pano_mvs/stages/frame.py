@@ -16,14 +16,9 @@ from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, sca
 from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
-from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
+from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
-
-
-@params_from(level_poses)
-class LevelParams(Params):
-    """Settings of poses.level."""
 
 
 def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
@@ -34,8 +29,8 @@ def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
     return 100_000_000 + 12 * pixels
 
 
-@stage("poses.level", memory=one_panorama_bytes)
-def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Context) -> Poses:
+@stage("poses.level", settings=level_poses, memory=one_panorama_bytes)
+def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context) -> Poses:
     """Rotate the world so that y points down along gravity, and z north if compass headings agree.
 
     The origin is the first registered camera; the unit of length does not change. The frame states the evidence and its

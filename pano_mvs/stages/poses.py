@@ -94,18 +94,13 @@ def _without_false_closures(
     return {pair: view for pair, view in matches.items() if pair not in left_out}
 
 
-@params_from(verify_poses)
-class VerifyParams(Params):
-    """Settings of poses.verify."""
-
-
-@stage("poses.verify")
+@stage("poses.verify", settings=verify_poses)
 def verify(
     poses: One[Poses],
     images: All[Panorama],
     features: All[Features] | None,
     matches: All[TwoView] | None,
-    params: VerifyParams,
+    params: Params,
     ctx: Context,
 ) -> Poses:
     """Check poses of any origin against the images, and correct errors caused by repeated structure.
