@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Axis, FilePart, Files
@@ -47,9 +48,7 @@ class NerfstudioFrame:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> NerfstudioFrame:
         """Return the frame that `to_json` gave."""
-        rows = tuple(tuple(map(float, row)) for row in value["frame_from_cam"])
-        size, focal = tuple(value["size_wh"]), tuple(value["focal_xy"])
-        return NerfstudioFrame(**{**value, "size_wh": size, "focal_xy": focal, "frame_from_cam": rows})
+        return TypeAdapter(NerfstudioFrame).validate_python(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from pano_mvs.algorithms.floor_plan.plan_grid import bar_length
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
@@ -295,7 +296,7 @@ def _drawn(
     named = len(labels) <= 600
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
-    length = _round_length(100 / scale)
+    length = bar_length(400 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
     wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
     cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
@@ -353,9 +354,3 @@ def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float
     if left < 2 or left + wide > _WIDTH - 2:
         return False
     return all(left + wide < other or other + width < left or abs(y - line) >= 16 for other, line, width in taken)
-
-
-def _round_length(longest: float) -> float:
-    """Return the largest length of the form 1, 2 or 5 × 10ⁿ that is not longer."""
-    power = 10.0 ** np.floor(np.log10(longest))
-    return float(next(step * power for step in (5, 2, 1) if step * power <= longest * (1 + 1e-9)))

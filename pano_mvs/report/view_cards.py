@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, scale_ticks
 from pano_mvs.report.earlier_page import EarlierPage
@@ -221,7 +222,7 @@ def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits |
     range_map = results.range_map(name)
     if range_map is None:
         return None
-    small = _shrunk(range_map.range)
+    small = narrowed(range_map.range, WIDTH)
     if not np.isfinite(small).any():
         return None
     near, far = (float(f"{limit:.4g}") for limit in range_limits(small))
@@ -280,7 +281,7 @@ def _new_card(
 
 def _range_pictures(range_map: RangeMap, stem: str, scales: RangeScales) -> tuple[dict[str, Picture], Picture | None]:
     """Return the images of a range map, and its range on its own scale if that differs."""
-    ranges, confidence = _shrunk(range_map.range), _shrunk(range_map.confidence)
+    ranges, confidence = narrowed(range_map.range, WIDTH), narrowed(range_map.confidence, WIDTH)
 
     def colored(limits: Limits) -> NDArray[np.uint8]:
         return mark_unconfirmed(color_mapped(ranges, *limits), confidence)
@@ -295,7 +296,7 @@ def _range_pictures(range_map: RangeMap, stem: str, scales: RangeScales) -> tupl
         "confidence": _part(table[confidence], stem, "confidence"),
     }
     if range_map.uncertainty is not None:
-        uncertainty = _shrunk(range_map.uncertainty.astype(np.float32))
+        uncertainty = narrowed(range_map.uncertainty, WIDTH).astype(np.float32)
         least, most = np.log(UNCERTAINTY_LIMITS)
         known = np.isfinite(uncertainty)
         steps = (np.log(np.where(known, uncertainty, 1).astype(np.float32)) - least) / (most - least)
@@ -318,11 +319,3 @@ def _shares(range_map: RangeMap, mask: NDArray[np.bool_] | None) -> Shares:
 def _part(image: NDArray[np.uint8], stem: str, part: str, *, file: str = "") -> Picture:
     key = f"{stem}.{file or part}" if stem else ""
     return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MAX_BYTES[part], key=key)
-
-
-def _shrunk(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a map at its displayed size, without mixing values."""
-    if array.shape[1] <= WIDTH:
-        return np.ascontiguousarray(array)
-    size = WIDTH, round(array.shape[0] * WIDTH / array.shape[1])
-    return np.asarray(cv2.resize(np.ascontiguousarray(array), size, interpolation=cv2.INTER_NEAREST))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.images.captures import describe_picture
@@ -147,8 +148,10 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
     if camera.range_file is None:
         return None, "no ranges of this camera: the workflow has no export.ranges, or the run did not reach it"
     try:
-        ranges = _small(read_range_tiff(camera.range_file))
-        confidence = None if camera.confidence_file is None else _small(read_confidence_png(camera.confidence_file))
+        ranges = narrowed(read_range_tiff(camera.range_file), _WIDTH)
+        confidence = (
+            None if camera.confidence_file is None else narrowed(read_confidence_png(camera.confidence_file), _WIDTH)
+        )
     except InputError as error:
         return None, str(error)
     near, far = range_limits(ranges)
@@ -160,14 +163,6 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
     if not np.isfinite(ranges).all():
         parts.append("grey: no range")
     return colors, "\n".join(parts)
-
-
-def _small(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map at most `_WIDTH` wide, of whole pixels."""
-    if values.shape[1] <= _WIDTH:
-        return values
-    size = _WIDTH, max(1, round(values.shape[0] * _WIDTH / values.shape[1]))
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST))
 
 
 _KEYS = (

@@ -260,7 +260,6 @@ def _bits(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
 
 _PAPER, _INK, _CAMERA = (255, 255, 255), (24, 32, 56), (214, 72, 36)
 _STRIP_SHARE = 0.06
-_BAR_SHARE = 0.25
 _SUBPIXEL_BITS = 4
 
 
@@ -270,9 +269,8 @@ def bar_length(width: float) -> float:
     >>> bar_length(10.0), bar_length(0.9)
     (2.0, 0.2)
     """
-    limit = _BAR_SHARE * width
-    power = 10.0 ** np.floor(np.log10(limit))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= limit))
+    power = 10.0 ** np.floor(np.log10(width / 4))
+    return float(next(step * power for step in (5, 2, 1) if step * power <= width / 4 * (1 + 1e-9)))
 
 
 def strip_px(size_hw: tuple[int, int]) -> int:

@@ -1,4 +1,4 @@
-"""The commands `pano-mvs evaluate`: their options, and how scores are printed."""
+"""Options of the commands `pano-mvs evaluate`."""
 
 from __future__ import annotations
 
@@ -8,20 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import typer
-from rich.box import SIMPLE
 from rich.markup import escape
-from rich.table import Table
 from typer.core import TyperGroup
 
 from pano_mvs.cli.console import Console, print_json
 from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import takes_record
-from pano_mvs.cli.run.printing import print_scores
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.evaluation import RunEvaluation, depth_summary
-from pano_mvs.evaluation.tables import Summary, TextTable
-from pano_mvs.results.records import ScoresSummary
 
 _FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
 
@@ -59,7 +53,7 @@ def run(
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of them.")],
 ) -> None:
     """Compare the poses, range maps and cloud of a run with ground truth, as far as available."""
-    from pano_mvs.cli.evaluate.app import print_run
+    from pano_mvs.cli.evaluate.printing import print_run
     from pano_mvs.evaluation import evaluate_run
 
     print_run(evaluate_run(out, truth), Console())
@@ -73,7 +67,7 @@ def poses(
     as_json: JsonOption = False,
 ) -> None:
     """Compare poses with ground truth, regardless of their frames and units."""
-    from pano_mvs.cli.evaluate.app import print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import evaluate_poses
 
     evaluation = evaluate_poses(model, truth)
@@ -108,7 +102,7 @@ def cloud(
     as_json: JsonOption = False,
 ) -> None:
     """Compare a cloud with ground truth: accuracy, completeness, F-score."""
-    from pano_mvs.cli.evaluate.app import print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import evaluate_cloud, write_error_clouds, write_overview
 
     evaluation = evaluate_cloud(cloud, truth, poses=poses, true_poses=true_poses, thresholds=thresholds)
@@ -189,7 +183,7 @@ class DepthArguments:
 @takes_record
 def depth(given: DepthArguments) -> None:
     """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
-    from pano_mvs.cli.evaluate.app import print_summary
+    from pano_mvs.cli.evaluate.printing import print_summary
     from pano_mvs.evaluation import (
         BadLimit,
         ScoreSettings,
@@ -239,39 +233,3 @@ def _scale(text: str) -> float | Literal["auto"]:
         raise UsageError(
             f"'{text}' is not a scale: give a positive number, or auto to estimate it from the camera centres"
         ) from error
-
-
-def print_summary(summary: Summary, console: Console) -> None:
-    """Print lines and tables."""
-    for part in summary:
-        if isinstance(part, TextTable):
-            console.print(_rich_table(part))
-        else:
-            console.say(escape(part))
-
-
-def print_run(evaluation: RunEvaluation, console: Console) -> None:
-    """Print all scores of a run, and why some are missing."""
-    if (poses := evaluation.poses) is not None:
-        print_scores(ScoresSummary(poses=poses.poses), console)
-        if "registered_in_one_frame" in poses.poses:
-            console.say(escape(poses.notes[0]))
-    if evaluation.depth is not None:
-        print_summary(depth_summary(evaluation.depth), console)
-    if evaluation.cloud is not None:
-        print_summary(evaluation.cloud.summary(), console)
-    for result, reason in evaluation.not_compared.items():
-        console.say(escape(f"{result}: not compared, {reason}"))
-
-
-def _rich_table(text: TextTable) -> Table:
-    if not text.baselines:
-        table = Table(*text.headings)
-        for row in text.rows:
-            table.add_row(*map(escape, row))
-        return table
-    table = Table(*text.headings, box=SIMPLE, collapse_padding=True)
-    for row, baseline in zip(text.rows, text.baselines, strict=True):
-        table.add_row(*map(escape, row))
-        table.add_row(*map(escape, baseline), style="dim", end_section=True)
-    return table
