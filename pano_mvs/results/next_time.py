@@ -100,7 +100,6 @@ LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 """Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
 
 _USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
-_GOOD_BASELINE = 0.05, 0.2
 _WEAK = 0.5  # of the median share that other views confirm
 _MAX_UNREGISTERED = 4
 
@@ -299,7 +298,7 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
         return
     worst = min(close, key=ratios.__getitem__)
     middle = median([group.typical_range(idx) for idx in close]) or 0.0
-    low, high = (significant(factor * middle) for factor in _GOOD_BASELINE)
+    low, high = (significant(factor * middle) for factor in (0.05, 0.2))
     names = shortened_list(group.names[idx] for idx in close)
     reason = (
         f"{len(close)} of {len(group.names)} panoramas ({names}) have their nearest neighbours within "

@@ -36,8 +36,6 @@ _OVERDUE = 1.2  # a unit that takes longer than expected is expected to take thi
 _UNKNOWN = 2.0  # … and this one if nothing is known of its stage
 
 _SPEED_PRIOR_S = 10.0
-_SPEED_LIMITS = 0.2, 5.0
-_GLIDE_S = 4.0
 _COMPUTED = ("run", "failed")
 
 
@@ -188,7 +186,7 @@ class TimeEstimator:
         timed = [stage for stage in self.stages.values() if stage.forecast.unit_s is not None and stage.computed]
         taken_s = sum(stage.seconds for stage in timed)
         expected_s = sum(stage.computed * (stage.forecast.unit_s or 0.0) for stage in timed)
-        least, most = _SPEED_LIMITS  # earlier runs may have been slower
+        least, most = 0.2, 5.0  # earlier runs may have been slower
         now, speed = self._clock(), min(most, max(least, (taken_s + _SPEED_PRIOR_S) / (expected_s + _SPEED_PRIOR_S)))
         work = {name: stage.work_s(now, speed) for name, stage in self.stages.items()}
         known = {name: found for name, found in work.items() if found is not None}
@@ -238,7 +236,7 @@ class Countdown:
         else:
             step_s = max(0.0, now - self._at)
             counted_s = self._shown_s - step_s
-            self._shown_s = counted_s + (seconds_left - counted_s) * -math.expm1(-step_s / _GLIDE_S)
+            self._shown_s = counted_s + (seconds_left - counted_s) * -math.expm1(-step_s / 4.0)
         self._at = now
         return max(0.0, self._shown_s)
 

@@ -250,7 +250,6 @@ def _may_have_image(run: RunOutput, name: str, images: Path | None) -> bool:
 
 _SAMPLED_HW = (16, 32)
 _TOLERANCE = 0.1
-_MIN_SHARED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,7 +343,7 @@ def rooms_by_sight(sights: Sequence[Sight]) -> list[int]:
     shared = np.array([[_share(first, second) for second in sights] for first in sights])
     apart = 1 - np.minimum(shared, shared.T)
     np.fill_diagonal(apart, 0)
-    labels = fcluster(linkage(squareform(apart), "average"), 1 - _MIN_SHARED, "distance").tolist()
+    labels = fcluster(linkage(squareform(apart), "average"), 0.5, "distance").tolist()
     order = {label: number for number, label in enumerate(dict.fromkeys(labels), 1)}
     return [order[label] for label in labels]
 

@@ -13,8 +13,6 @@ from pano_mvs.core.settings import Setting
 
 MaxKeypoints: TypeAlias = Annotated[int, Setting("maximum number, spread over the sphere by strength", ge=8)]
 
-_KEYPOINTS_PER_CELL = 8
-
 
 def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, radius_rad: float) -> NDArray[np.intp]:
     """Return the positions of key points without a stronger one within a radius; of equals, the first is kept.
@@ -52,7 +50,7 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
     order = np.argsort(-scores, kind="stable")
     if len(order) <= max_keypoints:
         return order
-    cells = _fibonacci_sphere(max(20, max_keypoints // _KEYPOINTS_PER_CELL))
+    cells = _fibonacci_sphere(max(20, max_keypoints // 8))
     cell = np.asarray(cKDTree(cells).query(bearings[order])[1], np.intp)
     by_cell = np.argsort(cell, kind="stable")
     first_of_cell = np.searchsorted(cell[by_cell], np.arange(len(cells)))

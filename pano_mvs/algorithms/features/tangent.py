@@ -20,7 +20,6 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
-_ORB_SMOOTHING_PX = 1.2
 # Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
 # slide.
 _SIFT_EDGE_RATIO = 20
@@ -134,7 +133,7 @@ def extract_orb(
             level_size = np.rint(size_xy / nominal)
             picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
             whole = np.rint(points[here] / nominal).astype(np.intp)
-            smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
+            smooth = cv2.GaussianBlur(picture, (0, 0), 1.2)
             strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
             x, y = whole.T
             tops = [

@@ -28,7 +28,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 _HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
 # The plane must be seen on most sides of the surface: extrapolation is unreliable.
 _SECTORS, _MIN_SECTORS = 8, 6
-_STEPS_BEYOND = 0.8, 1.3
 # Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
 # has this share of the pixels of that one.
 _CLEAR_SHARE, _NEARLY = 0.8, 0.8
@@ -252,7 +251,7 @@ def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArr
 def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, *, inverse: FloatArray) -> bool:
     """Return whether a plane stays within its points' ranges on the whole surface, and is seen on most sides of it."""
     laid = surface @ plane
-    low, high = _STEPS_BEYOND
+    low, high = 0.8, 1.3
     if len(rays) < _MIN_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
         return False
     middle = surface.mean(axis=0)

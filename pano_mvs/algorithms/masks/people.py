@@ -114,9 +114,6 @@ def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
     return narrow, wide
 
 
-_ROLLS_DEG = (-12.0, 12.0)
-
-
 @checks_settings
 def people(
     picture: Picture,
@@ -191,7 +188,7 @@ def _views_of(area: Mask) -> list[Look]:
     # them.
     if center[1] > np.cos(np.radians(15.0)):
         return [look(rolled(_DOWN, roll), fov_deg) for roll in np.radians([0, 90, 180, 270])]
-    return [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in _ROLLS_DEG]
+    return [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in (-12.0, 12.0)]
 
 
 def _at_size(probability: Map, size_hw: tuple[int, int]) -> Map:

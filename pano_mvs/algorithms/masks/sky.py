@@ -33,8 +33,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
-_RADII = (24, 6)
-_MIN_SEEDS = 40.0
 _TOLERANCE, _SPREAD, _MAX_TOLERANCE = 7.0, 3.0, 40.0
 _BAND_PX, _BAND_BESIDE_PX = 2, 3
 
@@ -68,11 +66,11 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
     low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
     mean = np.asarray(np.clip(terms @ factors, low, high))
     spread = np.full(seeds.shape, np.sqrt(float(((levels - mean)[seeds] ** 2).max(axis=-1).mean())))
-    for radius in _RADII:
+    for radius in (24, 6):
         if 2 * radius >= picture.shape[0]:
             continue
         count = box_sum(seeds.astype(np.float64), radius)
-        share = np.clip(count / _MIN_SEEDS, 0, 1)
+        share = np.clip(count / 40.0, 0, 1)
         local = box_sum(levels * seeds[..., None], radius) / np.maximum(count, 1)[..., None]
         mean = share[..., None] * local + (1 - share)[..., None] * mean
         squares = box_sum(largest_channel((levels - mean) ** 2) * seeds, radius) / np.maximum(count, 1)
@@ -130,7 +128,6 @@ _MIN_WIDTH = 64
 _SMOOTH = 10
 # Errors in grey levels: of the sky at infinity, and by how much those at finite range may be less.
 _MAX_ERROR, _FLAT_RATIO, _FLAT_MARGIN = 4.0, 1.15, 0.5
-_PREFERS_RATIO, _PREFERS_MARGIN = 1.3, 0.1
 # Where there is no range: errors at infinity as a share of the standard deviation of the colours.
 _CONTENT_RATIO = 0.12
 # Without a preference for infinity: the most that may lie on one plane, and that other views may confirm.
@@ -143,15 +140,12 @@ _SOLID_MARGIN = 3.0
 _MAX_PART_SHARE = 0.005
 # Larger ones count as small if they differ by at most this number of grey levels on average.
 _MAX_EXACT_SHARE, _EXACT_LEVELS = 0.03, 5.0
-_MIN_AGREEING = 0.3
 # Farther from known sky, the colours of the sky are not known.
 _REACH_PX = 40
 _CLOUD_RADIUS_PX, _CLOUD_SHARE, _ROUGH_ERRORS = 3, 0.7, 3
 _ROUNDS = 3
 # If less than this share of an area lies away from its border, all of it is compared.
 _MIN_INNER = 0.3
-_CREEP_PX, _CREEP_LEVELS = 4, 16
-_ENCLOSED = 0.7
 # A window: the smallest and the largest pane, how far what is behind it is, and how many pixels beside must show it.
 _PANE_SHARES, _FAR_PARALLAX = (2e-4, 0.01), 0.125
 _BESIDE_PX, _MIN_BESIDE, _MIN_FAR_SHARE = 4, 8, 0.04
@@ -331,7 +325,7 @@ def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share
     if not at_infinity <= min(_MAX_ERROR, _FLAT_RATIO * at_range + _FLAT_MARGIN):
         return False
     if np.isfinite(at_range):
-        if at_range >= _PREFERS_RATIO * at_infinity + _PREFERS_MARGIN:
+        if at_range >= 1.3 * at_infinity + 0.1:
             return True
     elif at_infinity <= _CONTENT_RATIO * view.picture[inner].std(axis=0).max():
         return True
@@ -389,7 +383,7 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
         away = largest_channel(np.abs(view.picture - colors.mean))
         exact = np.bincount(labels[inside], (weights * away)[inside], labels.size) <= _EXACT_LEVELS * sizes
         taken = (sizes <= most) | (exact & (sizes <= _MAX_EXACT_SHARE / _MAX_PART_SHARE * most))
-        for label in np.flatnonzero(~taken & (agreeing >= _MIN_AGREEING * sizes)):
+        for label in np.flatnonzero(~taken & (agreeing >= 0.3 * sizes)):
             taken[label] = _is_sky(view, labels == label, rng)
         sky = sky | (inside & taken[labels])
         sky = _with_enclosed_parts(_crept(sky, view.picture, agrees), agrees | alike)
@@ -398,10 +392,10 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
 
 def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
     """Return the sky with neighbouring pixels that agree at infinity and whose colours continue it, as at a horizon."""
-    for _ in range(_CREEP_PX):
+    for _ in range(4):
         count = box_sum(sky.astype(np.float64), 2)
         local = box_sum(picture.astype(np.float64) * sky[..., None], 2) / np.maximum(count, 1)[..., None]
-        further = agrees & ~sky & (count > 0) & (largest_channel(np.abs(picture - local)) <= _CREEP_LEVELS)
+        further = agrees & ~sky & (count > 0) & (largest_channel(np.abs(picture - local)) <= 16)
         if not further.any():
             break
         sky = sky | further
@@ -411,4 +405,4 @@ def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
 def _with_enclosed_parts(sky: Mask, possible: Mask) -> Mask:
     """Return the sky with the parts, such as the edges of clouds, whose border is mostly sky."""
     labels = area_labels(possible & ~sky)
-    return sky | ((labels >= 0) & (border_shares(labels, sky) >= _ENCLOSED)[labels])
+    return sky | ((labels >= 0) & (border_shares(labels, sky) >= 0.7)[labels])

@@ -142,8 +142,6 @@ MAX_VIEWS = 12
 """More views than this add nothing; give an evenly spread choice."""
 
 _MIN_WIDTH = 128
-_SEED_AGREEMENT, _SEED_SHARPNESS = 0.7, 0.03
-_GROWN_AGREEMENT, _GROWN_SHARPNESS = 0.5, -0.02
 _CLOSING_PX, _OVERHANG_PX = 2, 3
 
 
@@ -211,8 +209,8 @@ def static_content(
 
 def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:
     """Return connected areas of agreeing structure that contain seeds and lie in surroundings that move."""
-    agrees = structure & (agreement.agreement >= _GROWN_AGREEMENT) & (agreement.sharpness >= _GROWN_SHARPNESS)
-    seeds = structure & (agreement.agreement >= _SEED_AGREEMENT) & (agreement.sharpness >= _SEED_SHARPNESS)
+    agrees = structure & (agreement.agreement >= 0.5) & (agreement.sharpness >= -0.02)
+    seeds = structure & (agreement.agreement >= 0.7) & (agreement.sharpness >= 0.03)
     labels = area_labels(agrees | seeds)
     weights = pixel_weights(seeds.shape)
     enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= 12

@@ -23,7 +23,6 @@ from pano_mvs.algorithms.panoramas import filtered, sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
 
-_GREY = 128.0
 _TEXELS_OF_PART = 1 << 20  # bounds the memory
 
 
@@ -49,7 +48,7 @@ def vertex_colors(
             for channel in range(3):
                 sums[:, channel] += np.bincount(vertex, weight * colors[part][shown, channel], vertices)
     known = totals > 1e-3
-    result = np.full((vertices, 3), _GREY if not known.any() else 0.0)
+    result = np.full((vertices, 3), 128.0 if not known.any() else 0.0)
     if not known.any():
         return result.astype(np.float32)
     result[known] = sums[known] / totals[known, None]

@@ -290,7 +290,6 @@ def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, *, ke
     )
 
 
-_EXCESS = 0.02
 # Ratio of points after voxel selection, and number of a point's neighbours to examine for discs: points are on
 # surfaces, where no more fit around one.
 _CHOICE, _NEIGHBOURS = 2.5, 16
@@ -337,7 +336,7 @@ def _widest(low: float, high: float, wanted: int, *, left: Callable[[float], int
             high = middle
             continue
         low = middle
-        if found <= wanted * (1 + _EXCESS):
+        if found <= wanted * 1.02:
             break
     return low
 

@@ -16,7 +16,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 
 _ROUNDS = 3
-_RESECTION_SCALE_RAD = float(np.deg2rad(0.1))
 
 
 @checks_settings
@@ -76,5 +75,5 @@ def _settled(model: GrowingModel, new: list[int]) -> None:
         for image in new:
             points, bearings = model.known_points(image)
             model.cameras[image] = refine_resection(
-                model.cameras[image], points, bearings, scale_rad=_RESECTION_SCALE_RAD
+                model.cameras[image], points, bearings, scale_rad=float(np.deg2rad(0.1))
             )

@@ -24,7 +24,6 @@ from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 
-_MAX_PHOTOGRAPH_PX, _MAX_PANORAMA_PX = 2048, 2048
 # Levels of the panoramas in each round: coarse patches are aligned from further away.
 _ROUNDS = (1, 0, 0)
 
@@ -63,7 +62,7 @@ class PanoramaPatches:
         if name not in self._held:
             while len(self._held) >= 10:
                 self._held.popitem(last=False)
-            self._held[name] = panorama_levels(_reduced(self._load(name), _MAX_PANORAMA_PX), max(_ROUNDS) + 1)
+            self._held[name] = panorama_levels(_reduced(self._load(name), 2048), max(_ROUNDS) + 1)
         self._held.move_to_end(name)
         return self._held[name]
 
@@ -78,7 +77,7 @@ class PhotographPatches:
 
     def __init__(self, photograph: NDArray[np.uint8], panoramas: PanoramaPatches) -> None:
         self._size_hw = (photograph.shape[0], photograph.shape[1])
-        self._gray = np.asarray(cv2.cvtColor(_reduced(photograph, _MAX_PHOTOGRAPH_PX), cv2.COLOR_RGB2GRAY), np.uint8)
+        self._gray = np.asarray(cv2.cvtColor(_reduced(photograph, 2048), cv2.COLOR_RGB2GRAY), np.uint8)
         self._panoramas = panoramas
 
     @property
@@ -142,13 +141,11 @@ MIN_SIDE_PX = SIZE + 2 * MARGIN + 1
 """Photographs with a shorter side have no levels."""
 
 _PAD_PX = 8
-_SMOOTHING = 0.5
 # A patch is compared only where the photograph sees the surface at less than 75° from its normal, and not from behind.
 _MIN_COSINE = 0.25
 _MIN_CORRELATION, _MAX_SHIFT = 0.8, 3.0
 _FLOOR = 0.05
 _ROUNDNESS = 1.0
-_NOISE_FACTOR = 4.0
 
 
 def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -159,7 +156,7 @@ def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
     levels: list[NDArray[np.float32]] = []
     reduced = gray.astype(np.float32)
     while len(levels) < 7 and min(reduced.shape) >= MIN_SIDE_PX:
-        levels.append(np.asarray(cv2.GaussianBlur(reduced, (0, 0), _SMOOTHING), np.float32))
+        levels.append(np.asarray(cv2.GaussianBlur(reduced, (0, 0), 0.5), np.float32))
         size_xy = [max(1, round(side / 2 ** len(levels))) for side in gray.shape[::-1]]
         reduced = np.asarray(cv2.resize(reduced, size_xy, interpolation=cv2.INTER_AREA), np.float32)
     return levels
@@ -239,7 +236,7 @@ def _shift_covariances(patches: NDArray[np.float32], correlations: FloatArray) -
     gradients = np.stack([across, down], axis=-1).astype(np.float64)
     structure = np.einsum("nyxi,nyxj,yx->nij", gradients, gradients, window()) / contrast[:, None, None]
     noise = np.maximum(2 * (1 - correlations), 1e-4)[:, None, None]
-    information = structure / (_NOISE_FACTOR * noise) + np.eye(2) / _MAX_SHIFT**2
+    information = structure / (4 * noise) + np.eye(2) / _MAX_SHIFT**2
     covariances = np.linalg.inv(information)
     largest = np.linalg.eigvalsh(covariances)[:, -1:, None]
     return np.asarray(covariances + (_FLOOR**2 + _ROUNDNESS**2 * largest) * np.eye(2))

@@ -14,7 +14,6 @@ from pano_mvs.scene import Features, RangeMap
 
 # A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
 _OFFSETS_PX = (-4, -2, 0, 2, 4)
-_STD, _STD_BOUNDS = 0.005, (0.003, 0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +68,9 @@ def surface_points(
     with np.errstate(invalid="ignore"):
         flat = _planar_share(range_map.range, (x, y), (normals, heights)) >= 0.8
         keep = flat & (slopes < -0.1)
-    stds = np.full(len(good), _STD)
+    stds = np.full(len(good), 0.005)
     if range_map.uncertainty is not None:
-        stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), *_STD_BOUNDS)
+        stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), 0.003, 0.05)
     return SurfacePoints(cam_from_world, bearings[keep], (heights / slopes)[keep], normals[keep], stds[keep])
 
 

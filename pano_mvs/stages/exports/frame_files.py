@@ -143,7 +143,7 @@ class FrameFiles:
 
     def _add_layers(self, variant: Variant, name: str, layers: Layers, **frame: Any) -> None:
         """Write mask, depth, normals and confidence where there are any, and add the frame with their paths."""
-        paths = {"mask": "", "depth": ""}
+        paths: dict[str, Any] = {"mask": "", "depth": ""}
         if not layers.valid.all():
             paths["mask"] = f"masks/{name}.png"
             write_png(self._file(variant, paths["mask"]), np.where(layers.valid, np.uint8(255), np.uint8(0)))

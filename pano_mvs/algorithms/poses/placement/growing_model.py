@@ -27,9 +27,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-_MAX_PARTNERS = 8
-_ADJUST_STEPS = 20
 # Further steps are not needed: the finished model is refined anyway.
 _ADJUST_TOLERANCE = 1e-3
 
@@ -103,7 +100,7 @@ class GrowingModel:
             compact[tracks.track_idx[seen]].astype(np.int32),
             count=int(chosen.sum()),
             max_error_rad=MAX_ERROR_RAD,
-            min_angle_rad=_MIN_ANGLE_RAD,
+            min_angle_rad=float(np.deg2rad(1.0)),
         )
         self._points[chosen] = found.points_in_world
         return seen, found
@@ -128,7 +125,7 @@ class GrowingModel:
             bundle,
             loss="cauchy",
             scale_rad=MAX_ERROR_RAD / 4,
-            max_iterations=_ADJUST_STEPS,
+            max_iterations=20,
             tolerance=_ADJUST_TOLERANCE,
             fixed_camera=images.index(next(iter(self.cameras))),
         )
@@ -183,7 +180,7 @@ class GrowingModel:
 
     def _partners(self, image: int) -> list[int]:
         """Return the registered partners of an image, sorted by number of verified matches."""
-        return [partner for _, partner in self._pairs[image] if partner in self.cameras][:_MAX_PARTNERS]
+        return [partner for _, partner in self._pairs[image] if partner in self.cameras][:8]
 
     def _chained(self, image: int, partner: int) -> Rigid3 | None:
         """Return the pose from one partner: rotation and direction of the pair, and the length from known points.

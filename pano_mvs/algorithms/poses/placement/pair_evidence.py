@@ -21,7 +21,6 @@ MIN_RATIOS = 6
 # ratios.
 _AGREEING, MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
-_SHUFFLES = 50
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
 
 
@@ -212,7 +211,7 @@ def significant_length(
         return np.nan, np.inf
     length = estimate_scale(known / unit, np.sin(parallax) ** 2, estimator="cauchy", kappa=0.0)
     off = np.abs(np.log(known / unit / length))
-    shuffled = np.abs(np.log(rng.permuted(np.tile(known, (_SHUFFLES, 1)), axis=1) / unit / length))
+    shuffled = np.abs(np.log(rng.permuted(np.tile(known, (50, 1)), axis=1) / unit / length))
     alarms = [
         log10_false_alarms(
             int((off < tolerance).sum()),

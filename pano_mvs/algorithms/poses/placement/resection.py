@@ -15,7 +15,6 @@ FIRST_GUESS_RAD = float(np.deg2rad(2.0))
 """The same at a pose that is not yet refined."""
 
 MIN_POINTS = 15
-_MIN_SHARE, _MIN_SHARE_OF_AGREEING = 0.4, 0.2
 
 
 def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:
@@ -39,7 +38,7 @@ def points_needed(known: int, *, agreeing: int = 1) -> int:
         agreeing: number of pairs that agree with its pose. Two or more pairs are independent evidence, so that
             imprecise matches, as in the paper, do not lead to rejection.
     """
-    share = _MIN_SHARE if agreeing < 2 else _MIN_SHARE_OF_AGREEING
+    share = 0.4 if agreeing < 2 else 0.2
     return max(MIN_POINTS, int(np.ceil(share * known)))
 
 
