@@ -183,7 +183,13 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
         temporary.chmod(0o666 & (~_UMASK | _shared_mode(path.parent)))
         if durable:
             _flush(temporary)
-        _take_name(temporary, path)
+        try:
+            temporary.replace(path)
+        except PermissionError:  # while a reader has the target open, which is fine if its bytes are the same
+            if not is_file(path) or path.stat().st_size != temporary.stat().st_size:
+                raise
+            if path.read_bytes() != temporary.read_bytes():
+                raise
         if durable and os.name == "posix":
             _flush(path.parent)
     except OSError as error:
@@ -254,17 +260,6 @@ def copy_file(source: Path, target: Path) -> None:
     """Copy a file atomically."""
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
-
-
-def _take_name(temporary: Path, path: Path) -> None:
-    """Rename; some systems refuse this while a reader has the target open, which is fine if its bytes are the same."""
-    try:
-        temporary.replace(path)
-    except PermissionError:
-        if not is_file(path) or path.stat().st_size != temporary.stat().st_size:
-            raise
-        if path.read_bytes() != temporary.read_bytes():
-            raise
 
 
 def _flush(path: Path) -> None:

@@ -138,7 +138,8 @@ def camera_maps(
     centers = centers @ level_from_world.T
     places = np.array([place for _, place in marks], np.float64).reshape(-1, 3) @ level_from_world.T
     unit = "m" if poses.metric else "scene units"
-    labels = short_names(names)
+    short = [PurePosixPath(name).stem for name in names]
+    labels = short if len(set(short)) == len(short) else list(names)
     walk = _walk_of(poses.links, names)
     links = _chosen(poses.links, names, labels, reasons=reasons or {}, walk=walk)
     north = states_z_north(poses.frame)
@@ -181,12 +182,6 @@ def up_of(poses: PosesSummary) -> FloatArray:
     if not usable or states_y_down(poses.frame):
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
-
-
-def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without folder and extension if they stay distinct."""
-    short = [PurePosixPath(name).stem for name in names]
-    return short if len(set(short)) == len(short) else list(names)
 
 
 @dataclass(frozen=True)

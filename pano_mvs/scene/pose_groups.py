@@ -54,7 +54,16 @@ def join_groups(
     """
     order = tuple(name for group in groups for name in group.names) if order is None else tuple(order)
     position = {name: idx for idx, name in enumerate(order)}
-    _require_joinable(groups, position)
+    if not groups:
+        raise UsageError("there is no group to join")
+    if any(group.other_worlds for group in groups):
+        raise UsageError("a group that is joined must not have groups itself; split it first")
+    names = [name for group in groups for name in group.names]
+    if len(set(names)) < len(names):
+        raise UsageError("an image is in two groups")
+    missing = [name for name in names if name not in position]
+    if missing:
+        raise UsageError(f"the order of the images does not have {missing[0]!r}")
     reasons = {**(rejected or {})}
     for group in groups:
         reasons |= group.rejected
@@ -135,19 +144,6 @@ def _renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the new position of each kept item, (N,)."""
     positions: NDArray[np.int32] = (np.cumsum(kept) - 1).astype(np.int32)
     return positions
-
-
-def _require_joinable(groups: Sequence[Poses], position: Mapping[str, int]) -> None:
-    if not groups:
-        raise UsageError("there is no group to join")
-    if any(group.other_worlds for group in groups):
-        raise UsageError("a group that is joined must not have groups itself; split it first")
-    names = [name for group in groups for name in group.names]
-    if len(set(names)) < len(names):
-        raise UsageError("an image is in two groups")
-    missing = [name for name in names if name not in position]
-    if missing:
-        raise UsageError(f"the order of the images does not have {missing[0]!r}")
 
 
 def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses:

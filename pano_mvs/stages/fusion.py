@@ -53,13 +53,13 @@ def vote(ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params:
         clouds.append(fused)
         if not len(clouds[-1]):
             which = f"group {number}: " if len(set(groups.values())) > 1 else ""
-            ctx.note(
-                which
-                + _why_empty(
-                    {name: ranges[name] for name in names},
-                    _min_views(settings, len(names)),
-                )
+            why = (
+                f"at no pixel did {_min_views(settings, len(names))} views agree. Look at the poses, or lower "
+                "min_confidence or min_views"
+                if any(ranges[name].valid.any() for name in names)
+                else "no view has any range. Check the masks and the messages of the depth stage"
             )
+            ctx.note(f"{which}the cloud is empty: {why}")
     cloud = PointCloud.of_groups(clouds)
     ctx.metric("points", len(cloud))
     return cloud
@@ -155,15 +155,6 @@ def _joined_in_files(clouds: Iterable[PointCloud], *, folder: Path) -> PointClou
 def _min_views(settings: FusionSettings, views: int) -> int:
     """Return the number of views that must agree on a point, at most the number of views."""
     return min(settings.min_views, max(1, views))
-
-
-def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
-    if not any(range_map.valid.any() for range_map in ranges.values()):
-        return "the cloud is empty: no view has any range. Check the masks and the messages of the depth stage"
-    return (
-        f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
-        "min_views"
-    )
 
 
 @stage("points.surface", settings=sample_surface)

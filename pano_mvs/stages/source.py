@@ -27,7 +27,7 @@ from pano_mvs.api import (
     source,
 )
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.images.captures import describe_picture, list_pictures
 from pano_mvs.io.images.copies import find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
@@ -138,7 +138,18 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"{{count}} images have {trait}")
-    _check_pixels(path, data, info, max_pixels=params.max_pixels)
+    picture = decode_image(path, data, max_pixels=params.max_pixels)
+    height, width = picture.shape[:2]
+    if (height, width) != info.file_size_hw:
+        raise InputError(
+            f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. Save it again"
+        )
+    if info.gpano is None and is_dual_fisheye(picture):
+        raise InputError(
+            f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
+            "the camera maker's program (stitching), or, if the calibration of the lenses is known, use "
+            "source.dual_fisheye (docs/rigs.md)"
+        )
     del data
     panorama = Panorama(
         image=image,
@@ -197,22 +208,6 @@ def stereo_note(what: str, layout: StereoLayout) -> str:
     """Return a note on stereo pictures of which one eye is used."""
     place = "the upper half" if layout == "top_bottom" else "the left half"
     return f"{what} show both eyes (stereo); {place} is used, which is that of the left eye"
-
-
-def _check_pixels(path: Path, data: bytes, info: PictureInfo, *, max_pixels: int) -> None:
-    """Decode the whole image once, so that a damaged file is reported here and not in the middle of a sweep."""
-    picture = decode_image(path, data, max_pixels=max_pixels)
-    height, width = picture.shape[:2]
-    if (height, width) != info.file_size_hw:
-        raise InputError(
-            f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. Save it again"
-        )
-    if info.gpano is None and is_dual_fisheye(picture):
-        raise InputError(
-            f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
-            "the camera maker's program (stitching), or, if the calibration of the lenses is known, use "
-            "source.dual_fisheye (docs/rigs.md)"
-        )
 
 
 def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:

@@ -67,30 +67,25 @@ def write_curve_picture(path: Path, inspection: Inspection) -> None:
                     axes.plot(source_costs, color=_SOURCES[source % len(_SOURCES)], linewidth=0.8)
             is_last = idx == len(panels) - 1
             axes.plot(costs, color=_DECISIVE if is_last else _RAW)
-            _set_scales(axes, curve.ranges, with_labels=is_last)
+            drawn = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
+            highest = float(np.nanmax(drawn[~np.isinf(drawn)]))
+            axes.set(xlim=(0, len(curve.ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
+            axes.yaxis.set_major_formatter("{x:.2f}")
+            values = scale_ticks(float(curve.ranges[0]), float(curve.ranges[-1]))
+            places = [_place_of(value, curve.ranges) for value in values]
+            labels, taken = [], -np.inf
+            for value, place in zip(values, places, strict=True):
+                x = place / (len(curve.ranges) - 1) * (_RIGHT - _LEFT)
+                is_shown = is_last and x - taken > 44
+                labels.append(f"{value:g}" if is_shown else "")
+                taken = x if is_shown else taken
+            axes.set_xticks(places, labels)
+            if is_last:
+                axes.set_xlabel("depth hypothesis, scene units")
             _add_marks(axes, inspection, costs)
         _add_legend(figure, inspection)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, format="png", metadata={"Software": None})  # whose version would change the bytes
-
-
-def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -> None:
-    """Set the limits and ticks of the axes; hypotheses are evenly spaced."""
-    drawn = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
-    highest = float(np.nanmax(drawn[~np.isinf(drawn)]))
-    axes.set(xlim=(0, len(ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
-    axes.yaxis.set_major_formatter("{x:.2f}")
-    values = scale_ticks(float(ranges[0]), float(ranges[-1]))
-    places = [_place_of(value, ranges) for value in values]
-    labels, taken = [], -np.inf
-    for value, place in zip(values, places, strict=True):
-        x = place / (len(ranges) - 1) * (_RIGHT - _LEFT)
-        is_shown = with_labels and x - taken > 44
-        labels.append(f"{value:g}" if is_shown else "")
-        taken = x if is_shown else taken
-    axes.set_xticks(places, labels)
-    if with_labels:
-        axes.set_xlabel("depth hypothesis, scene units")
 
 
 def _add_marks(axes: Axes, inspection: Inspection, costs: NDArray[np.float64]) -> None:

@@ -193,15 +193,11 @@ def _differences(
     least = np.take_along_axis(differences, which[None], axis=0)[0]
     difference, expected = np.full(known.shape, np.nan, np.float32), np.full(own.shape, np.nan, np.float32)
     difference[known] = np.where(count >= 2, least, np.float32(np.nan))
-    expected[known & colors_at] = _nan_median(colors).T
-    return difference, expected
-
-
-def _nan_median(values: Plane) -> Plane:
-    """Return the median over the first axis of the values that are not NaN, the lower one of two; NaN without any."""
-    ordered = np.sort(values, axis=0)
+    # The median of the values that are not NaN, the lower one of two.
+    ordered = np.sort(colors, axis=0)
     middle = np.maximum(np.isfinite(ordered).sum(axis=0) - 1, 0) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
+    expected[known & colors_at] = np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0]).T
+    return difference, expected
 
 
 def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp], Mask]:

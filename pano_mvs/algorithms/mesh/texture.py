@@ -121,23 +121,19 @@ def view_gains(colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Flo
     seen = usable[:, shared]
     for channel in range(3):
         logs = np.log(np.maximum(colors[:, shared, channel].astype(np.float64), 1.0))
-        gains[:, channel] = np.exp(-_log_exposures(logs, seen))
+        exposure = np.zeros(len(logs))
+        robust = seen.astype(np.float64)
+        for _ in range(30):
+            surface = ((logs - exposure[:, None]) * robust).sum(axis=0) / robust.sum(axis=0)
+            differences = logs - surface
+            # A gain from few points is uncertain: as if this many further points had seen no difference.
+            exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + 30.0)
+            exposure -= exposure.mean()
+            # Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
+            residuals = (differences - exposure[:, None]) / 0.15
+            robust = seen / (1 + residuals**2)
+        gains[:, channel] = np.exp(-exposure)
     return np.clip(gains, *_GAIN_LIMITS)
-
-
-def _log_exposures(logs: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
-    exposure = np.zeros(len(logs))
-    robust = seen.astype(np.float64)
-    for _ in range(30):
-        surface = ((logs - exposure[:, None]) * robust).sum(axis=0) / robust.sum(axis=0)
-        differences = logs - surface
-        # A gain from few points is uncertain: as if this many further points had seen no difference.
-        exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + 30.0)
-        exposure -= exposure.mean()
-        # Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
-        residuals = (differences - exposure[:, None]) / 0.15
-        robust = seen / (1 + residuals**2)
-    return exposure
 
 
 Loader = Callable[[int], PaintView]

@@ -145,7 +145,6 @@ _PAD_PX = 8
 _MIN_COSINE = 0.25
 _MIN_CORRELATION, _MAX_SHIFT = 0.8, 3.0
 _FLOOR = 0.05
-_ROUNDNESS = 1.0
 
 
 def photograph_levels(gray: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
@@ -239,7 +238,7 @@ def _shift_covariances(patches: NDArray[np.float32], correlations: FloatArray) -
     information = structure / (4 * noise) + np.eye(2) / _MAX_SHIFT**2
     covariances = np.linalg.inv(information)
     largest = np.linalg.eigvalsh(covariances)[:, -1:, None]
-    return np.asarray(covariances + (_FLOOR**2 + _ROUNDNESS**2 * largest) * np.eye(2))
+    return np.asarray(covariances + (_FLOOR**2 + largest) * np.eye(2))
 
 
 def _testable(

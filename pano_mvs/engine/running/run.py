@@ -142,12 +142,27 @@ class Run:
                 self.result.removed = self.publisher.remove_stale(self.publisher.earlier, complete=self.result.complete)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
-            self._wait_for_running_units()
+            deadline = time.monotonic() + GRACE_S
+            if self.dispatcher and self.executor.enforces_timeouts:
+                count = len(self.dispatcher)
+                text = f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s"
+                self.observer(Warned(f"{text}; interrupt again to stop at once"))
+                while self.dispatcher and (left := deadline - time.monotonic()) > 0:
+                    self.dispatcher.next_finished(left)
             raise
         finally:
             self.dispatcher.cancel()
             self._remember()
-            self._list_files()
+            for name, new_name in self.publisher.set_aside.items():
+                self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
+            published = self.publisher.published
+            self.result.written = sorted(set(self.publisher.written))
+            self.result.published = published
+            self.result.left_over = {
+                name: digest
+                for name, digest in self.publisher.earlier.items()
+                if name not in published and is_file(self.out / name)
+            }
         return self.result
 
     def load(self, stage: str, kind: type[Record], item: str = "") -> Record | None:
@@ -231,29 +246,6 @@ class Run:
             )
             self.store.unit_times.add(summary.use, sample)
         self.store.unit_times.save()
-
-    def _list_files(self) -> None:
-        """Enter into the result which files the run wrote and which ones of earlier runs are left."""
-        for name, new_name in self.publisher.set_aside.items():
-            self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
-        published = self.publisher.published
-        self.result.written = sorted(set(self.publisher.written))
-        self.result.published = published
-        self.result.left_over = {
-            name: digest
-            for name, digest in self.publisher.earlier.items()
-            if name not in published and is_file(self.out / name)
-        }
-
-    def _wait_for_running_units(self) -> None:
-        """Give units that run in other processes some time after an interrupt; a second interrupt ends them."""
-        deadline = time.monotonic() + GRACE_S
-        if self.dispatcher and self.executor.enforces_timeouts:
-            count = len(self.dispatcher)
-            text = f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s"
-            self.observer(Warned(f"{text}; interrupt again to stop at once"))
-            while self.dispatcher and (left := deadline - time.monotonic()) > 0:
-                self.dispatcher.next_finished(left)
 
 
 class RunPass:
