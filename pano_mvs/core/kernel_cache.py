@@ -97,11 +97,7 @@ def user_cache_folder() -> Path:
 
 
 def _own_temporary_folder() -> Path:
-    """Return a folder that stays between runs and that nobody else can write to, as it holds code that we execute.
-
-    Raises:
-        OSError: if there is none.
-    """
+    """Return a folder that stays between runs and that nobody else can write to, as it holds code that we execute."""
     if sys.platform != "win32":
         folder = Path(tempfile.gettempdir()) / f"pano-mvs-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)

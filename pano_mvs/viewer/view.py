@@ -99,7 +99,7 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     if cloud is not None:
         color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # raises if the colouring is not available
     points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
-    corners = mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
+    corners = _mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
     box = box_of(points if corners is None else corners, scene.centers)
     tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
@@ -118,12 +118,8 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     return tour
 
 
-def mesh_points(path: Path) -> NDArray[np.float32]:
-    """Return the vertices of a mesh, (N, 3) float32.
-
-    Raises:
-        InputError: if it cannot be read.
-    """
+def _mesh_points(path: Path) -> NDArray[np.float32]:
+    """Return the vertices of a mesh, (N, 3) float32."""
     from pano_mvs.io.ply import read_ply_points
 
     points = read_ply_points(path)

@@ -294,11 +294,7 @@ class BlobStore:
 
 
 def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:
-    """Return whether the bytes are those that the reference names.
-
-    Raises:
-        OSError: if they cannot be read.
-    """
+    """Return whether the bytes are those that the reference names."""
     if isinstance(place, Packed):
         return place.content_digest() == ref.digest
     found = place.stat()
@@ -310,11 +306,7 @@ def _mapped(place: Path | Packed) -> NDArray[np.uint8]:
 
 
 def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:
-    """Return the array in the bytes of a .npy file, read-only and without a copy; nothing in them is executed.
-
-    Raises:
-        ValueError: if the bytes are not valid, hold Python objects, or have not as many values as the header says.
-    """
+    """Return the array in the bytes of a .npy file, read-only and without a copy; nothing in them is executed."""
     start = bytes(data[: len(_MAGIC) + 2])
     if not start.startswith(_MAGIC):
         return _other_format(bytes(data))
@@ -336,11 +328,7 @@ def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _other_format(data: bytes) -> NDArray[Any]:
-    """Return the array in a .npy file of a format that this package does not write.
-
-    Raises:
-        ValueError: if the bytes are not valid, or hold Python objects.
-    """
+    """Return the array in a .npy file of a format that this package does not write."""
     try:
         array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     except Exception as error:  # numpy reads the header with Python's parser, which raises many kinds of errors
