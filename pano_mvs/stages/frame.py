@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
-from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical
+from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations as without_scale_factors
+from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
-from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups

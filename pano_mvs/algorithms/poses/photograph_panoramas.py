@@ -14,8 +14,13 @@ from pano_mvs.algorithms.matching.integer_descriptors import (
     nearest_two_packed,
 )
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
-from pano_mvs.algorithms.poses.photograph_points import KnownPoints, has_sift, known_points
-from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
+from pano_mvs.algorithms.poses.photograph_surface import (
+    KnownPoints,
+    SurfacePoints,
+    has_sift,
+    known_points,
+    surface_points,
+)
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, RangeMap
 

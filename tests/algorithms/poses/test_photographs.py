@@ -32,8 +32,7 @@ from pano_mvs.algorithms.poses.photograph_camera import (
 )
 from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
 from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas as similar_to_each
-from pano_mvs.algorithms.poses.photograph_points import KnownPoints, known_points
-from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
+from pano_mvs.algorithms.poses.photograph_surface import KnownPoints, SurfacePoints, known_points, surface_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, RangeMap
