@@ -217,13 +217,16 @@ class RunView:
     def shown(self) -> Group:
         """Return all of it."""
         self._now = self._latest if self.end else max(self._latest, self._clock())
+        lines = [f"failed {failure.stage}:{one_line(failure.item)}: {failure.cause}" for failure in self._failures]
+        if self._failed > len(lines):
+            lines.insert(0, f"{self._failed} units failed; the latest:")
         return Group(
             *(Text(line, style="bold") for line in self._heading()),
             self._stages(),
             *(Text(line) for line in ([] if self.end else [self.left_text(), self._disk()])),
             *(Text(line, style="yellow") for line in self._silence()),
             *(Text(f"warning: {text}", style="yellow") for text in self._warnings),
-            *(Text(line, style="red") for line in self._failure_lines()),
+            *(Text(line, style="red") for line in lines),
         )
 
     def left_text(self) -> str:
@@ -290,12 +293,6 @@ class RunView:
         if silent_s < 60.0:
             return []
         return [f"no event for {duration_text(silent_s)}: the run is computing a long unit, or its host has failed"]
-
-    def _failure_lines(self) -> list[str]:
-        lines = [f"failed {failure.stage}:{one_line(failure.item)}: {failure.cause}" for failure in self._failures]
-        if self._failed > len(lines):
-            lines.insert(0, f"{self._failed} units failed; the latest:")
-        return lines
 
 
 def _done(stage: StageProgress) -> str:

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from pano_mvs.algorithms.floor_plan.plan_grid import bar_length
+from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
@@ -249,10 +249,6 @@ def _words(link: PairLink, why: str) -> str:
     return f"{words}{why and f'; {why}'}"
 
 
-def _measured(length: float, unit: str) -> str:
-    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
-
-
 def _drawn(
     title: str,
     flat: FloatArray,
@@ -292,7 +288,7 @@ def _drawn(
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = bar_length(400 / scale)
-    bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
+    bar = (14.0, height - 14.0, round(length * scale, 1), bar_text(length, unit))
     wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
     cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
     text = f"{cameras_text} {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"

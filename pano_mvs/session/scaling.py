@@ -185,21 +185,18 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
         cache=cache or run.summary.cache or None,
         out=resolved(run.out),
     )
-    workflow = _scaled_workflow(session, known)
+    stages = dict(session.workflow.stages)
+    before = {name: entry for name, entry in stages.items() if name.startswith(_PREFIX)}
+    if before:
+        workflow = replace(session.workflow, stages=stages | {n: _again(entry, known) for n, entry in before.items()})
+    else:
+        workflow = _Rewiring(session, known).workflow()
     graph = wire(workflow)
     path = run.out / WORKFLOW_FILE
     text = resolved_yaml(workflow, graph)
     with replacing(path) as scratch:
         scratch.write_text(text, encoding="utf-8")
     return replace(session, workflow=replace(workflow, path=path, text=text, overrides=()), graph=graph)
-
-
-def _scaled_workflow(session: Session, known: Measurement) -> Workflow:
-    stages = dict(session.workflow.stages)
-    before = {name: entry for name, entry in stages.items() if name.startswith(_PREFIX)}
-    if before:
-        return replace(session.workflow, stages=stages | {n: _again(entry, known) for n, entry in before.items()})
-    return _Rewiring(session, known).workflow()
 
 
 def _again(entry: StageEntry, known: Measurement) -> StageEntry:

@@ -144,7 +144,13 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
     groups = split_groups(poses)
     if params.baseline is not None:
         ends, metres = _ends(images, params.baseline), params.baseline.metres
-        chosen = _holding(ends, groups)
+        homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
+        chosen = homes[0] if len(homes) == 2 else None  # None if one of them is in no group
+        if chosen is not None and chosen != homes[1]:
+            raise InputError(
+                f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
+                "reliable pair connects, so the distance between them gives no scale. Use two images of one group"
+            )
         whole = poses if chosen is None else groups[chosen]
         return _scaled(
             poses, groups, [chosen or 0], scaled=lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx=ctx
@@ -194,19 +200,6 @@ def _scaled(
             why = str(refused.get(number, "the length that is known is of another group"))
             ctx.note(f"{which}keeps its own unit of length ({group.scale}): {why}")
     return join_groups(found, order=poses.names, rejected=poses.rejected)
-
-
-def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
-    """Return the number of the group that contains both images; None if one of them is in no group."""
-    homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
-    if len(homes) < 2:
-        return None
-    if homes[0] != homes[1]:
-        raise InputError(
-            f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
-            "reliable pair connects, so the distance between them gives no scale. Use two images of one group"
-        )
-    return homes[0]
 
 
 def _by_camera_height(poses: Poses, images: All[Panorama], params: ScaleParams) -> Poses:

@@ -162,8 +162,3 @@ def length_text(length: float, unit: str) -> str:
     if unit != "m":
         return f"{length:.4g} {unit}"
     return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
-
-
-def bar_text(length: float, unit: str) -> str:
-    """Return a round length with its unit, as text."""
-    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"

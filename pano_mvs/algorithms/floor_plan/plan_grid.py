@@ -270,6 +270,11 @@ def bar_length(width: float) -> float:
     return float(next(step * power for step in (5, 2, 1) if step * power <= width / 4 * (1 + 1e-9)))
 
 
+def bar_text(length: float, unit: str) -> str:
+    """Return a round length with its unit, as text."""
+    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
+
+
 def strip_px(size_hw: tuple[int, int]) -> int:
     """Return the rows of the strip for the scale bar below a plan of a size."""
     return max(36, round(0.06 * max(size_hw)))

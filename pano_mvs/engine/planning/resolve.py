@@ -162,7 +162,7 @@ def resolve_source(
             resolution.blocked[item.name] = str(error)
             continue
         inputs = {"files": digests, "name": item.name, **({"links": list(item.links)} if item.links else {})}
-        key = _key(common, inputs)
+        key = digest_from_value([common, inputs])
         unit = Unit(
             entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, replace(item, digests=digests)
         )
@@ -314,7 +314,8 @@ class Resolver:
             self._common = digest_from_value(self._static)
         encoded = {port: self._encode(port, value) for port, value in inputs.items()}
         identity = self._static | {"inputs": encoded}
-        self.resolution.units.append(Unit(self.entry, name, members, inputs, _key(self._common, encoded), identity))
+        key = digest_from_value([self._common, encoded])
+        self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
 
     def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
         """Return a unit's input at a port, the reason why there is none, and whether it is not known yet."""
@@ -384,11 +385,6 @@ class Resolver:
             return list(value)
         state = self.states[self.edges[port].producer]
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
-
-
-def _key(common: str, inputs: Mapping[str, Any]) -> str:
-    """Return a unit's key; `common` is the digest of what all units of the stage share, encoded only once."""
-    return digest_from_value([common, inputs])
 
 
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
