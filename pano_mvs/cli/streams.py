@@ -22,18 +22,12 @@ _READER_LEFT = {errno.EPIPE, errno.ECONNRESET, getattr(errno, "ESHUTDOWN", errno
 
 
 class StreamState:
-    """Whether a stream can still be written.
-
-    Attributes:
-        reader_left: whether the other end of the pipe, or the terminal, was closed.
-        failure: why the stream cannot be written otherwise, such as a full disk; empty if it can.
-        reader_may_leave: whether the command keeps its own exit code when the reader leaves.
-    """
+    """Whether a stream can still be written."""
 
     def __init__(self) -> None:
-        self.reader_left = False
-        self.failure = ""
-        self.reader_may_leave = False
+        self.reader_left = False  # whether the other end of the pipe, or the terminal, was closed
+        self.failure = ""  # why the stream cannot be written otherwise, such as a full disk; empty if it can
+        self.reader_may_leave = False  # whether the command keeps its own exit code when the reader leaves
 
     def exit_code(self, code: int) -> int:
         """Return the exit code of a command that would end with `code`, reporting a failed standard output."""

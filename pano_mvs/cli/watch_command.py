@@ -101,16 +101,11 @@ def _ending(end: RunFinished | None) -> str:
 
 
 class BlocksView:
-    """What the events of a run in blocks say about it: the present block, and what is still to come.
-
-    Attributes:
-        folder: with the output folders of the blocks.
-        end: its last event; None while it runs.
-    """
+    """What the events of a run in blocks say about it: the present block, and what is still to come."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.end: RunFinished | None = None
+        self.folder = folder  # with the output folders of the blocks
+        self.end: RunFinished | None = None  # its last event; None while it runs
         self._block: BlockStarted | None = None
         self._since_s = 0.0
         self._run = RunView(folder)  # of the block
@@ -162,14 +157,10 @@ class BlocksView:
 
 
 class RunView:
-    """What the events of a run say about it.
-
-    Attributes:
-        end: its last event; None while it runs.
-    """
+    """What the events of a run say about it."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
-        self.end: RunFinished | None = None
+        self.end: RunFinished | None = None  # its last event; None while it runs
         self.folder = folder
         self._clock = clock
         self._start: RunStarted | None = None

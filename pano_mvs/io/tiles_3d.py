@@ -24,11 +24,7 @@ _UNLIT = "KHR_materials_unlit"
 
 
 class TilesetWriter:
-    """The tiles of one tileset, written one after the other.
-
-    Attributes:
-        files: paths of the tiles and the tileset, by name.
-    """
+    """The tiles of one tileset, written one after the other."""
 
     def __init__(self, folder: Path, cloud: PointCloud, file_from_world: FloatArray, *, tile_points: int) -> None:
         """Take the folder to write to, the cloud, the rotation (3, 3) into axes with z up, and the points of a tile."""
@@ -38,7 +34,7 @@ class TilesetWriter:
         self._file_from_world = file_from_world
         self._bounds: dict[str, FloatArray] = {}
         self._errors: dict[str, float] = {}
-        self.files: dict[str, Path] = {}
+        self.files: dict[str, Path] = {}  # paths of the tiles and the tileset, by name
 
     def add(self, name: str, chosen: NDArray[np.int64], size: float) -> None:
         """Write the points of one node of the octree as NAME.glb.

@@ -37,18 +37,13 @@ class RunOutput:
 
     Values are loaded from the cache of the run or, if it was deleted, from the files in the output folder, if the
     workflow exports them. Values that the run did not produce are None.
-
-    Attributes:
-        out: the output folder.
-        summary: what run.json holds.
-        values: the values in the cache.
-        written: files that this run wrote, relative to the output folder; empty for a run that was loaded.
     """
 
     def __init__(self, out: Path, summary: RunSummary, values: StoredValues, *, written: tuple[str, ...] = ()) -> None:
-        self.out = out
-        self.summary = summary
-        self.values = values
+        self.out = out  # the output folder
+        self.summary = summary  # what run.json holds
+        self.values = values  # the values in the cache
+        # files that this run wrote, relative to the output folder; empty for a run that was loaded
         self.written = written
 
     @cached_property

@@ -179,14 +179,11 @@ class _Sender:
 
 
 class _Messages(logging.Handler):
-    """Takes what OpenTelemetry logs, such as each attempt to send, which would appear between the lines of the run.
-
-    Attributes:
-        first: the first warning or error, which names the cause; later ones say that there is no further attempt.
-    """
+    """Takes what OpenTelemetry logs, such as each attempt to send, which would appear between the lines of the run."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
+        # the first warning or error, which names the cause; later ones say that there is no further attempt
         self.first = ""
         self._logger = logging.getLogger("opentelemetry")
         self._logger.addHandler(self)

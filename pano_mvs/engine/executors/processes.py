@@ -136,12 +136,7 @@ _BOOT = (
 
 
 class WorkerProcess:
-    """A process that computes one unit at a time; it is started for the first one.
-
-    Attributes:
-        served: number of units that the present process has received.
-        refused: whether the latest process exited by itself before it was ready for a unit.
-    """
+    """A process that computes one unit at a time; it is started for the first one."""
 
     def __init__(self, threads: int, errors: Path) -> None:
         """Prepare a worker.
@@ -152,8 +147,8 @@ class WorkerProcess:
         """
         self.threads = threads
         self.errors = errors
-        self.served = 0
-        self.refused = False
+        self.served = 0  # number of units that the present process has received
+        self.refused = False  # whether the latest process exited by itself before it was ready for a unit
         self._ready = False
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None

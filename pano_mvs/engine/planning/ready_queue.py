@@ -54,11 +54,7 @@ class _Stage:
 
 
 class ReadyQueue:
-    """The state of all stages during a pass, and the units that can run.
-
-    Attributes:
-        states: stage to its results so far, in the order of the workflow.
-    """
+    """The state of all stages during a pass, and the units that can run."""
 
     def __init__(
         self,
@@ -70,6 +66,7 @@ class ReadyQueue:
         listing: SourceListing | None = None,
     ) -> None:
         self.listing = listing or SourceListing()
+        # stage to its results so far, in the order of the workflow
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
         self._only = graph.only

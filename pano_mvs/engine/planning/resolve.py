@@ -193,11 +193,7 @@ def resolve(
 
 
 class Resolver:
-    """Finds the units of a stage that is not a source: all in turn for a plan, or one by name in a run.
-
-    Attributes:
-        near: unit to its neighbours, if the stage has an index and its unit names are known.
-    """
+    """Finds the units of a stage that is not a source: all in turn for a plan, or one by name in a run."""
 
     def __init__(self, entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store) -> None:
         self.entry = entry
@@ -207,6 +203,7 @@ class Resolver:
         self.states = states
         self.store = store
         self.resolution = Resolution()
+        # unit to its neighbours, if the stage has an index and its unit names are known
         self.near: Mapping[str, tuple[str, ...]] = {}
         self._static: dict[str, Any] = {}
         self._common = ""

@@ -56,12 +56,7 @@ class UnusableInputError(RunStoppedError):
 
 
 class Run:
-    """One run of a workflow: what its passes share, and what happens before and after them.
-
-    Attributes:
-        keys: stage to unit to cache key, of all units that were looked up.
-        refreshed: labels of the units that `--refresh` named and that were reached.
-    """
+    """One run of a workflow: what its passes share, and what happens before and after them."""
 
     def __init__(
         self,
@@ -94,9 +89,9 @@ class Run:
             raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use another one")
         self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
-        self.keys: dict[str, dict[str, str]] = {}
+        self.keys: dict[str, dict[str, str]] = {}  # stage to unit to cache key, of all units that were looked up
         self.computed: set[str] = set()
-        self.refreshed: set[str] = set()
+        self.refreshed: set[str] = set()  # labels of the units that `--refresh` named and that were reached
         self._planned: dict[str, UnitRecord] = {}
         self._has_passed = False  # whether the last pass ended without an error
         self._warnings: list[str] = []
@@ -249,23 +244,20 @@ class Run:
 
 
 class RunPass:
-    """One pass over a workflow, with a result and statistics of its own.
-
-    Attributes:
-        queue: the units that can run, and the results so far.
-        damaged: damaged files of the cache (which have been removed) and changed input files that this pass met.
-            Units that need any of them are left to the next pass, while the others go on, so that much damage takes no
-            more passes than little.
-    """
+    """One pass over a workflow, with a result and statistics of its own."""
 
     def __init__(self, run: Run, warnings: list[str]) -> None:
         self.result = RunResult(warnings=warnings)
+        # damaged files of the cache (which have been removed) and changed input files that this pass met. Units that
+        # need any of them are left to the next pass, while the others go on, so that much damage takes no more passes
+        # than little.
         self.damaged: list[str] = []
         self._run = run
         self._store = run.store
         self._statistics = RunStatistics(
             self.result, run.observer, states=lambda name: self.queue.states[name], name_items=run.publisher.name_items
         )
+        # the units that can run, and the results so far
         self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
         self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
 

@@ -76,16 +76,11 @@ def load_workflow(
 
 
 class InvalidWorkflowError(WorkflowError):
-    """A workflow with errors.
-
-    Attributes:
-        stages: its entries whose stage exists, so that their connections can be checked.
-        unknown: names of the other entries.
-    """
+    """A workflow with errors."""
 
     def __init__(self, problems: list[str], stages: dict[str, StageEntry], unknown: frozenset[str]) -> None:
-        self.stages = stages
-        self.unknown = unknown
+        self.stages = stages  # its entries whose stage exists, so that their connections can be checked
+        self.unknown = unknown  # names of the other entries
         super().__init__(problems)
 
 
