@@ -206,7 +206,7 @@ class _Picture(NamedTuple):
 
 
 class _RigModel:
-    """A pycolmap model of rigs, whose ids of cameras, images and frames follow from the order in which they are added."""
+    """A pycolmap model of rigs, whose cameras, images and frames have ids in the order in which they are added."""
 
     def __init__(self, poses: Poses) -> None:
         import pycolmap
