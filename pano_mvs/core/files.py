@@ -32,13 +32,8 @@ def is_cache(folder: Path) -> bool:
     return is_file(folder / "layout.json") and all(is_folder(folder / name) for name in _FOLDERS_OF_A_CACHE)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-_UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
+_UMASK = os.umask(0)  # read once, because reading it sets it for a moment, in all threads
+os.umask(_UMASK)
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
 

@@ -7,7 +7,7 @@ reliable ranges in and around each connected, uniformly coloured part of the pan
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -101,7 +101,10 @@ def lay_planes(
     for fit, is_valid in zip(fits, valid, strict=True):
         chosen = fit
         if fit.share < parallel_share:
-            chosen = _parallel_fit(fit, clear, max_relative_error=max_relative_error)
+            # The best plane with a clear normal, unless the free fit holds clearly more pixels.
+            found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in clear]
+            best = max(found, key=lambda other: other.share, default=fit)
+            chosen = best if best.share >= _NEARLY * fit.share else fit
         if not (is_valid if chosen is fit else chosen.is_valid(rays, min_share)):
             continue
         surface = fit.surface & ~open_sky
@@ -173,13 +176,6 @@ def _plane_fits(
         around, seen = rays[support][points], inverse[support][points]
         plane, on_plane = fit_plane(around, seen, max_relative_error=max_relative_error, rng=rng)
         yield _PlaneFit(surface, around, seen, plane, on_plane)
-
-
-def _parallel_fit(fit: _PlaneFit, normals: Sequence[FloatArray], *, max_relative_error: float) -> _PlaneFit:
-    """Return the best plane with one of these unit normals, (3,) each, or `fit` if it fits clearly more pixels."""
-    found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in normals]
-    best = max(found, key=lambda other: other.share, default=fit)
-    return best if best.share >= _NEARLY * fit.share else fit
 
 
 def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: float) -> _PlaneFit:

@@ -177,7 +177,11 @@ def _refined_with_rigs(
         return _refined_centrally(poses, settings, load=load)
     if not measured:
         return in_gauge_of(refined, poses.centers)
-    return _in_metres(refined, adjusted, own_rigs, std=scale.relative_std)
+    distance_mm = 2000 * np.median([rig.lens_offset_m for rig in own_rigs if rig is not None])
+    origin = (
+        f"the distance of {distance_mm:.3g} mm between the lens centres, uncertain by {100 * scale.relative_std:.1f} %"
+    )
+    return scaled_poses(refined, 1 / adjusted.units_per_m, origin=origin)
 
 
 def _with_unit(
@@ -197,13 +201,6 @@ def _with_unit(
         if known:
             return bundle
     return None
-
-
-def _in_metres(poses: Poses, bundle: Bundle, rigs: Sequence[LensRig | None], *, std: float) -> Poses:
-    """Return poses of one group in metres, by the offsets of their lenses."""
-    distance_mm = 2000 * np.median([rig.lens_offset_m for rig in rigs if rig is not None])
-    origin = f"the distance of {distance_mm:.3g} mm between the lens centres, uncertain by {100 * std:.1f} %"
-    return scaled_poses(poses, 1 / bundle.units_per_m, origin=origin)
 
 
 def _offset_scale(bundle: Bundle, *, settings: _Settings, neighbour: int) -> OffsetScale:
