@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces
 from pano_mvs.algorithms.fusion.view import (
     ConfidentView,
@@ -18,6 +17,7 @@ from pano_mvs.algorithms.fusion.view import (
     ViewWindow,
     held_rays,
     nearest_views,
+    normals_from_range,
 )
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP

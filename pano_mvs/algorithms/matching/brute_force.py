@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
-from pano_mvs.algorithms.matching.nearest_two import nearest_two
+from pano_mvs.algorithms.matching.nearest_two import can_compare_as_integers, nearest_two, nearest_two_integers
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pano_mvs.algorithms.matching.integer_descriptors import (
+from pano_mvs.algorithms.matching.nearest_two import (
+    NearestTwo,
     PackedDescriptors,
     can_compare_as_integers,
+    nearest_two,
     nearest_two_packed,
 )
-from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError

@@ -9,8 +9,7 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, poses_with_points
 from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
-from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
-from pano_mvs.algorithms.poses.placement.resection import refine_resection
+from pano_mvs.algorithms.poses.placement.resection import refine_resection, why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView

@@ -10,8 +10,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
-from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
-from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed
+from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed, why_few_known, why_few_seen
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.aliases import find_aliases
 from pano_mvs.algorithms.poses.verification.camera_checks import (

@@ -8,12 +8,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.integer_descriptors import (
+from pano_mvs.algorithms.matching.nearest_two import (
+    NearestTwo,
     PackedDescriptors,
     can_compare_as_integers,
+    nearest_two,
     nearest_two_packed,
 )
-from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.algorithms.poses.photograph_surface import (
     KnownPoints,
     SurfacePoints,

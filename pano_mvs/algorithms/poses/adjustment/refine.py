@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.offset_scale import (
+from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
+from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
+from pano_mvs.algorithms.poses.adjustment.uncertainty import (
     OffsetScale,
+    camera_deviations,
     estimate_offset_scale,
+    held_cameras,
     ray_derivatives,
     unexplained,
 )
-from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
-from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.uncertainty import camera_deviations, held_cameras
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.algorithms.two_view.refinement import tangent_basis

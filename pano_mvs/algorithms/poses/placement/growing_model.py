@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks
-from pano_mvs.algorithms.poses.placement.pair_evidence import MIN_RATIOS, unit_ranges
-from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.pair_evidence import MIN_RATIOS, ScaleEstimator, estimate_scale, unit_ranges
 from pano_mvs.algorithms.poses.placement.resection import (
     FIRST_GUESS_RAD,
     MAX_ERROR_RAD,
@@ -20,8 +19,9 @@ from pano_mvs.algorithms.poses.placement.resection import (
     points_needed,
     refined_on_points,
     resection_errors,
+    why_few_known,
+    why_few_seen,
 )
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, relative_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
