@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -109,7 +110,7 @@ def transforms_document(
     frames: Sequence[tuple[str, Rigid3, NerfstudioFrame]],
     *,
     depth_unit: float,
-    about: Mapping[str, Any],
+    about: Mapping[str, Any] = MappingProxyType({}),
     file_from_world: NDArray[np.float64] | None = None,
     seed: str = "",
 ) -> dict[str, Any]:
@@ -123,7 +124,7 @@ def transforms_document(
         frames: frames with their panorama's name and cam_from_world.
         depth_unit: scene units per step of the depths.
         about: further entries for readers, which nerfstudio ignores.
-        file_from_world: rotation (3, 3) of the cameras; None: they stay in the world frame.
+        file_from_world: rotation (3, 3) of the cameras, which the file states; None: they stay in the world frame.
         seed: path of the initial points relative to the file; empty without points.
     """
     if file_from_world is not None:
@@ -140,6 +141,8 @@ def transforms_document(
         listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
     model = _DISTORTED if any(frame.radial for _, _, frame in frames) else CAMERA_MODELS[variant]
     document = {"camera_model": model, **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    if file_from_world is not None:
+        document["file_from_world"] = file_from_world.tolist()
     if with_depth:
         document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
     return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}

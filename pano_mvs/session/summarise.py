@@ -7,7 +7,6 @@ import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 import pano_mvs
 from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
+from pano_mvs.core.extras import installed_version
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.running.events import Failure, StageSummary
@@ -338,12 +338,7 @@ def _machine() -> dict[str, Any]:
 
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "pano_mvs": pano_mvs.__version__, "system": platform.platform()}
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 PLAUSIBLE_HEIGHT_M = 1.6  # a usual height of a camera on a tripod or a stick

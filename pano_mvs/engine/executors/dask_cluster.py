@@ -17,7 +17,6 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,7 +24,7 @@ from urllib.parse import urlsplit
 import pano_mvs
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.extras import import_extra
+from pano_mvs.core.extras import import_extra, installed_version
 from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.core.paths import below, children, is_file
 from pano_mvs.engine.cache.store import Store
@@ -303,12 +302,7 @@ def versions() -> dict[str, str]:
         "python": ".".join(platform.python_version_tuple()[:2]),
         "pano_mvs": f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}",
     }
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 def _new_worker(threads: int) -> WorkerProcess:

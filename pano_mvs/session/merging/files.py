@@ -170,7 +170,6 @@ class MergeFiles:
             "equirectangular",
             frames,
             depth_unit=1.0,
-            about={"file_from_world": turn.tolist()},
             file_from_world=turn,
             seed="cloud.ply" if has_cloud else "",
         )

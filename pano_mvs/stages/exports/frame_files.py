@@ -239,9 +239,7 @@ def write_transforms(
     poses = group.poses
     seed = _write_seed(group, cloud, params, ctx=ctx, file_from_world=file_from_world)
     seed_name = "" if seed is None else group_file("seed.ply", group.number)
-    about: dict[str, Any] = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
-    if file_from_world is not None:
-        about["file_from_world"] = file_from_world.tolist()
+    about = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
     cameras = poses.cameras
     for variant, listed in group.listed().items():
         document = transforms_document(
@@ -290,15 +288,9 @@ def write_photographs(
     for idx, name in enumerate(photographs.names):
         height, width = photographs.sizes_hw[idx].tolist()
         focal = float(photographs.focals_px[idx])
+        radial = float(photographs.radials[idx])
         frame = NerfstudioFrame(
-            "faces",
-            f"images/{name}",
-            "",
-            "",
-            (width, height),
-            (focal, focal),
-            _NO_TURN,
-            radial=float(photographs.radials[idx]),
+            "faces", f"images/{name}", "", "", (width, height), (focal, focal), _NO_TURN, radial=radial
         )
         frames.append((name, photographs.cam_from_world(idx), frame))
         files[f"{folder}/images/{name}"] = photographs.pictures[idx].path
@@ -306,8 +298,7 @@ def write_photographs(
         "faces",
         frames,
         depth_unit=group.depth_unit,
-        about={"world_frame": group.poses.frame}
-        | ({} if file_from_world is None else {"file_from_world": file_from_world.tolist()}),
+        about={"world_frame": group.poses.frame},
         file_from_world=file_from_world,
         seed="seed.ply" if seed else "",
     )
