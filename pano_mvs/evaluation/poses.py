@@ -175,7 +175,6 @@ def _row(label: str, values: NDArray[np.float64], form: str) -> tuple[str, ...]:
 
 
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
-_ROUNDING = 1e-12  # of a centre's coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +290,7 @@ def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float |
     lengths = np.linalg.norm(translations, axis=1)
     extent = float(lengths.max(initial=0)) if extent is None else extent
     # Centres closer than this share of the capture's extent coincide: an image that occurs twice.
-    apart = lengths > max(1e-6 * extent, _ROUNDING * float(np.abs(centers).max()))
+    apart = lengths > max(1e-6 * extent, 1e-12 * float(np.abs(centers).max()))  # of which coordinates are rounded
     return _RelativePoses(rotations[second] @ rotations[first].swapaxes(1, 2), translations, lengths, apart)
 
 

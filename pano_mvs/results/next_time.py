@@ -99,7 +99,6 @@ MIN_CAMERAS = 4
 LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 """Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
 
-_USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
 _WEAK = 0.5  # of the median share that other views confirm
 _MAX_UNREGISTERED = 4
 
@@ -262,8 +261,9 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
     typical = median([length for _, _, length in edges]) or 0.0
     for first, second, length in edges if len(group.names) >= MIN_CAMERAS and typical > 0 else ():
         ranges = [known for idx in (first, second) if (known := group.typical_range(idx)) is not None]
-        # Cameras are far apart if their distance is more than this many times the median distance of neighbours.
-        if length > 2.0 * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
+        # Cameras are far apart if their distance is more than this many times the median distance of neighbours; a gap
+        # below a tenth of the median range costs nothing.
+        if length > 2.0 * typical and (not ranges or length > 0.1 * min(ranges)):
             reason = (
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -99,7 +100,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         )
     for path, (name, problem) in zip(pictures, names, strict=True):
         files = {"image": path}
-        mask = None if problem else _mask_of(name, params)
+        mask = None if problem else (params.masks and find_mask(params.masks, name)) or params.mask
         if mask is not None:
             files["mask"] = mask
         if name in copies:
@@ -131,7 +132,15 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """
     image = item.file("image")
     path, data = image.path, image.read_bytes()
-    if (layout := _layout(path, data, params)) != "none":
+    layout = params.stereo
+    if layout == "auto":
+        layout = stereo_layout(
+            path,
+            stated_size(data) or (0, 0),
+            data,
+            picture=partial(decode_image, path, data, max_pixels=params.max_pixels),
+        )
+    if layout != "none":
         return _left_eye(item, layout, data, params=params, ctx=ctx)
     info = describe_picture(path, data, max_pixels=params.max_pixels)
     for warning in info.warnings:
@@ -168,15 +177,6 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     if not valid:
         ctx.note(f"{item.name}: everything in it is masked")
     return panorama
-
-
-def _layout(path: Path, data: bytes, params: FolderParams) -> StereoLayout:
-    def picture() -> NDArray[np.uint8]:
-        return decode_image(path, data, max_pixels=params.max_pixels)
-
-    if params.stereo != "auto":
-        return params.stereo
-    return stereo_layout(path, stated_size(data) or (0, 0), data, picture=picture)
 
 
 def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: FolderParams, ctx: Context) -> Panorama:
@@ -216,11 +216,6 @@ def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
     if width < 16:
         raise InputError(f"a panorama of {source_hw[1]}×{source_hw[0]} px is too small; it needs at least 16 columns")
     return width // 2, width
-
-
-def _mask_of(name: str, params: FolderParams) -> Path | None:
-    own = None if params.masks is None else find_mask(params.masks, name)
-    return own or params.mask
 
 
 def _notes_on_masks(name: str, mask: Path | None, params: FolderParams) -> Iterator[str]:
@@ -303,20 +298,16 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
 
 
 def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:
-    tiles = {tuple(map(int, key.split("_")[1:])): key for key in item.files if key.startswith(f"{face}_")}
+    keys = (key for key in item.files if key.startswith(f"{face}_"))
+    tiles = {tuple(map(int, key.split("_")[1:])): item.file(key) for key in keys}
+    pictures = {place: decode_image(tile.path, tile.read_bytes()) for place, tile in tiles.items()}
     rows = [
-        [_picture(item, tiles[row, column]) for column in sorted({column for _, column in tiles})]
+        [pictures[row, column] for column in sorted({column for _, column in tiles})]
         for row in sorted({row for row, _ in tiles})
     ]
     try:
         return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
     except ValueError as error:
-        place = item.file(tiles[0, 0]).path
         raise InputError(
-            f"{place}: this tile and those beside it do not fit together. Export the tour again"
+            f"{tiles[0, 0].path}: this tile and those beside it do not fit together. Export the tour again"
         ) from error
-
-
-def _picture(item: SourceItem, key: str) -> NDArray[np.uint8]:
-    file = item.file(key)
-    return decode_image(file.path, file.read_bytes())

@@ -26,7 +26,6 @@ from pano_mvs.geometry import pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _PAD_PX = 4
-_EDGE_RAD = float(np.arctan(2.0))  # angle between two neighbouring corners of an icosahedron
 # Lattice steps (u, v) to the six neighbours, counter-clockwise; the axes include 60°.
 NEIGHBOURS = np.array([[1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
 
@@ -103,7 +102,8 @@ class GeodesicGrid:
 
     def _weights(self, places_uv: FloatArray) -> FloatArray:
         u, v = places_uv[..., 0] / self.steps, places_uv[..., 1] / self.steps
-        return np.sin(_EDGE_RAD * np.stack([1 - u - v, u, v], axis=-1)).astype(np.float64)
+        # Neighbouring corners of an icosahedron are arctan(2) apart.
+        return np.sin(float(np.arctan(2.0)) * np.stack([1 - u - v, u, v], axis=-1)).astype(np.float64)
 
 
 def hexagon_ring(radius: int) -> NDArray[np.int64]:

@@ -24,8 +24,6 @@ _SCALE = 5.4
 _PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS = 4, 2, 8
 # Smaller reprojection errors, and less roughness, are chance; both in pixels.
 _MIN_ERROR_PX, _MIN_ROUGH_PX = 0.02, 0.01
-# Errors grow slowly with the roughness of the surface.
-_ROUGH_POWER = 0.25
 # Near steps like this, in ln range, a pixel may have the range of the other surface.
 _STEP, _STEP_WEIGHT, _STEP_POWER = 0.1, 5.0, 1 / 3
 LEAST_UNCERTAINTY, MOST_UNCERTAINTY = 0.0005, 0.5
@@ -63,7 +61,7 @@ def confirmed_uncertainty(
     count = np.maximum(box_sum(consistent.astype(np.float64), rough), 1)
     mean = np.maximum(box_sum(inverse, rough) / count, 1e-12)
     deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), rough) / count
-    sigma *= np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, _MIN_ROUGH_PX) ** _ROUGH_POWER
+    sigma *= np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, _MIN_ROUGH_PX) ** 0.25  # errors grow slowly with it
     sigma *= (1 + _STEP_WEIGHT * _share(step > _STEP, wide)) ** _STEP_POWER
     sigma *= _SCALE / motion
     return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(

@@ -31,7 +31,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 Grid = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _SUPPORT_RADIUS = 2
-_MAX_SUPPORT_STEP = 0.03
 
 
 def fuse_stream(
@@ -232,9 +231,7 @@ def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings)
     kept = confirmed
     if settings.min_support is not None and settings.min_views > 1:
         stretches = columns_per_step((shape[0], shape[1]), steps=2 * _SUPPORT_RADIUS + 1)
-        supported = find_supported(
-            reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, _MAX_SUPPORT_STEP, settings.min_support
-        )
+        supported = find_supported(reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, 0.03, settings.min_support)
         kept = confirmed | (supported & (agreeing == settings.min_views - 1) & (tallies.violations == 0))
     if settings.max_uncertainty is not None and reference.uncertainty is not None:
         kept = kept & (tallies.deviations() <= settings.max_uncertainty * reference.ranges)

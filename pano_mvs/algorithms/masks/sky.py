@@ -124,28 +124,18 @@ MAX_SOURCES = 4
 """More sources than this add little."""
 
 _MIN_WIDTH = 64
-# Grey levels between the darkest and the brightest pixel of a 3×3 window of a smooth area.
-_SMOOTH = 10
 # Errors in grey levels: of the sky at infinity, and by how much those at finite range may be less.
 _MAX_ERROR, _FLAT_RATIO, _FLAT_MARGIN = 4.0, 1.15, 0.5
-# Where there is no range: errors at infinity as a share of the standard deviation of the colours.
-_CONTENT_RATIO = 0.12
 # Without a preference for infinity: the most that may lie on one plane, and that other views may confirm.
 _MAX_PLANE_SHARE, _MAX_CONSISTENT = 0.7, 0.18
-# The smallest such area by which a sky is recognised; smaller ones are blinds and lamps.
-_MIN_FLAT_SHARE = 0.05
 _PLANE_TRIALS, _PLANE_TOLERANCE, _MIN_BORDER_POINTS = 200, 0.06, 30
 _SOLID_MARGIN = 3.0
 # Larger parts of the colours of the sky must agree at infinity too.
 _MAX_PART_SHARE = 0.005
 # Larger ones count as small if they differ by at most this number of grey levels on average.
 _MAX_EXACT_SHARE, _EXACT_LEVELS = 0.03, 5.0
-# Farther from known sky, the colours of the sky are not known.
-_REACH_PX = 40
 _CLOUD_RADIUS_PX, _CLOUD_SHARE, _ROUGH_ERRORS = 3, 0.7, 3
 _ROUNDS = 3
-# If less than this share of an area lies away from its border, all of it is compared.
-_MIN_INNER = 0.3
 # A window: the smallest and the largest pane, how far what is behind it is, and how many pixels beside must show it.
 _PANE_SHARES, _FAR_PARALLAX = (2e-4, 0.01), 0.125
 _BESIDE_PX, _MIN_BESIDE, _MIN_FAR_SHARE = 4, 8, 0.04
@@ -255,12 +245,14 @@ def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[
 
     If the sky is only seen through windows, other large smooth areas are walls and ceilings.
     """
-    possible = view.valid & ((contrast_around(view.picture, 1) < _SMOOTH) | _clouds(view))
+    # In a smooth area, the pixels of a window of 3×3 differ by fewer grey levels.
+    possible = view.valid & ((contrast_around(view.picture, 1) < 10) | _clouds(view))
     labels, weights = area_labels(possible), pixel_weights(possible.shape)
     sizes = np.bincount(labels[possible], weights[possible], labels.size)
     found, large = np.zeros_like(possible), np.flatnonzero(sizes >= min_share * weights.sum())
     for label in large:
-        if _is_sky(view, area := labels == label, rng, min_flat_share=_MIN_FLAT_SHARE):
+        # Smaller flat areas by which no sky is recognised are blinds and lamps.
+        if _is_sky(view, area := labels == label, rng, min_flat_share=0.05):
             found |= area
     if found.any():
         return found, np.zeros_like(found)
@@ -319,7 +311,7 @@ def _clouds(view: _View) -> Mask:
 def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share: float = 0.0) -> bool:
     """Return whether the colours of an area agree at infinity, and nothing speaks for a finite range."""
     inner = area & ~dilated(~area, 2)
-    if inner.sum() < _MIN_INNER * area.sum():
+    if inner.sum() < 0.3 * area.sum():  # too little of it lies away from its border
         inner = area
     at_infinity, at_range = errors_of_area(view.picture, inner, view.comparisons)
     if not at_infinity <= min(_MAX_ERROR, _FLAT_RATIO * at_range + _FLAT_MARGIN):
@@ -327,7 +319,7 @@ def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share
     if np.isfinite(at_range):
         if at_range >= 1.3 * at_infinity + 0.1:
             return True
-    elif at_infinity <= _CONTENT_RATIO * view.picture[inner].std(axis=0).max():
+    elif at_infinity <= 0.12 * view.picture[inner].std(axis=0).max():
         return True
     border = dilated(area, 3) & ~area & view.consistent & ~is_bare(view.picture)
     return bool(
@@ -374,7 +366,8 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
     sky, most = seeds, _MAX_PART_SHARE * pixel_weights(seeds.shape).sum()
     for _ in range(_ROUNDS):
         colors = sky_colors(view.picture, sky)
-        reached = view.valid & ~walls & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        # Farther from known sky, the colours of the sky are not known.
+        reached = view.valid & ~walls & dilated(sky, min(40, len(sky) // 2 - 1))
         alike = reached & colors.match(view.picture) & (~solid | dilated(sky, 1))
         labels = area_labels(alike & ~sky)
         inside, weights = labels >= 0, pixel_weights(sky.shape)

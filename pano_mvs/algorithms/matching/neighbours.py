@@ -25,7 +25,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry.geodesy import local_from_lla
 from pano_mvs.scene import Features, GlobalDescriptor, Pairs
 
-_SHORTLISTED = 20
 _WINDOW, _NEAREST = 5, 10  # the defaults of pairs.sequential and pairs.position
 
 
@@ -298,7 +297,7 @@ def similarities(features: Collection[Features], *, sample: int = 400) -> FloatA
     """Return the similarity of images, (N, N): matches of samples of their key points, then their VLAD vectors."""
     names = [str(number) for number in range(len(features))]
     descriptors = {name: vlad_descriptor(one, sample=sample) for name, one in zip(names, features, strict=True)}
-    return -_dissimilarities(names, descriptors, _SHORTLISTED)
+    return -_dissimilarities(names, descriptors, 20)
 
 
 def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:

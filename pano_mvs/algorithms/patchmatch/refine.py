@@ -93,8 +93,6 @@ class ViewWeights:
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 # Maximum of a refined range, relative to the farthest swept one.
 _BEYOND = 1.5
-# Maximum step, in pixels of the reference at the widest baseline: beyond it, images are not linear.
-_MAX_STEP_PX = 0.5
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
 # A window extends two pixels per sample from its centre, and one and a half times as far in a source that is nearer.
@@ -184,7 +182,7 @@ class WindowSettings:
             (self.prior_px * pixel_q) ** -2,
             (self.prior_slope * pixel_q) ** -2,
             10.0,
-            np.float32(_MAX_STEP_PX * pixel_q),
+            np.float32(0.5 * pixel_q),  # beyond half a pixel at the widest baseline, images are not linear
         )
 
 

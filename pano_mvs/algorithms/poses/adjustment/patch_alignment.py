@@ -22,7 +22,6 @@ _MAX_WIDTH = 4096  # wider panoramas are rarely sharp to a pixel, and their patc
 _PAD_PX = 8
 # All of these were tuned on rendered and synthetic captures; the result changes little around them.
 _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
-_STIFFNESS = 6.0
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
 _FLOOR = 0.1  # samples: error that the deviation of the aligned patches does not include
@@ -226,7 +225,7 @@ def aligned_shifts(
 
     count = len(target_idx)
     shifts, correlations, deviations = np.empty((count, 2)), np.empty(count), np.empty(count)
-    align_patches(patches, reference_idx, target_idx, window(), _STIFFNESS, shifts, correlations, deviations)
+    align_patches(patches, reference_idx, target_idx, window(), 6.0, shifts, correlations, deviations)
     return shifts, correlations, deviations
 
 

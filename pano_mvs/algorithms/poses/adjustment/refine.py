@@ -34,7 +34,6 @@ from pano_mvs.scene.pose_groups import per_group, split_groups
 _ROUNDS = 3
 # The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
-_MIN_USED = 0.5  # share of the observations that fit a solution; a wrong one leaves most of them out
 # Sigma of a key point in a panorama of 1024 columns, a fifth of a pixel, to which the scale of the loss refers.
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
 
@@ -173,8 +172,9 @@ def _refined_with_rigs(
     if poses.metric and measured:
         return in_gauge_of(refined, poses.centers)
     scale = estimate(adjusted)
-    # Offsets that determine the unit of length less well than this are too small to matter.
-    if not scale.relative_std < 0.03 or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
+    # Offsets that determine the unit of length less well than this are too small to matter. A wrong solution leaves
+    # out most observations.
+    if not scale.relative_std < 0.03 or len(adjusted.bearings) < 0.5 * len(bundle.bearings):
         return _refined_centrally(poses, settings, load=load)
     if not measured:
         return in_gauge_of(refined, poses.centers)
@@ -343,7 +343,6 @@ _REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
 # A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of 20
 # panoramas, 28 of 35 are within 1.6 %, the others at 7 to 14 %, all due to wrong lengths.
 _MAX_DIFFERENCE, _MIN_STD, _MIN_PAIRS = 0.25, 0.02, 3
-_MEDIAN_SQUARE = 1.39  # squared median of the length of a 2D normal vector of variance 1 in each direction
 
 
 def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
@@ -374,7 +373,8 @@ def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
     same = np.abs(differences) < _MAX_DIFFERENCE
     # What is known of the spread of heights before any is measured.
     std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
-    weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / _MEDIAN_SQUARE
+    # 1.39 is the squared median of the length of a normal vector of variance 1 in each of two directions.
+    weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / 1.39
     return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
 
 

@@ -27,9 +27,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import TwoView
 
-# Further steps are not needed: the finished model is refined anyway.
-_ADJUST_TOLERANCE = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
@@ -126,7 +123,7 @@ class GrowingModel:
             loss="cauchy",
             scale_rad=MAX_ERROR_RAD / 4,
             max_iterations=20,
-            tolerance=_ADJUST_TOLERANCE,
+            tolerance=1e-3,  # the finished model is refined anyway
             fixed_camera=images.index(next(iter(self.cameras))),
         )
         for image, rotation, center in zip(images, bundle.rotations, bundle.centers, strict=True):

@@ -72,7 +72,6 @@ MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
 _AGREEING, MIN_AGREEING = 1.25, 0.4
-_FEW_MATCHES = 15
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
 
 
@@ -112,7 +111,7 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
         found.append(
             Geometry(
                 view=geometry,
-                weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
+                weight=(1 + np.log10(max(len(geometry), 1) / 15)) * min(1.0, np.sqrt(len(geometry) / most)),
                 direction_std_deg=view.direction_std_deg if rank == 0 else 0.5,
                 unit_ranges=ranges,
                 parallax_rad=parallax,

@@ -164,8 +164,6 @@ def fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 _TILE_COLUMNS = 64
-# A band of which this share is to be swept is swept as a whole.
-_WHOLE_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -220,7 +218,7 @@ def runs_of(tiles: NDArray[np.bool_], size_hw: tuple[int, int], windows: Windows
     runs = []
     for band, row in enumerate(tiles):
         first, rows = band * BAND_ROWS, min(BAND_ROWS, height - band * BAND_ROWS)
-        if row.mean() > _WHOLE_SHARE:
+        if row.mean() > 0.7:  # a band most of which is to be swept is swept as a whole
             runs.append(TileRun(first, rows, 0, width, 0))
             continue
         # How far the windows of the band reach, the box's and those that look around within it.
