@@ -161,16 +161,10 @@ def is_common_picture(path: Path) -> bool:
     with path.open("rb") as stream:
         start = stream.read(26)
         if start[:2] == JPEG_START:
-            return _jpeg_channels(start + stream.read()) == 3
+            data = start + stream.read()
+            frame = next((at for marker, at, _ in jpeg_segments(data) if marker in JPEG_FRAMES), None)
+            return frame is not None and data[frame + 5] == 3  # channels (ITU-T T.81, B.2.2)
     return start[:8] == PNG_START and start[24:26] == bytes([8, 2])  # 8 bits, RGB
-
-
-def _jpeg_channels(data: bytes) -> int:
-    """Return the number of channels in a JPEG's first start of frame (ITU-T T.81, B.2.2); 0 without one."""
-    for marker, start, _ in jpeg_segments(data):
-        if marker in JPEG_FRAMES:
-            return data[start + 5]
-    return 0
 
 
 def _listed(

@@ -138,7 +138,9 @@ def share_run(
     cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))] if poses is not None else []
     frame = page_from_world(cameras, is_level=states_y_down(largest.frame))
     page = PageFolder(folder)
-    title = options.title or _capture_name(run)
+    source = resolved(run.summary.source_folder or run.out)
+    # The name of the folder of the capture, which may hold its images in `images`; else of the output.
+    title = options.title or (source.parent if source.name == "images" else source).name
     scene: dict[str, Any] = {"title": title, "unit": "m" if largest.metric else "units", "ranges": list(RANGES_HW)}
     centers = np.array([frame.apply(camera.center) for camera in cameras]).reshape(-1, 3)
     geometry, more = _put_geometry(page, run, cloud, frame=frame, centers=centers, options=options)
@@ -164,12 +166,6 @@ def share_run(
         total_bytes=sum(page.written.values()),
         notes=tuple(notes),
     )
-
-
-def _capture_name(run: RunOutput) -> str:
-    """Return the name of the folder of the capture, which may hold its images in `images`; else of the output."""
-    folder = resolved(run.summary.source_folder or run.out)
-    return (folder.parent if folder.name == "images" else folder).name
 
 
 def _put_geometry(

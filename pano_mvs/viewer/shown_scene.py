@@ -74,7 +74,12 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         UsageError: if there is no such group.
     """
     if is_file(path):
-        return _scene_of_ply(path)
+        points, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+        if points is not None and not points.count:
+            raise InputError(
+                f"{path}: contains no points, so there is nothing to show. Check the program that wrote it"
+            )
+        return ShownScene(path.name, points, mesh, (), "scene units", *_frame(()))
     if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _summary(path)
@@ -112,13 +117,6 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         ahead=ahead,
         notes=tuple(notes),
     )
-
-
-def _scene_of_ply(path: Path) -> ShownScene:
-    cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
-    if cloud is not None and not cloud.count:
-        raise InputError(f"{path}: contains no points, so there is nothing to show. Check the program that wrote it")
-    return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
 
 
 def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:

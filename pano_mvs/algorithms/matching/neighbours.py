@@ -329,7 +329,8 @@ def sample_matches(
     matches = np.zeros((count, count))
     compare = _comparison(samples)
     for first, second in np.argwhere(listed).tolist():
-        if _comparable(samples[first], samples[second]):
+        a, b = samples[first], samples[second]
+        if len(a) > 0 and len(b) >= 2 and a.shape[1] == b.shape[1]:  # of one kind, and enough for a ratio test
             found = compare(first, second)
             distinct = found.squared < np.float32(0.8**2) * found.next_squared
             matches[first, second] = int(
@@ -344,11 +345,6 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
         packed = {idx: PackedDescriptors.of(sample) for idx, sample in enumerate(samples) if sample.size}
         return lambda first, second: nearest_two_packed(packed[first], packed[second])
     return lambda first, second: nearest_two(samples[first], samples[second])
-
-
-def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
-    """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
-    return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
 
 
 def exhaustive_pairs(names: Sequence[str]) -> Pairs:

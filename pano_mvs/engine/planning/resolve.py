@@ -256,7 +256,8 @@ class Resolver:
         leading = [edge for edge in each if not edge.exploded and self.states[edge.producer].axis is self.axis]
         names: dict[str, tuple[str, ...]] = {}
         for number, edge in enumerate(leading or each):
-            found = self._members(edge)
+            state = self.states[edge.producer]
+            found = {name: (name,) for name in state.exploded} if edge.exploded else dict(state.members)
             names = found if number == 0 else {name: names[name] for name in names if name in found}
         return self._with_neighbours(names) if INDEX_PORT in self.edges else names
 
@@ -267,12 +268,6 @@ class Resolver:
             return views
         self.near = {name: (name, *self.near[name]) if name in views else () for name in names}
         return names
-
-    def _members(self, edge: Edge) -> dict[str, tuple[str, ...]]:
-        state = self.states[edge.producer]
-        if edge.exploded:
-            return {name: (name,) for name in state.exploded}
-        return dict(state.members)
 
     def _units_of_index(self, edge: Edge) -> Mapping[str, tuple[str, ...]] | None:
         state = self.states[edge.producer]
