@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry.geodesy import earth_from_lla, earth_from_local
-from pano_mvs.io.meshes import ARRAY_BUFFER, FLOAT, write_glb_parts
+from pano_mvs.io.meshes import ARRAY_BUFFER, unlit_document, write_glb_parts
 from pano_mvs.scene import PointCloud
 
 _UINT16, _POINTS = 5123, 0
-_UNLIT = "KHR_materials_unlit"
 
 
 class TilesetWriter:
@@ -103,25 +102,11 @@ def write_points_glb(path: Path, points: NDArray[np.float32], colors_rgb: NDArra
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     colors = np.full((len(points), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * linear).astype("<u2")[colors_rgb]
-    document = {
-        "asset": {"version": "2.0", "generator": "pano_mvs"},
-        "extensionsUsed": [_UNLIT],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0, "mode": _POINTS}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": {_UNLIT: {}}}],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": FLOAT,
-                "count": len(points),
-                "type": "VEC3",
-                "min": positions.min(axis=0).tolist(),
-                "max": positions.max(axis=0).tolist(),
-            },
-            {"bufferView": 1, "componentType": _UINT16, "normalized": True, "count": len(points), "type": "VEC4"},
-        ],
-    }
+    document = unlit_document(
+        {"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0, "mode": _POINTS},
+        {"pbrMetallicRoughness": {"metallicFactor": 0}},
+        positions,
+        {"componentType": _UINT16, "normalized": True, "count": len(points), "type": "VEC4"},
+    )
     views = [{"target": ARRAY_BUFFER}] * 2
     write_glb_parts(path, document, [positions.tobytes(), colors.tobytes()], views=views)
