@@ -21,6 +21,11 @@ class NearestTwo:
     next_squared: NDArray[np.float32]  # (N,) float32, to the second nearest one
     squared_back: NDArray[np.float32]  # (M,) float32, from each descriptor of the other image to its nearest one
 
+    def mutual(self) -> NDArray[np.bool_]:
+        """Return which pass the ratio test of Lowe 2004, section 7.1, and are mutually the nearest, (N,)."""
+        distinct = self.squared < np.float32(0.8**2) * self.next_squared
+        return np.asarray(distinct & (self.squared <= self.squared_back[self.nearest]))
+
 
 def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
     """Return the two nearest neighbours of each descriptor: |a − b|² = |a|² + |b|² − 2 a·b, in blocks of rows.

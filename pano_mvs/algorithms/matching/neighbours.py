@@ -331,11 +331,7 @@ def sample_matches(
     for first, second in np.argwhere(listed).tolist():
         a, b = samples[first], samples[second]
         if len(a) > 0 and len(b) >= 2 and a.shape[1] == b.shape[1]:  # of one kind, and enough for a ratio test
-            found = compare(first, second)
-            distinct = found.squared < np.float32(0.8**2) * found.next_squared
-            matches[first, second] = int(
-                np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest]))
-            )
+            matches[first, second] = np.count_nonzero(compare(first, second).mutual())
     return matches + matches.T
 
 

@@ -151,10 +151,7 @@ def _count_matches(sample: _Sample, known: _Sample) -> int:
     if min(len(sample.descriptors), len(known.descriptors)) < 2:
         return 0
     found = _nearest_two(sample, known)
-    # Threshold of the ratio test of Lowe 2004, section 7.1.
-    kept = found.squared < np.float32(0.8**2) * found.next_squared
-    kept &= found.squared <= found.squared_back[found.nearest]
-    return len(np.unique(found.nearest[kept]))
+    return len(np.unique(found.nearest[found.mutual()]))
 
 
 def _nearest_two(sample: _Sample, known: _Sample) -> NearestTwo:

@@ -365,15 +365,15 @@ _forms: dict[tuple[tuple[str, str, bool], ...], Form] = {}
 class PackedRefs(Mapping[str, BlobRef]):
     """References to blobs by name; equal to a dict with the same entries."""
 
-    __slots__ = ("_form", "_packed")
+    __slots__ = ("form", "packed")
 
     def __init__(self, parts: Mapping[str, BlobRef]) -> None:
         """Pack references; values with the same names and suffixes share these."""
         form = tuple((name, ref.suffix, ref.external) for name, ref in parts.items())
         if form not in _forms:
             _forms[form] = {name: (idx, suffix, external) for idx, (name, suffix, external) in enumerate(form)}
-        self._form = _forms[form]
-        self._packed = b"".join(
+        self.form = _forms[form]  # what values with the same names and suffixes share
+        self.packed = b"".join(
             bytes.fromhex(ref.digest) + ref.size_bytes.to_bytes(_SIZE_BYTES, "big") for ref in parts.values()
         )
 
@@ -381,31 +381,21 @@ class PackedRefs(Mapping[str, BlobRef]):
     def from_packed(form: Form, packed: bytes) -> PackedRefs:
         """Return the references whose `form` and `packed` are known."""
         parts = PackedRefs.__new__(PackedRefs)
-        parts._form, parts._packed = form, packed
+        parts.form, parts.packed = form, packed
         return parts
 
-    @property
-    def form(self) -> Form:
-        """What values with the same names and suffixes share."""
-        return self._form
-
-    @property
-    def packed(self) -> bytes:
-        """The digests and sizes."""
-        return self._packed
-
     def __getitem__(self, name: str) -> BlobRef:
-        idx, suffix, external = self._form[name]
+        idx, suffix, external = self.form[name]
         start = idx * _PART_BYTES
         middle, end = start + DIGEST_BYTES, start + _PART_BYTES
-        size_bytes = int.from_bytes(self._packed[middle:end], "big")
-        return BlobRef(self._packed[start:middle].hex(), size_bytes, suffix, external)
+        size_bytes = int.from_bytes(self.packed[middle:end], "big")
+        return BlobRef(self.packed[start:middle].hex(), size_bytes, suffix, external)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._form)
+        return iter(self.form)
 
     def __len__(self) -> int:
-        return len(self._form)
+        return len(self.form)
 
     def __repr__(self) -> str:
         return repr(dict(self))
