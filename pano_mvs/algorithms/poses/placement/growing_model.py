@@ -53,7 +53,7 @@ class GrowingModel:
     cameras: dict[int, Rigid3] = field(default_factory=dict)  # image position to cam_from_world
 
     def __post_init__(self) -> None:
-        self._points = np.full((self.tracks.count, 3), np.nan)
+        self.points_in_world = np.full((self.tracks.count, 3), np.nan)  # of all tracks, NaN where not triangulated
         # Positions of the observations of every image, and its pairs, sorted by number of verified matches.
         by_image = np.argsort(self.tracks.image_idx, kind="stable")
         sizes = np.bincount(self.tracks.image_idx, minlength=len(self.tracks.names))
@@ -64,11 +64,6 @@ class GrowingModel:
             self._pairs[second].append((-len(view), first))
         for pairs in self._pairs:
             pairs.sort()
-
-    @property
-    def points_in_world(self) -> FloatArray:
-        """Points of all tracks, (count, 3), NaN where not triangulated."""
-        return self._points
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image and triangulate the tracks that it sees."""
@@ -99,7 +94,7 @@ class GrowingModel:
             max_error_rad=MAX_ERROR_RAD,
             min_angle_rad=float(np.deg2rad(1.0)),
         )
-        self._points[chosen] = found.points_in_world
+        self.points_in_world[chosen] = found.points_in_world
         return seen, found
 
     def adjust(self) -> None:
@@ -133,7 +128,7 @@ class GrowingModel:
     def known_points(self, image: int) -> tuple[FloatArray, FloatArray]:
         """Return the triangulated points of an image's tracks, (M, 3), and its rays to them, (M, 3)."""
         observations = self._track_of_image[image]
-        points = self._points[self.tracks.track_idx[observations]]
+        points = self.points_in_world[self.tracks.track_idx[observations]]
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
@@ -154,7 +149,7 @@ class GrowingModel:
 
     def known_counts(self) -> NDArray[np.intp]:
         """Return the number of triangulated points in the tracks of each image, (N,)."""
-        known = np.isfinite(self._points[self.tracks.track_idx, 0])
+        known = np.isfinite(self.points_in_world[self.tracks.track_idx, 0])
         return np.bincount(self.tracks.image_idx[known], minlength=len(self.tracks.names))
 
     def attach(self, image: int) -> Attachment:
@@ -195,7 +190,7 @@ class GrowingModel:
         p = self.tracks.bearings[self._track_of_image[partner][theirs]]
         q = self.tracks.bearings[self._track_of_image[image][mine]]
         (unit_range, _), parallax = unit_ranges(image_from_partner, p, q)
-        ratios = np.linalg.norm(self._points[seen] - self.cameras[partner].center, axis=1) / unit_range
+        ratios = np.linalg.norm(self.points_in_world[seen] - self.cameras[partner].center, axis=1) / unit_range
         usable = np.isfinite(ratios)
         if usable.sum() < MIN_RATIOS:
             return None
