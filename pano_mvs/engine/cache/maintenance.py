@@ -15,7 +15,7 @@ import re
 import stat
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -350,32 +350,32 @@ def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) ->
 
 def _read(place: Path | Packed) -> bytes | None:
     """Return the bytes of a value, or None if another process has deleted it."""
-    with _reading(place):
+    with suppress(FileNotFoundError), _reading(place):
         return place.read_bytes() if isinstance(place, Packed) else read_regular(place)
     return None
 
 
 def _digest(place: Path | Packed) -> str:
     """Return the digest of a value, or nothing if another process has deleted it, or it is not a regular file."""
-    with _reading(place):
+    with suppress(FileNotFoundError), _reading(place):
         if isinstance(place, Packed) or stat.S_ISREG(place.lstat().st_mode):
             return place.content_digest() if isinstance(place, Packed) else digest_from_file(place)
     return ""
 
 
 def _stat(path: str | Path) -> os.stat_result | None:
-    with _reading(path):
+    with suppress(FileNotFoundError), _reading(path):
         return Path(path).lstat()
     return None
 
 
 @contextmanager
 def _reading(place: str | Path | Packed) -> Iterator[None]:
-    """Skip the rest of a block if a file that it reads is missing, and name one that cannot be read."""
+    """Name a file that cannot be read, unless it is missing."""
     try:
         yield
     except FileNotFoundError:
-        pass
+        raise
     except OSError as error:
         path = place.pack if isinstance(place, Packed) else place
         raise StoreError(
@@ -396,6 +396,6 @@ def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
 
 
 def _sorted(folder: Path) -> Iterable[os.DirEntry[str]]:
-    with _reading(folder), os.scandir(folder) as entries:
+    with suppress(FileNotFoundError), _reading(folder), os.scandir(folder) as entries:
         return sorted(entries, key=lambda entry: entry.name)
     return ()
