@@ -257,7 +257,8 @@ class Resolver:
         names: dict[str, tuple[str, ...]] = {}
         for number, edge in enumerate(leading or each):
             state = self.states[edge.producer]
-            found = {name: (name,) for name in state.exploded} if edge.exploded else dict(state.members)
+            exploded: dict[str, tuple[str, ...]] = {name: (name,) for name in state.exploded}
+            found = exploded if edge.exploded else dict(state.members)
             names = found if number == 0 else {name: names[name] for name in names if name in found}
         return self._with_neighbours(names) if INDEX_PORT in self.edges else names
 
