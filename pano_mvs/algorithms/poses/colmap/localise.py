@@ -196,7 +196,7 @@ class _Search:
             aligned = self.patches.aligned(camera, names, prior=self.prior)
             if best is None or aligned.confirmed > best[0].confirmed:
                 best = aligned, agreeing
-        # The patches of the panoramas must confirm it: this many, and this share of those that the photograph could show.
+        # The patches of the panoramas must confirm it: this many, and this share of those that the photograph shows.
         if best is None or best[0].confirmed < 60 or best[0].share < 0.3:
             return ""
         aligned, _ = best
