@@ -189,7 +189,20 @@ def similarity_from_cameras(source: Sequence[Rigid3], target: Sequence[Rigid3]) 
     weights = np.ones(len(before))
     found = Similarity3(1.0, np.eye(3), np.zeros(3))
     for _ in range(30):
-        found = _weighted_similarity(before, after, weights)
+        # Rotation and translation are those of all points, as Umeyama's. The scale is that of the centres alone,
+        # because the arms have the length of the spacing in either frame.
+        share = np.repeat(weights / weights.sum() / before.shape[1], before.shape[1])
+        a, b = before.reshape(-1, 3), after.reshape(-1, 3)
+        mean_a, mean_b = share @ a, share @ b
+        rotation = nearest_rotation((b - mean_b).T @ ((a - mean_a) * share[:, None]))
+        of_camera = weights / weights.sum()
+        centers_a, centers_b = before[:, 0], after[:, 0]
+        middle_a, middle_b = of_camera @ centers_a, of_camera @ centers_b
+        turned = (centers_a - middle_a) @ rotation.T
+        spread = float(of_camera @ np.sum(turned**2, axis=1))
+        scale = float(of_camera @ np.sum(turned * (centers_b - middle_b), axis=1)) / max(spread, 1e-300)
+        scale = scale if scale > 0 else 1.0
+        found = Similarity3(scale, rotation, middle_b - scale * rotation @ middle_a)
         errors = np.linalg.norm(found.apply(before) - after, axis=-1).max(axis=1)
         weights = 1 / (errors + 1e-9 + 0.01 * float(np.median(errors)))
     return found
@@ -206,26 +219,6 @@ def _reference_points(cameras: Sequence[Rigid3]) -> FloatArray:
     centers = np.array([camera.center for camera in cameras])
     axes = np.array([camera.rotation for camera in cameras])  # the rows are the axes in the world
     return np.concatenate([centers[:, None], centers[:, None] + _ARM * camera_spacing(centers) * axes], axis=1)
-
-
-def _weighted_similarity(source: FloatArray, target: FloatArray, weights: FloatArray) -> Similarity3:
-    """Return the similarity with the least weighted squared distance between points (N, 4, 3) of cameras.
-
-    Rotation and translation are those of all points, as Umeyama's. The scale is that of the centres alone, because the
-    arms have the length of the spacing in either frame.
-    """
-    share = np.repeat(weights / weights.sum() / source.shape[1], source.shape[1])
-    a, b = source.reshape(-1, 3), target.reshape(-1, 3)
-    mean_a, mean_b = share @ a, share @ b
-    rotation = nearest_rotation((b - mean_b).T @ ((a - mean_a) * share[:, None]))
-    of_camera = weights / weights.sum()
-    centers_a, centers_b = source[:, 0], target[:, 0]
-    middle_a, middle_b = of_camera @ centers_a, of_camera @ centers_b
-    turned = (centers_a - middle_a) @ rotation.T
-    spread = float(of_camera @ np.sum(turned**2, axis=1))
-    scale = float(of_camera @ np.sum(turned * (centers_b - middle_b), axis=1)) / max(spread, 1e-300)
-    scale = scale if scale > 0 else 1.0
-    return Similarity3(scale, rotation, middle_b - scale * rotation @ middle_a)
 
 
 def _next_link(

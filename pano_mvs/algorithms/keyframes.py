@@ -21,7 +21,6 @@ REDUCED_HW = (128, 256)
 _PAD = 24  # columns that are repeated on each side of the seam
 _MAX_POINTS, _MIN_DISTANCE, _QUALITY = 160, 6, 0.005
 _WINDOW = (11, 11)
-_FIT_SCALE_RAD = float(np.radians(0.5))
 
 
 @dataclass(frozen=True)
@@ -184,11 +183,10 @@ def _robust_rotation(before: FloatArray, after: FloatArray) -> FloatArray:
     turn = np.eye(3)
     for _ in range(5):
         turn = nearest_rotation((after * weights[:, None]).T @ before)
-        weights = 1 / (_FIT_SCALE_RAD + angle_between(before @ turn.T, after))
+        weights = 1 / (float(np.radians(0.5)) + angle_between(before @ turn.T, after))
     return turn
 
 
-_LOST_SHARE = 0.3
 _EPSILON_S = 1e-6
 _BY_TIME_S = 1.0  # between keyframes if there is nothing to measure motion by
 
@@ -304,7 +302,7 @@ class _Selector:
         wanted_deg, since = self.settings.parallax_deg, frame.time_s - last.time_s
         is_plain = self.tracker.points < 30
         motion = self.tracker.measure(frame.grey)
-        is_lost = not is_plain and motion.seen_share < _LOST_SHARE
+        is_lost = not is_plain and motion.seen_share < 0.3
         if not is_lost:
             self.lost_since = None
         elif self.lost_since is None:

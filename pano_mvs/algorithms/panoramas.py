@@ -81,6 +81,12 @@ def nearest_resized(values: NDArray[Any], size_hw: tuple[int, ...]) -> NDArray[A
     return np.asarray(values[rows[:, None], columns])
 
 
+def narrowed(values: NDArray[Any], width: int) -> NDArray[Any]:
+    """Return values (H, W) that are at most `width` wide, those of the nearest pixels."""
+    height = max(1, round(values.shape[0] * width / values.shape[1]))
+    return values if values.shape[1] <= width else nearest_resized(values, (height, width))
+
+
 def columns_per_step(size_hw: tuple[int, int], *, steps: int) -> NDArray[np.int64]:
     """Return for each row the number of columns as wide as a pixel at the equator: 1 / cos φ, rounded, (H,) int64.
 

@@ -16,9 +16,7 @@ from pano_mvs.scene import PointCloud
 # The nearest point of each cell and its neighbours hides points that are further away by more than this share.
 _CELLS, _HIDDEN = 200, 0.08
 _MIN_POINTS = 200
-_EXPOSURE_ROUNDS, _EXPOSURE_SCALE = 8, 0.1
 _CORRELATED = (0.8, 0.95)
-_CONTRAST_BOUNDS, _GAIN_BOUNDS = (0.6, 1.6), (0.3, 3.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +141,7 @@ def _exposure(colors: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArr
     x, y = np.log(colors[usable] / 255), np.log(own[usable] / 255)
     for channel in range(3):
         offset, contrasts[channel] = _robust_line(x[:, channel], y[:, channel])
-        gains[channel] = np.clip(np.exp(offset), *_GAIN_BOUNDS)
+        gains[channel] = np.clip(np.exp(offset), 0.3, 3.0)
     return gains, contrasts
 
 
@@ -154,14 +152,14 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     photograph with more detail than the cloud would otherwise appear to have too much contrast.
     """
     offset, slope = float(np.median(y - x)), 1.0
-    for _ in range(_EXPOSURE_ROUNDS):
-        weights = 1 / (1 + ((y - offset - slope * x) / _EXPOSURE_SCALE) ** 2)
+    for _ in range(8):
+        weights = 1 / (1 + ((y - offset - slope * x) / 0.1) ** 2)
         middle_x, middle_y = np.average(x, weights=weights), np.average(y, weights=weights)
         spread_x = float(np.average((x - middle_x) ** 2, weights=weights)) + 1e-6
         spread_y = float(np.average((y - middle_y) ** 2, weights=weights)) + 1e-6
         together = float(np.average((x - middle_x) * (y - middle_y), weights=weights))
         trust = np.clip((together / np.sqrt(spread_x * spread_y) - _CORRELATED[0]) / np.ptp(_CORRELATED), 0, 1)
-        slope = float(np.clip(1 + trust * (np.sqrt(spread_y / spread_x) - 1), *_CONTRAST_BOUNDS))
+        slope = float(np.clip(1 + trust * (np.sqrt(spread_y / spread_x) - 1), 0.6, 1.6))
         offset = float(middle_y - slope * middle_x)
     return offset, slope
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from pano_mvs.core.arrays import FloatArray
@@ -60,7 +59,10 @@ def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg
     """Return the sources of the images of one group."""
     distances = np.asarray(cdist(poses.centers, poses.centers), np.float64)
     scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
-    preference = _distance_ranks(distances)
+    others = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
+    usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0
+    too_close = distances < usual / 4
+    preference = distances + np.where(too_close, 2 * distances.max(initial=0.0), 0.0)
     extent = float(distances.max(initial=0.0))
     # Centres closer than this share of the extent of the capture are at the same place.
     apart = distances > 1e-9 * max(extent, 1e-300)
@@ -73,47 +75,10 @@ def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg
     return neighbours
 
 
-def _distance_ranks(distances: FloatArray) -> FloatArray:
-    """Return the rank of each image by distance alone, (N, N): smaller is better.
-
-    Images closer than a quarter of the capture's usual step are ranked after all others.
-    """
-    others = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
-    usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0
-    too_close = distances < usual / 4
-    return distances + np.where(too_close, 2 * distances.max(initial=0.0), 0.0)
-
-
 def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: float) -> FloatArray:
     """Return the weighted number of shared points of all pairs, (N, N), symmetric; 0 if there are too few."""
     images = len(poses.names)
     scores, shared = np.zeros((images, images)), np.zeros((images, images), np.int64)
-    first, second = _covisible(poses)
-    if not len(first):
-        return scores
-    points = np.asarray(poses.points_in_world)[poses.track_point_idx[first]]
-    image_a, image_b = poses.track_image_idx[first], poses.track_image_idx[second]
-    centers = poses.centers
-    with np.errstate(invalid="ignore", divide="ignore"):
-        angle_deg = np.degrees(angle_between(points - centers[image_a], points - centers[image_b]))
-    weight = _angle_weight(angle_deg, min_angle_deg, max_angle_deg)
-    np.add.at(scores, (image_a, image_b), weight)
-    np.add.at(shared, (image_a, image_b), weight > 0)
-    scores, shared = scores + scores.T, shared + shared.T
-    # With fewer shared points than this, the overlap of two images cannot be judged.
-    return np.where(shared >= 8, scores, 0.0)
-
-
-def _angle_weight(angle_deg: FloatArray, min_angle_deg: float, max_angle_deg: float) -> FloatArray:
-    """Return the weights α/12° up to 12°, √(12°/α) from there on, 0 outside the limits; (M,)."""
-    inside = (angle_deg >= min_angle_deg) & (angle_deg <= max_angle_deg)
-    safe = np.where(inside, np.maximum(angle_deg, 1e-6), _BEST_ANGLE_DEG)
-    weight = np.minimum(safe / _BEST_ANGLE_DEG, np.sqrt(_BEST_ANGLE_DEG / safe))
-    return np.where(inside, weight, 0.0)
-
-
-def _covisible(poses: Poses) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of observations of the same point, as two arrays of positions in the tracks."""
     order = np.lexsort((poses.track_image_idx, poses.track_point_idx))
     point = np.asarray(poses.track_point_idx)[order]
     image = np.asarray(poses.track_image_idx)[order]
@@ -127,4 +92,20 @@ def _covisible(poses: Poses) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         firsts.append(order[same])
         seconds.append(order[same + step])
         step += 1
-    return np.concatenate(firsts), np.concatenate(seconds)
+    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    if not len(first):
+        return scores
+    points = np.asarray(poses.points_in_world)[poses.track_point_idx[first]]
+    image_a, image_b = poses.track_image_idx[first], poses.track_image_idx[second]
+    centers = poses.centers
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angle_deg = np.degrees(angle_between(points - centers[image_a], points - centers[image_b]))
+    inside = (angle_deg >= min_angle_deg) & (angle_deg <= max_angle_deg)
+    safe = np.where(inside, np.maximum(angle_deg, 1e-6), _BEST_ANGLE_DEG)
+    weight = np.minimum(safe / _BEST_ANGLE_DEG, np.sqrt(_BEST_ANGLE_DEG / safe))
+    weight = np.where(inside, weight, 0.0)
+    np.add.at(scores, (image_a, image_b), weight)
+    np.add.at(shared, (image_a, image_b), weight > 0)
+    scores, shared = scores + scores.T, shared + shared.T
+    # With fewer shared points than this, the overlap of two images cannot be judged.
+    return np.where(shared >= 8, scores, 0.0)

@@ -73,8 +73,19 @@ def _run_blocks_shown(
 
     def run_block(run: BlockRun) -> int:
         _print_heading(run, console=console)
-        codes[run.name] = _run_block(run, execution, console)
-        return codes[run.name]
+        try:
+            summary = run_shown(run.session, execution, console, advise=False)
+            code, reason = summary.exit_code, summary.stopped
+        except PanoMvsError as error:
+            code, reason = error.exit_code, str(error)
+        if is_early(code):
+            Console(stderr=True).say(
+                f"[red]error:[/] {run.name}: {escape(reason)}\n"
+                f"To continue, remove the cause and {_SAME_COMMAND}. This block alone:\n"
+                f"  {escape(run_command(run.session))}"
+            )
+        codes[run.name] = code
+        return code
 
     with interrupted_by_termination():
         merge = partial(_merge, session=session, console=console)
@@ -110,22 +121,6 @@ def _print_heading(run: BlockRun, *, console: Console) -> None:
         f"\n[bold]block {run.number} of {run.blocks}[/]{what}: {len(run.names)} images, "
         f"{escape(run.names[0])} to {escape(run.names[-1])}, in {escape(str(run.session.out))}"
     )
-
-
-def _run_block(run: BlockRun, execution: Execution, console: Console) -> int:
-    """Run a block and return its exit code; if it ends early, print why and how to go on."""
-    try:
-        summary = run_shown(run.session, execution, console, advise=False)
-        code, reason = summary.exit_code, summary.stopped
-    except PanoMvsError as error:
-        code, reason = error.exit_code, str(error)
-    if is_early(code):
-        Console(stderr=True).say(
-            f"[red]error:[/] {run.name}: {escape(reason)}\n"
-            f"To continue, remove the cause and {_SAME_COMMAND}. This block alone:\n"
-            f"  {escape(run_command(run.session))}"
-        )
-    return code
 
 
 def _merge(outs: Sequence[Path], *, session: Session, console: Console) -> int:

@@ -67,15 +67,8 @@ def guarded(command: Command) -> Command:
             errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")
             raise typer.Exit(1) from None
 
-    run_guarded.__signature__ = _refusing_empty(command)  # type: ignore[attr-defined]
-    return cast(Command, run_guarded)
-
-
-def _refusing_empty(command: Callable[..., None]) -> inspect.Signature:
-    """Return the signature of a command in which typer finds that empty paths and arguments are errors.
-
-    A variable of the shell without a value makes an empty one, and an empty path is the current folder.
-    """
+    # Empty paths and arguments are errors: a variable of the shell without a value makes an empty one, and an empty
+    # path is the current folder.
     signature = inspect.signature(command, eval_str=True)
     for parameter in signature.parameters.values():
         if get_origin(parameter.annotation) is not Annotated:
@@ -85,7 +78,8 @@ def _refusing_empty(command: Callable[..., None]) -> inspect.Signature:
             info.parser = path
         elif str in _leaves(hint) and isinstance(info, ArgumentInfo):
             info.parser = text
-    return signature
+    run_guarded.__signature__ = signature  # type: ignore[attr-defined]
+    return cast(Command, run_guarded)
 
 
 def _leaves(hint: Any) -> list[Any]:

@@ -205,7 +205,13 @@ def print_inspection(found: Inspection, console: Console) -> None:
         f"{_vector(found.center_in_world)}"
     )
     console.print(_stage_table(found))
-    console.print(_source_table(found))
+    table = Table("neighbour", "baseline", "parallax", "pixel it is seen at", "colour", "cost")
+    for one in found.sources:
+        cost = "masked" if one.masked or not math.isfinite(one.cost) else f"{one.cost:.3f}"
+        pixel = f"{one.pixel_px[0]:.1f}, {one.pixel_px[1]:.1f}"
+        color = f"[on {_hex(one.color_rgb)}]  [/] {_hex(one.color_rgb)}"
+        table.add_row(escape(one.name), f"{one.baseline:.3g}", f"{one.parallax_deg:.2f}°", pixel, color, cost)
+    console.print(table)
     settings, curve = found.settings, found.curve
     said = [settings.cost, f"window {settings.window}", settings.combination, settings.aggregation]
     say(
@@ -242,16 +248,6 @@ def _stage_table(found: Inspection) -> Table:
         table.add_row(escape(one.stage), escape(one.use), shown, f"{one.confidence} {kind}")
     if math.isfinite(found.true_range):
         table.add_row("truth", "", f"{found.true_range:.5g}", "")
-    return table
-
-
-def _source_table(found: Inspection) -> Table:
-    table = Table("neighbour", "baseline", "parallax", "pixel it is seen at", "colour", "cost")
-    for one in found.sources:
-        cost = "masked" if one.masked or not math.isfinite(one.cost) else f"{one.cost:.3f}"
-        pixel = f"{one.pixel_px[0]:.1f}, {one.pixel_px[1]:.1f}"
-        color = f"[on {_hex(one.color_rgb)}]  [/] {_hex(one.color_rgb)}"
-        table.add_row(escape(one.name), f"{one.baseline:.3g}", f"{one.parallax_deg:.2f}°", pixel, color, cost)
     return table
 
 

@@ -59,7 +59,16 @@ def show_plan(session: Session, console: Console, *, workers: int = 0, threads: 
         table.add_row(plan.name, plan.use, *counts, *_expected(forecast, run_plan.workers))
     console.print(table)
     for plan in run_plan.stages:
-        _print_reasons(plan, console)
+        by_reason = Counter(plan.run.values())
+        for reason, count in by_reason.most_common(_SHOWN_REASONS):
+            items = [item for item, why in plan.run.items() if why == reason and item]
+            which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
+            console.say(escape(f"{plan.name}{which}: {reason}"))
+        if len(by_reason) > _SHOWN_REASONS:
+            more = len(by_reason) - _SHOWN_REASONS
+            console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
+        for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
+            console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
     _print_total(run_plan, console)
     return run_plan
 
@@ -100,19 +109,6 @@ def _print_total(run_plan: RunPlan, console: Console) -> None:
         text = f"{bound} {duration_text(run_plan.seconds)} with {workers}, and {size} in the cache, by earlier runs"
         text += f"; unknown: {shortened_list(unknown)}" if unknown else ""
     console.say(escape(text))
-
-
-def _print_reasons(plan: StagePlan, console: Console) -> None:
-    by_reason = Counter(plan.run.values())
-    for reason, count in by_reason.most_common(_SHOWN_REASONS):
-        items = [item for item, why in plan.run.items() if why == reason and item]
-        which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
-        console.say(escape(f"{plan.name}{which}: {reason}"))
-    if len(by_reason) > _SHOWN_REASONS:
-        more = len(by_reason) - _SHOWN_REASONS
-        console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
-    for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
-        console.say(escape(f"{plan.name}:{item}: cannot run: {reason}"))
 
 
 def explain_unit(session: Session, label: str, console: Console) -> None:

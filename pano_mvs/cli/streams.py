@@ -22,18 +22,12 @@ _READER_LEFT = {errno.EPIPE, errno.ECONNRESET, getattr(errno, "ESHUTDOWN", errno
 
 
 class StreamState:
-    """Whether a stream can still be written.
-
-    Attributes:
-        reader_left: whether the other end of the pipe, or the terminal, was closed.
-        failure: why the stream cannot be written otherwise, such as a full disk; empty if it can.
-        reader_may_leave: whether the command keeps its own exit code when the reader leaves.
-    """
+    """Whether a stream can still be written."""
 
     def __init__(self) -> None:
-        self.reader_left = False
-        self.failure = ""
-        self.reader_may_leave = False
+        self.reader_left = False  # whether the other end of the pipe, or the terminal, was closed
+        self.failure = ""  # why the stream cannot be written otherwise, such as a full disk; empty if it can
+        self.reader_may_leave = False  # whether the command keeps its own exit code when the reader leaves
 
     def exit_code(self, code: int) -> int:
         """Return the exit code of a command that would end with `code`, reporting a failed standard output."""
@@ -87,17 +81,13 @@ class _LenientRaw(io.RawIOBase):
             ) is None:  # another process made the terminal or the pipe non-blocking
                 select.select([], [self._raw], [])
         except OSError as error:
-            if self._is_closed(error):
+            hung_up = self._is_terminal and error.errno == errno.EIO
+            if error.errno in _READER_LEFT or hung_up or (os.name == "nt" and error.errno == errno.EINVAL):
                 self._state.reader_left = True
             else:
                 self._state.failure = error.strerror or str(error)
             return size
         return written
-
-    def _is_closed(self, error: OSError) -> bool:
-        """Return whether the reader has gone: a closed pipe or terminal."""
-        hung_up = self._is_terminal and error.errno == errno.EIO
-        return error.errno in _READER_LEFT or hung_up or (os.name == "nt" and error.errno == errno.EINVAL)
 
 
 def protect_standard_streams() -> StreamState:

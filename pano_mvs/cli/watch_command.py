@@ -101,16 +101,11 @@ def _ending(end: RunFinished | None) -> str:
 
 
 class BlocksView:
-    """What the events of a run in blocks say about it: the present block, and what is still to come.
-
-    Attributes:
-        folder: with the output folders of the blocks.
-        end: its last event; None while it runs.
-    """
+    """What the events of a run in blocks say about it: the present block, and what is still to come."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.end: RunFinished | None = None
+        self.folder = folder  # with the output folders of the blocks
+        self.end: RunFinished | None = None  # its last event; None while it runs
         self._block: BlockStarted | None = None
         self._since_s = 0.0
         self._run = RunView(folder)  # of the block
@@ -162,14 +157,10 @@ class BlocksView:
 
 
 class RunView:
-    """What the events of a run say about it.
-
-    Attributes:
-        end: its last event; None while it runs.
-    """
+    """What the events of a run say about it."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
-        self.end: RunFinished | None = None
+        self.end: RunFinished | None = None  # its last event; None while it runs
         self.folder = folder
         self._clock = clock
         self._start: RunStarted | None = None
@@ -217,13 +208,16 @@ class RunView:
     def shown(self) -> Group:
         """Return all of it."""
         self._now = self._latest if self.end else max(self._latest, self._clock())
+        lines = [f"failed {failure.stage}:{one_line(failure.item)}: {failure.cause}" for failure in self._failures]
+        if self._failed > len(lines):
+            lines.insert(0, f"{self._failed} units failed; the latest:")
         return Group(
             *(Text(line, style="bold") for line in self._heading()),
             self._stages(),
             *(Text(line) for line in ([] if self.end else [self.left_text(), self._disk()])),
             *(Text(line, style="yellow") for line in self._silence()),
             *(Text(f"warning: {text}", style="yellow") for text in self._warnings),
-            *(Text(line, style="red") for line in self._failure_lines()),
+            *(Text(line, style="red") for line in lines),
         )
 
     def left_text(self) -> str:
@@ -290,12 +284,6 @@ class RunView:
         if silent_s < 60.0:
             return []
         return [f"no event for {duration_text(silent_s)}: the run is computing a long unit, or its host has failed"]
-
-    def _failure_lines(self) -> list[str]:
-        lines = [f"failed {failure.stage}:{one_line(failure.item)}: {failure.cause}" for failure in self._failures]
-        if self._failed > len(lines):
-            lines.insert(0, f"{self._failed} units failed; the latest:")
-        return lines
 
 
 def _done(stage: StageProgress) -> str:

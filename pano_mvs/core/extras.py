@@ -24,3 +24,13 @@ def import_extra(module: str, use: str, extra: str) -> Any:
     except ImportError as error:
         library = module.partition(".")[0]
         raise UsageError(f"{use} needs {library}: pip install 'pano-mvs[{extra}]'") from error
+
+
+def installed_version(name: str) -> str | None:
+    """Return the version of an installed distribution, or None."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

@@ -32,13 +32,8 @@ def is_cache(folder: Path) -> bool:
     return is_file(folder / "layout.json") and all(is_folder(folder / name) for name in _FOLDERS_OF_A_CACHE)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-_UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
+_UMASK = os.umask(0)  # read once, because reading it sets it for a moment, in all threads
+os.umask(_UMASK)
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
 
@@ -183,7 +178,13 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
         temporary.chmod(0o666 & (~_UMASK | _shared_mode(path.parent)))
         if durable:
             _flush(temporary)
-        _take_name(temporary, path)
+        try:
+            temporary.replace(path)
+        except PermissionError:  # while a reader has the target open, which is fine if its bytes are the same
+            if not is_file(path) or path.stat().st_size != temporary.stat().st_size:
+                raise
+            if path.read_bytes() != temporary.read_bytes():
+                raise
         if durable and os.name == "posix":
             _flush(path.parent)
     except OSError as error:
@@ -254,17 +255,6 @@ def copy_file(source: Path, target: Path) -> None:
     """Copy a file atomically."""
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
-
-
-def _take_name(temporary: Path, path: Path) -> None:
-    """Rename; some systems refuse this while a reader has the target open, which is fine if its bytes are the same."""
-    try:
-        temporary.replace(path)
-    except PermissionError:
-        if not is_file(path) or path.stat().st_size != temporary.stat().st_size:
-            raise
-        if path.read_bytes() != temporary.read_bytes():
-            raise
 
 
 def _flush(path: Path) -> None:

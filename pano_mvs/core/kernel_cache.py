@@ -90,17 +90,14 @@ def user_cache_folder() -> Path:
     places = [Path(given)] if given else []
     places += [] if home is None else [home / below_home]
     for place in places:
-        if _can_be_made(place):
+        there = next((path for path in (place, *place.absolute().parents) if exists(path)), None)
+        if there is not None and is_folder(there) and os.access(there, os.W_OK | os.X_OK):
             return place
     return _own_temporary_folder()
 
 
 def _own_temporary_folder() -> Path:
-    """Return a folder that stays between runs and that nobody else can write to, as it holds code that we execute.
-
-    Raises:
-        OSError: if there is none.
-    """
+    """Return a folder that stays between runs and that nobody else can write to, as it holds code that we execute."""
     if sys.platform != "win32":
         folder = Path(tempfile.gettempdir()) / f"pano-mvs-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -108,9 +105,3 @@ def _own_temporary_folder() -> Path:
         if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid() and not info.st_mode & 0o077:
             return folder
     raise OSError(errno.EACCES, "there is no writable folder for caches")
-
-
-def _can_be_made(folder: Path) -> bool:
-    """Return whether a folder is writable, or can be created in the nearest existing folder above it."""
-    there = next((path for path in (folder, *folder.absolute().parents) if exists(path)), None)
-    return there is not None and is_folder(there) and os.access(there, os.W_OK | os.X_OK)

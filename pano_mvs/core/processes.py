@@ -60,10 +60,6 @@ def start_of(process: int) -> str | None:
         return None if fields[0] in _ENDED else fields[19]
     if exists(Path("/proc/self/stat")):  # the process has just ended, or is hidden from us
         return "" if is_running(process) else None
-    return _start_by_ps(process)
-
-
-def _start_by_ps(process: int) -> str | None:
     command = ["ps", "-o", "lstart=", "-p", str(process)]
     try:
         found = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"LC_ALL": "C"})  # noqa: S603

@@ -6,12 +6,11 @@ import re
 from collections.abc import Iterable
 from xml.etree import ElementTree
 
-MAX_CHARACTERS = 2000  # maximum length of a message
 # Control characters except tab and newline, marks of writing direction, line separators, surrogates.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def shortened(text: str, most: int = MAX_CHARACTERS) -> str:
+def shortened(text: str, most: int = 2000) -> str:
     """Return a text shortened to about `most` characters: its beginning, the number of omitted ones, and its end.
 
     >>> shortened("a" * 10 + "b" * 90, 20)

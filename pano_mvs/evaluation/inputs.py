@@ -173,12 +173,7 @@ class RangeFile:
             if name is None:
                 raise InputError(f"{self.path}: an EXR file without channels. Write it again")
             return channels[name]
-        try:
-            data = self.path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be read ({error.strerror}). Check that it exists and may be read"
-            ) from error
+        data = FilePart(self.path).read_bytes()
         array = decode_picture(data, self.path, cv2.IMREAD_UNCHANGED)
         if array is None:
             raise InputError(f"{self.path}: not an image that can be decoded ({len(data)} bytes). Write it again")

@@ -21,28 +21,18 @@ from pano_mvs.io.images.names import pair_image_names
 
 @dataclass(frozen=True, eq=False)
 class PoseEvaluation:
-    """Errors of poses against the truth; image names are those of the truth.
+    """Errors of poses against the truth; image names are those of the truth."""
 
-    Attributes:
-        model: name of the estimates' source.
-        truth: name of the truth's source.
-        unit: unit of lengths, for display.
-        pairs: errors over all pairs of the truth's images; a pair with an unregistered image is 180° off.
-        registered_pairs: errors over the pairs of registered images.
-        centers: errors of the camera centres after similarity alignment, or None if no alignment is possible.
-        no_centers: why there is no alignment; otherwise "".
-        without_truth: registered images without truth, by their own names.
-        other_groups: number of images in each further group of the model, which count as not registered.
-    """
-
-    model: str
-    truth: str
-    unit: str
-    pairs: PoseErrors
-    registered_pairs: PoseErrors
+    model: str  # name of the estimates' source
+    truth: str  # name of the truth's source
+    unit: str  # unit of lengths, for display
+    pairs: PoseErrors  # errors over all pairs of the truth's images; a pair with an unregistered image is 180° off
+    registered_pairs: PoseErrors  # errors over the pairs of registered images
+    # errors of the camera centres after similarity alignment, or None if no alignment is possible
     centers: CenterErrors | None
-    no_centers: str = ""
-    without_truth: tuple[str, ...] = ()
+    no_centers: str = ""  # why there is no alignment; otherwise ""
+    without_truth: tuple[str, ...] = ()  # registered images without truth, by their own names
+    # number of images in each further group of the model, which count as not registered
     other_groups: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
@@ -185,7 +175,6 @@ def _row(label: str, values: NDArray[np.float64], form: str) -> tuple[str, ...]:
 
 
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
-_ROUNDING = 1e-12  # of a centre's coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +290,7 @@ def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float |
     lengths = np.linalg.norm(translations, axis=1)
     extent = float(lengths.max(initial=0)) if extent is None else extent
     # Centres closer than this share of the capture's extent coincide: an image that occurs twice.
-    apart = lengths > max(1e-6 * extent, _ROUNDING * float(np.abs(centers).max()))
+    apart = lengths > max(1e-6 * extent, 1e-12 * float(np.abs(centers).max()))  # of which coordinates are rounded
     return _RelativePoses(rotations[second] @ rotations[first].swapaxes(1, 2), translations, lengths, apart)
 
 

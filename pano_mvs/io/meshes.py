@@ -65,7 +65,18 @@ def write_glb(path: Path, mesh: TexturedArrays, picture: bytes, *, form: Texture
         picture,
     ]
     views = [{"target": target} for target in (ARRAY_BUFFER, ARRAY_BUFFER, _ELEMENT_BUFFER)] + [{}]
-    write_glb_parts(path, _document(mesh, MIME_TYPES[form]), parts, views=views)
+    shading = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
+    document = unlit_document(
+        {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0},
+        {"pbrMetallicRoughness": shading, "doubleSided": True},
+        mesh.positions,
+        {"componentType": FLOAT, "count": len(mesh.uv), "type": "VEC2"},
+        {"componentType": _UINT32, "count": mesh.faces.size, "type": "SCALAR"},
+        textures=[{"sampler": 0, "source": 0}],
+        samplers=[{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+        images=[{"bufferView": 3, "mimeType": MIME_TYPES[form]}],
+    )
+    write_glb_parts(path, document, parts, views=views)
 
 
 def write_glb_parts(
@@ -94,37 +105,26 @@ def write_glb_parts(
         stream.writelines(padded)
 
 
-def _document(mesh: TexturedArrays, mime_type: str) -> dict[str, Any]:
-    positions: NDArray[np.float32] = mesh.positions
+def unlit_document(
+    primitive: dict[str, Any],
+    material: dict[str, Any],
+    positions: NDArray[np.float32],
+    *others: dict[str, Any],
+    **textures: list[dict[str, Any]],
+) -> dict[str, Any]:
+    """Return a glTF document of a primitive without lighting; accessor n is buffer view n, the first its positions."""
+    first = {"componentType": FLOAT, "count": len(positions), "type": "VEC3"}
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     return {
         "asset": {"version": "2.0", "generator": "pano_mvs"},
         "extensionsUsed": [_UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
-        "materials": [
-            {
-                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1},
-                "doubleSided": True,
-                "extensions": {_UNLIT: {}},
-            }
-        ],
-        "textures": [{"sampler": 0, "source": 0}],
-        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
-        "images": [{"bufferView": 3, "mimeType": mime_type}],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": FLOAT,
-                "count": len(positions),
-                "type": "VEC3",
-                "min": positions.min(axis=0).tolist(),
-                "max": positions.max(axis=0).tolist(),
-            },
-            {"bufferView": 1, "componentType": FLOAT, "count": len(mesh.uv), "type": "VEC2"},
-            {"bufferView": 2, "componentType": _UINT32, "count": mesh.faces.size, "type": "SCALAR"},
-        ],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material | {"extensions": {_UNLIT: {}}}],
+        **textures,
+        "accessors": [{"bufferView": view, **accessor} for view, accessor in enumerate((first | bounds, *others))],
     }
 
 

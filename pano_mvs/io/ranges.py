@@ -199,15 +199,10 @@ def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
         raise ValueError(f"its header states {count * dtype.itemsize} bytes, but there are at most {size_bytes}")
     if count > MAX_PIXELS:
         raise ValueError(f"its {count} numbers are more than the limit of {MAX_PIXELS}")
-    values = np.frombuffer(_read_exactly(stream, count * dtype.itemsize), dtype)
-    return values.reshape(shape, order="F" if is_fortran else "C")
-
-
-def _read_exactly(stream: IO[bytes], size_bytes: int) -> bytes:
-    data = stream.read(size_bytes)
-    if len(data) < size_bytes:
-        raise EOFError(f"it ends after {len(data)} of {size_bytes} bytes")
-    return data
+    data = stream.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise EOFError(f"it ends after {len(data)} of {count * dtype.itemsize} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C")
 
 
 def _reason(error: BaseException) -> str:

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -206,10 +205,6 @@ def _pose(node: CommentedMap, place: _Place) -> Rigid3:
         if abs(np.linalg.norm(quaternion) - 1) > _MAX_TURN_ERROR:
             place.fail(given, turn, "the length of the quaternion is not 1")
         return Rigid3(rotation_from_quat_wxyz(quaternion / np.linalg.norm(quaternion)), translation)
-    return Rigid3(_rotation(given, place), translation)
-
-
-def _rotation(given: CommentedMap, place: _Place) -> NDArray[np.float64]:
     rows = given["rotation"]
     fits = isinstance(rows, CommentedSeq) and len(rows) == 3
     if not fits or not all(
@@ -219,7 +214,7 @@ def _rotation(given: CommentedMap, place: _Place) -> NDArray[np.float64]:
     matrix = np.array([[float(value) for value in row] for row in rows])
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _MAX_TURN_ERROR or np.linalg.det(matrix) < 0:
         place.fail(given, "rotation", "is not a rotation matrix: its rows must be orthonormal, its determinant 1")
-    return nearest_rotation(matrix)
+    return Rigid3(nearest_rotation(matrix), translation)
 
 
 def _numbers(node: CommentedMap, key: str, place: _Place, *, count: int, what: str) -> list[float]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Axis, FilePart, Files
@@ -47,9 +49,7 @@ class NerfstudioFrame:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> NerfstudioFrame:
         """Return the frame that `to_json` gave."""
-        rows = tuple(tuple(map(float, row)) for row in value["frame_from_cam"])
-        size, focal = tuple(value["size_wh"]), tuple(value["focal_xy"])
-        return NerfstudioFrame(**{**value, "size_wh": size, "focal_xy": focal, "frame_from_cam": rows})
+        return TypeAdapter(NerfstudioFrame).validate_python(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def transforms_document(
     frames: Sequence[tuple[str, Rigid3, NerfstudioFrame]],
     *,
     depth_unit: float,
-    about: Mapping[str, Any],
+    about: Mapping[str, Any] = MappingProxyType({}),
     file_from_world: NDArray[np.float64] | None = None,
     seed: str = "",
 ) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def transforms_document(
         frames: frames with their panorama's name and cam_from_world.
         depth_unit: scene units per step of the depths.
         about: further entries for readers, which nerfstudio ignores.
-        file_from_world: rotation (3, 3) of the cameras; None: they stay in the world frame.
+        file_from_world: rotation (3, 3) of the cameras, which the file states; None: they stay in the world frame.
         seed: path of the initial points relative to the file; empty without points.
     """
     if file_from_world is not None:
@@ -141,6 +141,8 @@ def transforms_document(
         listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
     model = _DISTORTED if any(frame.radial for _, _, frame in frames) else CAMERA_MODELS[variant]
     document = {"camera_model": model, **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    if file_from_world is not None:
+        document["file_from_world"] = file_from_world.tolist()
     if with_depth:
         document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
     return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}
@@ -159,16 +161,10 @@ def is_common_picture(path: Path) -> bool:
     with path.open("rb") as stream:
         start = stream.read(26)
         if start[:2] == JPEG_START:
-            return _jpeg_channels(start + stream.read()) == 3
+            data = start + stream.read()
+            frame = next((at for marker, at, _ in jpeg_segments(data) if marker in JPEG_FRAMES), None)
+            return frame is not None and data[frame + 5] == 3  # channels (ITU-T T.81, B.2.2)
     return start[:8] == PNG_START and start[24:26] == bytes([8, 2])  # 8 bits, RGB
-
-
-def _jpeg_channels(data: bytes) -> int:
-    """Return the number of channels in a JPEG's first start of frame (ITU-T T.81, B.2.2); 0 without one."""
-    for marker, start, _ in jpeg_segments(data):
-        if marker in JPEG_FRAMES:
-            return data[start + 5]
-    return 0
 
 
 def _listed(

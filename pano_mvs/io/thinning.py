@@ -87,7 +87,12 @@ def select_points(cloud: PointCloud, selection: Selection, scratch: Path) -> Sel
     if selection == Selection() or not len(cloud):
         return None
     voxel = selection.voxel
-    bits = _good_bits(cloud, selection)
+    bits = np.zeros(-(-len(cloud) // 8), np.uint8)
+    for chunk in chunks(len(cloud)):
+        good = cloud.view_counts[chunk] >= selection.min_views
+        if cloud.confidence is not None:
+            good &= cloud.confidence[chunk] >= selection.min_confidence
+        bits[chunk.start // 8 : -(-chunk.stop // 8)] = np.packbits(good, bitorder="little")
     if selection.max_points:
         voxel = voxel_for_count(cloud, SelectedPoints(bits, voxel=0), selection)
     if voxel:
@@ -107,7 +112,10 @@ def voxel_for_count(cloud: PointCloud, good: SelectedPoints, selection: Selectio
     share = max(1, selection.max_points // (1 << 14))
     if selection.voxel and _occupied(cloud, good, selection.voxel, share=share) <= selection.max_points:
         return selection.voxel
-    reach = _reach(cloud, good)
+    reach = 1e-6
+    for chunk in chunks(len(cloud)):
+        points = cloud.points_in_world[chunk][good.within(chunk)]
+        reach = max(reach, float(np.abs(points).max(initial=0)))
     smallest = max(selection.voxel, 2 * reach / (_MAX_INDEX - 2))
     # A rough model of rooms is a cube from −1 to 1, whose surface is 24.
     edge, slope = max(smallest, reach * np.sqrt(24.0 / wanted)), -2.0
@@ -125,25 +133,6 @@ def voxel_for_count(cloud: PointCloud, good: SelectedPoints, selection: Selectio
         aim = 0.5 * (1 + _FULL_ENOUGH) * wanted
         edge = max(smallest, float(np.exp(tried[-1][0] + (np.log(aim) - tried[-1][1]) / slope)))
     return min(fitting, default=edge)
-
-
-def _good_bits(cloud: PointCloud, selection: Selection) -> NDArray[np.uint8]:
-    bits = np.zeros(-(-len(cloud) // 8), np.uint8)
-    for chunk in chunks(len(cloud)):
-        good = cloud.view_counts[chunk] >= selection.min_views
-        if cloud.confidence is not None:
-            good &= cloud.confidence[chunk] >= selection.min_confidence
-        bits[chunk.start // 8 : -(-chunk.stop // 8)] = np.packbits(good, bitorder="little")
-    return bits
-
-
-def _reach(cloud: PointCloud, good: SelectedPoints) -> float:
-    """Return the largest absolute coordinate of the good points."""
-    reach = 1e-6
-    for chunk in chunks(len(cloud)):
-        points = cloud.points_in_world[chunk][good.within(chunk)]
-        reach = max(reach, float(np.abs(points).max(initial=0)))
-    return reach
 
 
 def _occupied(cloud: PointCloud, good: SelectedPoints, edge: float, *, share: int) -> int:

@@ -16,19 +16,14 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry.geodesy import earth_from_lla, earth_from_local
-from pano_mvs.io.meshes import ARRAY_BUFFER, FLOAT, write_glb_parts
+from pano_mvs.io.meshes import ARRAY_BUFFER, unlit_document, write_glb_parts
 from pano_mvs.scene import PointCloud
 
 _UINT16, _POINTS = 5123, 0
-_UNLIT = "KHR_materials_unlit"
 
 
 class TilesetWriter:
-    """The tiles of one tileset, written one after the other.
-
-    Attributes:
-        files: paths of the tiles and the tileset, by name.
-    """
+    """The tiles of one tileset, written one after the other."""
 
     def __init__(self, folder: Path, cloud: PointCloud, file_from_world: FloatArray, *, tile_points: int) -> None:
         """Take the folder to write to, the cloud, the rotation (3, 3) into axes with z up, and the points of a tile."""
@@ -38,7 +33,7 @@ class TilesetWriter:
         self._file_from_world = file_from_world
         self._bounds: dict[str, FloatArray] = {}
         self._errors: dict[str, float] = {}
-        self.files: dict[str, Path] = {}
+        self.files: dict[str, Path] = {}  # paths of the tiles and the tileset, by name
 
     def add(self, name: str, chosen: NDArray[np.int64], size: float) -> None:
         """Write the points of one node of the octree as NAME.glb.
@@ -107,25 +102,11 @@ def write_points_glb(path: Path, points: NDArray[np.float32], colors_rgb: NDArra
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     colors = np.full((len(points), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * linear).astype("<u2")[colors_rgb]
-    document = {
-        "asset": {"version": "2.0", "generator": "pano_mvs"},
-        "extensionsUsed": [_UNLIT],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0, "mode": _POINTS}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": {_UNLIT: {}}}],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": FLOAT,
-                "count": len(points),
-                "type": "VEC3",
-                "min": positions.min(axis=0).tolist(),
-                "max": positions.max(axis=0).tolist(),
-            },
-            {"bufferView": 1, "componentType": _UINT16, "normalized": True, "count": len(points), "type": "VEC4"},
-        ],
-    }
+    document = unlit_document(
+        {"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0, "mode": _POINTS},
+        {"pbrMetallicRoughness": {"metallicFactor": 0}},
+        positions,
+        {"componentType": _UINT16, "normalized": True, "count": len(points), "type": "VEC4"},
+    )
     views = [{"target": ARRAY_BUFFER}] * 2
     write_glb_parts(path, document, [positions.tobytes(), colors.tobytes()], views=views)

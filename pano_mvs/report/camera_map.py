@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
@@ -137,7 +138,8 @@ def camera_maps(
     centers = centers @ level_from_world.T
     places = np.array([place for _, place in marks], np.float64).reshape(-1, 3) @ level_from_world.T
     unit = "m" if poses.metric else "scene units"
-    labels = short_names(names)
+    short = [PurePosixPath(name).stem for name in names]
+    labels = short if len(set(short)) == len(short) else list(names)
     walk = _walk_of(poses.links, names)
     links = _chosen(poses.links, names, labels, reasons=reasons or {}, walk=walk)
     north = states_z_north(poses.frame)
@@ -180,12 +182,6 @@ def up_of(poses: PosesSummary) -> FloatArray:
     if not usable or states_y_down(poses.frame):
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
-
-
-def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without folder and extension if they stay distinct."""
-    short = [PurePosixPath(name).stem for name in names]
-    return short if len(set(short)) == len(short) else list(names)
 
 
 @dataclass(frozen=True)
@@ -253,10 +249,6 @@ def _words(link: PairLink, why: str) -> str:
     return f"{words}{why and f'; {why}'}"
 
 
-def _measured(length: float, unit: str) -> str:
-    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
-
-
 def _drawn(
     title: str,
     flat: FloatArray,
@@ -295,8 +287,8 @@ def _drawn(
     named = len(labels) <= 600
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
-    length = _round_length(100 / scale)
-    bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
+    length = bar_length(400 / scale)
+    bar = (14.0, height - 14.0, round(length * scale, 1), bar_text(length, unit))
     wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
     cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
     text = f"{cameras_text} {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
@@ -353,9 +345,3 @@ def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float
     if left < 2 or left + wide > _WIDTH - 2:
         return False
     return all(left + wide < other or other + width < left or abs(y - line) >= 16 for other, line, width in taken)
-
-
-def _round_length(longest: float) -> float:
-    """Return the largest length of the form 1, 2 or 5 × 10ⁿ that is not longer."""
-    power = 10.0 ** np.floor(np.log10(longest))
-    return float(next(step * power for step in (5, 2, 1) if step * power <= longest * (1 + 1e-9)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
@@ -370,11 +370,4 @@ def _image_width(values: StoredValues) -> int | None:
 def _mean(shares: list[Shares]) -> Shares | None:
     if not shares:
         return None
-    count = len(shares)
-    return Shares(
-        consistent=sum(one.consistent for one in shares) / count,
-        weak=sum(one.weak for one in shares) / count,
-        filled=sum(one.filled for one in shares) / count,
-        invalid=sum(one.invalid for one in shares) / count,
-        masked=sum(one.masked for one in shares) / count,
-    )
+    return Shares(*(sum(column) / len(shares) for column in zip(*map(astuple, shares), strict=True)))

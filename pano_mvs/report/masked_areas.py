@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from pano_mvs.algorithms.masks.areas import share_of_sphere
+from pano_mvs.algorithms.panoramas import nearest_resized
 from pano_mvs.core.arrays import Mask
 from pano_mvs.core.errors import InputError
 from pano_mvs.report.earlier_page import EarlierPage
@@ -121,7 +122,7 @@ def masked_kinds(panorama: Panorama, *, static: StaticMasks | None = None, sky: 
         "zenith": edges_deg[:-1] < panorama.zenith_deg,
         "static": _static(panorama, static, size_hw) & masked,
         "other": masked,
-        "sky": np.zeros(size_hw, np.bool_) if sky is None else _nearest(sky, size_hw),
+        "sky": np.zeros(size_hw, np.bool_) if sky is None else nearest_resized(sky, size_hw),
     }
     # Masks are enlarged by up to a pixel: what is left at the borders of other reasons is not one of its own.
     free = np.ones(size_hw, np.bool_)
@@ -143,11 +144,6 @@ def _static(panorama: Panorama, static: StaticMasks | None, size_hw: tuple[int, 
         return np.zeros(size_hw, np.bool_)
     pixels = static.pixels[static.cameras.index(camera)].astype(np.float32)
     return np.asarray(cv2.resize(pixels, size_hw[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5)
-
-
-def _nearest(pixels: Mask, size_hw: tuple[int, int]) -> Mask:
-    small = cv2.resize(np.ascontiguousarray(pixels, np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(small > 0)
 
 
 def _key(values: StoredValues, name: str, what: str) -> str:
@@ -200,6 +196,6 @@ def _picture(values: StoredValues, kept: EarlierPage, name: str, *, masks: Stati
         return None
     for kind in KINDS:
         if kind.name in kinds:
-            pixels = _nearest(kinds[kind.name], (image.shape[0], image.shape[1]))
+            pixels = nearest_resized(kinds[kind.name], (image.shape[0], image.shape[1]))
             image[pixels] = 0.5 * image[pixels] + 0.5 * np.array(kind.color_rgb, np.float32)
     return picture(image.astype(np.uint8), width=_WIDTH, most_bytes=MAX_BYTES, key=key)

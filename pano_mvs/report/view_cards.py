@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, scale_ticks
 from pano_mvs.report.earlier_page import EarlierPage
@@ -124,27 +125,6 @@ def range_ticks(near: float, far: float) -> Ticks:
     return tuple(found)
 
 
-def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return RGB colours (H, W, 3) of confidences (H, W): a hue per class, brighter if higher; invalid is grey."""
-    table = np.empty((256, 3), np.uint8)
-    table[0] = _INVALID
-    for (low, high), dark, bright in _CLASSES:
-        share = np.linspace(0, 1, high - low + 1)[:, None]
-        table[low : high + 1] = np.rint((1 - share) * np.array(dark) + share * np.array(bright))
-    return table[confidence]
-
-
-def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return relative standard deviations (H, W) in colours (H, W, 3) RGB, from dark to bright; invalid is grey."""
-    low, high = np.log(UNCERTAINTY_LIMITS)
-    known = np.isfinite(uncertainty)
-    share = (np.log(np.where(known, uncertainty, 1).astype(np.float32)) - low) / (high - low)
-    colors = cv2.applyColorMap(np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
-    rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
-    rgb[~known] = _INVALID
-    return rgb
-
-
 VERSION = 4  # raise it when the pictures change: earlier pages' are then drawn again
 MAX_CARDS = 36
 WIDTH = 768
@@ -242,7 +222,7 @@ def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits |
     range_map = results.range_map(name)
     if range_map is None:
         return None
-    small = _shrunk(range_map.range)
+    small = narrowed(range_map.range, WIDTH)
     if not np.isfinite(small).any():
         return None
     near, far = (float(f"{limit:.4g}") for limit in range_limits(small))
@@ -301,18 +281,29 @@ def _new_card(
 
 def _range_pictures(range_map: RangeMap, stem: str, scales: RangeScales) -> tuple[dict[str, Picture], Picture | None]:
     """Return the images of a range map, and its range on its own scale if that differs."""
-    ranges, confidence = _shrunk(range_map.range), _shrunk(range_map.confidence)
+    ranges, confidence = narrowed(range_map.range, WIDTH), narrowed(range_map.confidence, WIDTH)
 
     def colored(limits: Limits) -> NDArray[np.uint8]:
         return mark_unconfirmed(color_mapped(ranges, *limits), confidence)
 
+    table = np.empty((256, 3), np.uint8)  # a hue for each class of confidences, brighter if higher
+    table[0] = _INVALID
+    for (low, high), dark, bright in _CLASSES:
+        share = np.linspace(0, 1, high - low + 1)[:, None]
+        table[low : high + 1] = np.rint((1 - share) * np.array(dark) + share * np.array(bright))
     pictures = {
         "range": _part(colored(scales.common), stem, "range", file=scales.range_part),
-        "confidence": _part(confidence_colors(confidence), stem, "confidence"),
+        "confidence": _part(table[confidence], stem, "confidence"),
     }
     if range_map.uncertainty is not None:
-        colors = uncertainty_colors(_shrunk(range_map.uncertainty.astype(np.float32)))
-        pictures["uncertainty"] = _part(colors, stem, "uncertainty")
+        uncertainty = narrowed(range_map.uncertainty, WIDTH).astype(np.float32)
+        least, most = np.log(UNCERTAINTY_LIMITS)
+        known = np.isfinite(uncertainty)
+        steps = (np.log(np.where(known, uncertainty, 1).astype(np.float32)) - least) / (most - least)
+        colors = cv2.applyColorMap(np.rint(255 * np.clip(steps, 0, 1)).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
+        rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
+        rgb[~known] = _INVALID
+        pictures["uncertainty"] = _part(rgb, stem, "uncertainty")
     differs = scales.own is not None and scales.differ
     own = _part(colored(scales.own), stem, "own_range", file="own") if differs and scales.own else None
     return pictures, own
@@ -328,11 +319,3 @@ def _shares(range_map: RangeMap, mask: NDArray[np.bool_] | None) -> Shares:
 def _part(image: NDArray[np.uint8], stem: str, part: str, *, file: str = "") -> Picture:
     key = f"{stem}.{file or part}" if stem else ""
     return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MAX_BYTES[part], key=key)
-
-
-def _shrunk(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a map at its displayed size, without mixing values."""
-    if array.shape[1] <= WIDTH:
-        return np.ascontiguousarray(array)
-    size = WIDTH, round(array.shape[0] * WIDTH / array.shape[1])
-    return np.asarray(cv2.resize(np.ascontiguousarray(array), size, interpolation=cv2.INTER_NEAREST))

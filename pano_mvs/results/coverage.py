@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
@@ -81,6 +82,9 @@ def coverage(values: StoredValues, names: Sequence[str]) -> dict[str, ViewCovera
     return found
 
 
+_FACT = TypeAdapter(dict[str, ViewCoverage])
+
+
 def fact_of(found: Mapping[str, ViewCoverage]) -> dict[str, Any]:
     """Return what views see as a JSON value."""
     return {name: asdict(view) for name, view in found.items()}
@@ -89,22 +93,9 @@ def fact_of(found: Mapping[str, ViewCoverage]) -> dict[str, Any]:
 def coverage_from_fact(fact: Any) -> dict[str, ViewCoverage] | None:
     """Return what views see from the value of `fact_of`; None for other values."""
     try:
-        return {
-            str(name): ViewCoverage(
-                float(view["typical_range"]),
-                float(view["alone"]),
-                tuple(_area_from_fact(area) for area in view["areas"]),
-            )
-            for name, view in fact.items()
-        }
-    except (AttributeError, KeyError, TypeError, ValueError):
+        return _FACT.validate_python(fact)
+    except ValidationError:
         return None
-
-
-def _area_from_fact(fact: Mapping[str, Any]) -> LonelyArea:
-    x, y, z = (float(value) for value in fact["at"])
-    azimuth_deg, elevation_deg = float(fact["azimuth_deg"]), float(fact["elevation_deg"])
-    return LonelyArea(azimuth_deg, elevation_deg, float(fact["share"]), float(fact["distance"]), (x, y, z))
 
 
 def coverage_key(values: StoredValues, names: Sequence[str]) -> str:

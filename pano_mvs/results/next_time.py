@@ -37,7 +37,14 @@ class CameraGroup:
         centers = np.array(poses.centers, np.float64).reshape(-1, 3)
         if len(centers) != len(poses.registered) or len(centers) < 2 or not np.isfinite(centers).all():
             return None
-        return CameraGroup(number, poses, centers, nearest_neighbours(centers), coverage)
+        count = len(centers)
+        found = cKDTree(centers).query(centers, k=min(count, 7))
+        distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
+        near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
+        own = near == np.arange(count)[:, None]
+        own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
+        neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
+        return CameraGroup(number, poses, centers, neighbours, coverage)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,18 +74,6 @@ class CameraGroup:
         return None if known is None else known.typical_range
 
 
-def nearest_neighbours(centers: FloatArray) -> NDArray[np.intp]:
-    """Return up to six nearest others of each point (N, 3), (N, K), nearest first; N > 1."""
-    count = len(centers)
-    found = cKDTree(centers).query(centers, k=min(count, 7))
-    distance, unordered = np.asarray(found[0], np.float64), np.asarray(found[1], np.intp)
-    near: NDArray[np.intp] = np.take_along_axis(unordered, np.lexsort((unordered, distance)), axis=1)
-    own = near == np.arange(count)[:, None]
-    own[~own.any(axis=1), -1] = True  # of many points in one place, the point itself may not be among the nearest
-    neighbours: NDArray[np.intp] = near[~own].reshape(count, -1)
-    return neighbours
-
-
 def shortest_tree(centers: FloatArray) -> list[tuple[int, int, float]]:
     """Return (first, second, length) of the edges of the minimum spanning tree of points (N, 3), by Prim's method."""
     count = len(centers)
@@ -104,8 +99,6 @@ MIN_CAMERAS = 4
 LONG_BASELINE, SHORT_BASELINE = 0.8, 0.03
 """Distance of a camera to its neighbours relative to its median range: above is too long, below too short."""
 
-_USEFUL_GAP = 0.1  # a gap below this share of the median range costs nothing
-_GOOD_BASELINE = 0.05, 0.2
 _WEAK = 0.5  # of the median share that other views confirm
 _MAX_UNREGISTERED = 4
 
@@ -268,8 +261,9 @@ def _spacing(group: CameraGroup, found: _Collected) -> None:
     typical = median([length for _, _, length in edges]) or 0.0
     for first, second, length in edges if len(group.names) >= MIN_CAMERAS and typical > 0 else ():
         ranges = [known for idx in (first, second) if (known := group.typical_range(idx)) is not None]
-        # Cameras are far apart if their distance is more than this many times the median distance of neighbours.
-        if length > 2.0 * typical and (not ranges or length > _USEFUL_GAP * min(ranges)):
+        # Cameras are far apart if their distance is more than this many times the median distance of neighbours; a gap
+        # below a tenth of the median range costs nothing.
+        if length > 2.0 * typical and (not ranges or length > 0.1 * min(ranges)):
             reason = (
                 f"they are {group.length(length)} apart; the median distance between neighbours is "
                 f"{group.length(typical)}"
@@ -304,7 +298,7 @@ def _all_too_close(group: CameraGroup, found: _Collected) -> None:
         return
     worst = min(close, key=ratios.__getitem__)
     middle = median([group.typical_range(idx) for idx in close]) or 0.0
-    low, high = (significant(factor * middle) for factor in _GOOD_BASELINE)
+    low, high = (significant(factor * middle) for factor in (0.05, 0.2))
     names = shortened_list(group.names[idx] for idx in close)
     reason = (
         f"{len(close)} of {len(group.names)} panoramas ({names}) have their nearest neighbours within "

@@ -89,9 +89,6 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
 
 
 _RED_YELLOW_GREEN = np.array([(199, 38, 74), (250, 204, 77), (26, 153, 115)], np.float64)
-PROBABILITIES = 0.5, 5 / 6, 0.99
-"""The probabilities that are red, yellow and green: as likely wrong, the default limit of a doubt, and as sure as can
-be."""
 
 
 def ramp_rgb(values: ArrayLike, stops: tuple[float, float, float]) -> NDArray[np.uint8]:
@@ -103,4 +100,5 @@ def ramp_rgb(values: ArrayLike, stops: tuple[float, float, float]) -> NDArray[np
 
 def probability_color(probability: float) -> str:
     """Return the colour of a probability that a pose is right, as `#rrggbb`."""
-    return f"#{bytes(ramp_rgb(probability, PROBABILITIES)).hex()}"
+    # As likely wrong, the default limit of a doubt, and as sure as can be.
+    return f"#{bytes(ramp_rgb(probability, (0.5, 5 / 6, 0.99))).hex()}"

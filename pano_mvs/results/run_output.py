@@ -37,18 +37,13 @@ class RunOutput:
 
     Values are loaded from the cache of the run or, if it was deleted, from the files in the output folder, if the
     workflow exports them. Values that the run did not produce are None.
-
-    Attributes:
-        out: the output folder.
-        summary: what run.json holds.
-        values: the values in the cache.
-        written: files that this run wrote, relative to the output folder; empty for a run that was loaded.
     """
 
     def __init__(self, out: Path, summary: RunSummary, values: StoredValues, *, written: tuple[str, ...] = ()) -> None:
-        self.out = out
-        self.summary = summary
-        self.values = values
+        self.out = out  # the output folder
+        self.summary = summary  # what run.json holds
+        self.values = values  # the values in the cache
+        # files that this run wrote, relative to the output folder; empty for a run that was loaded
         self.written = written
 
     @cached_property
@@ -120,7 +115,28 @@ class RunOutput:
 
     def _repr_html_(self) -> str:
         """Return the run for a notebook: the verdict, pictures of some views, and the stages."""
-        return run_html(self)
+        verdict = self.verdict
+        title = f"<b>{escape(self.summary.workflow.name or 'pano-mvs')}</b>: {escape(verdict.outcome)}."
+        judgement = f'<b style="color:{_COLORS[verdict.mood]}">{escape(verdict.judgement)}</b>'
+        tiles = " · ".join(f"<b>{escape(tile.value)}</b> {escape(tile.label)}" for tile in verdict.tiles)
+        findings = "".join(f"<li>{escape(found.text)} {escape(found.remedy)}</li>" for found in verdict.findings)
+        names = ("run", "cached", "failed", "blocked")
+        head = "".join(f"<th>{name}</th>" for name in ("stage", "use", *names, "time"))
+        rows = "".join(
+            f"<tr><td>{escape(stage.name)}</td><td>{escape(stage.use)}</td>"
+            + "".join(f"<td>{figure(getattr(stage, name))}</td>" for name in names)
+            + f"<td>{duration(stage.seconds)}</td></tr>"
+            for stage in self.summary.stages
+        )
+        parts = [
+            f"<p>{title} {judgement} {escape(verdict.sentence)}</p>",
+            f"<p>{tiles}</p>" if tiles else "",
+            f"<ul>{findings}</ul>" if findings else "",
+            "".join(_view_html(self.views[name]) for name in evenly_spaced(list(self.views), 6)),
+            f"<table><tr>{head}</tr>{rows}</table>" if rows else "",
+            f"<p>{escape(str(self.out))}</p>",
+        ]
+        return f"<div>{''.join(parts)}</div>"
 
 
 class Views(Mapping[str, "RunView"]):
@@ -220,24 +236,6 @@ _MAX_BYTES = 40_000
 _COLORS = {"good": "#1a7f37", "fair": "#9a6700", "bad": "#cf222e", "": "inherit"}
 
 
-def run_html(run: RunOutput) -> str:
-    """Return the verdict, images of some views, and a table of the stages, as self-contained HTML."""
-    verdict = run.verdict
-    title = f"<b>{escape(run.summary.workflow.name or 'pano-mvs')}</b>: {escape(verdict.outcome)}."
-    judgement = f'<b style="color:{_COLORS[verdict.mood]}">{escape(verdict.judgement)}</b>'
-    tiles = " · ".join(f"<b>{escape(tile.value)}</b> {escape(tile.label)}" for tile in verdict.tiles)
-    findings = "".join(f"<li>{escape(found.text)} {escape(found.remedy)}</li>" for found in verdict.findings)
-    parts = [
-        f"<p>{title} {judgement} {escape(verdict.sentence)}</p>",
-        f"<p>{tiles}</p>" if tiles else "",
-        f"<ul>{findings}</ul>" if findings else "",
-        "".join(_view_html(run.views[name]) for name in evenly_spaced(list(run.views), 6)),
-        _stages_html(run),
-        f"<p>{escape(str(run.out))}</p>",
-    ]
-    return f"<div>{''.join(parts)}</div>"
-
-
 def _view_html(view: RunView) -> str:
     pictures = _pictures(view)
     if not pictures:
@@ -261,18 +259,6 @@ def _pictures(view: RunView) -> Iterable[tuple[str, Picture]]:
             colors = mark_unconfirmed(colors, view.confidence)
         found.append(("range map", picture(colors, width=_WIDTH, most_bytes=_MAX_BYTES)))
     return found
-
-
-def _stages_html(run: RunOutput) -> str:
-    names = ("run", "cached", "failed", "blocked")
-    head = "".join(f"<th>{name}</th>" for name in ("stage", "use", *names, "time"))
-    rows = "".join(
-        f"<tr><td>{escape(stage.name)}</td><td>{escape(stage.use)}</td>"
-        + "".join(f"<td>{figure(getattr(stage, name))}</td>" for name in names)
-        + f"<td>{duration(stage.seconds)}</td></tr>"
-        for stage in run.summary.stages
-    )
-    return f"<table><tr>{head}</tr>{rows}</table>" if rows else ""
 
 
 def load(out: str | Path, *, cache: str | Path | None = None) -> RunOutput:

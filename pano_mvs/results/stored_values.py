@@ -68,7 +68,13 @@ class StoredValues:
             note = "run.json was written by an earlier version and lists no results: run again to see images"
             return StoredValues(notes=[note])
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
-        _find_images(store, summary, refs.get("images", {}))
+        last = summary.results.get("images")  # the source, or a stage that masks its images
+        sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
+        folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
+        for name, ref in refs.get("images", {}).items() if folder else ():
+            path = summary.source_file(name, Path(str(folder)))
+            if path is not None and any(part.external for part in ref.parts.values()):
+                store.blobs.register_external(path)
         return StoredValues(store, refs)
 
     @property
@@ -163,14 +169,3 @@ class _Recorded(Mapping[str, ItemRef]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
-
-
-def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
-    """Register the user's images with the store, which knows only their digests."""
-    last = summary.results.get("images")  # the source, or a stage that masks its images
-    sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
-    folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
-    for name, ref in refs.items() if folder else ():
-        path = summary.source_file(name, Path(str(folder)))
-        if path is not None and any(part.external for part in ref.parts.values()):
-            store.blobs.register_external(path)

@@ -47,73 +47,43 @@ class RunSummary(Entry):
     ('fast', False, 'depth')
     >>> RunSummary.from_json(summary.to_json()) == summary
     True
-
-    Attributes:
-        schema_version: of run.json, where it is called `schema`; fields may be added to a version, none changes.
-        workflow: what ran.
-        cache: folder of the cache; empty if it is not known.
-        version: of pano_mvs.
-        started: date and time, ISO 8601 in UTC.
-        machine: processor, number of cores and memory.
-        executor: its name, number of workers, and threads of each.
-        seconds: that the run took; None if it is not known.
-        exit_code: 0 finished; 1 internal error; 2 unusable workflow or input; 3 finished with failed or doubtful items;
-            4 stopped by a quality threshold or a safety check; 130 interrupted.
-        stopped: why the run ended early; empty if it did not.
-        units: number of units, by outcome.
-        stages: those that began, in the order of the workflow.
-        failures: units that failed.
-        blocked: units that could not run because others failed.
-        rejected: image that a stage left out to the reason.
-        doubts: image that a stage finds doubtful to the reason.
-        warnings: such as damaged files in the cache that were computed again.
-        notes: of the stages.
-        results: role (`images`, `pairs`, `poses`, `ranges`, `cloud`, `static`) to the stage that made the final values.
-        poses: the cameras.
-        scores: of the first stage that compares with the ground truth.
-        all_scores: scores by stage, if several branches were compared.
-        views: the final range maps.
-        cloud: the fused cloud.
-        workflow_text: the workflow as it was read.
-        versions: library to version.
-        files: file in the output folder to its digest.
-        left_over: existing files of earlier runs that this run did not write, with their digests.
-        verdict: whether the result is reliable; None if the run ended before it could be judged.
-        merged: the blocks, if the folder holds merged runs and not a run.
-        inputs: file that a source read to its digest.
     """
 
+    # of run.json, where it is called `schema`; fields may be added to a version, none changes
     schema_version: int = Field(default=SCHEMA, alias="schema")
-    workflow: WorkflowSummary = WorkflowSummary()
-    cache: str = ""
-    version: str = ""
-    started: str = ""
-    machine: Mapping[str, Number | str] = {}
-    executor: Mapping[str, Number | str] = {}
-    seconds: float | None = None
+    workflow: WorkflowSummary = WorkflowSummary()  # what ran
+    cache: str = ""  # folder of the cache; empty if it is not known
+    version: str = ""  # of pano_mvs
+    started: str = ""  # date and time, ISO 8601 in UTC
+    machine: Mapping[str, Number | str] = {}  # processor, number of cores and memory
+    executor: Mapping[str, Number | str] = {}  # its name, number of workers, and threads of each
+    seconds: float | None = None  # that the run took; None if it is not known
+    # 0 finished; 1 internal error; 2 unusable workflow or input; 3 finished with failed or doubtful items; 4 stopped by
+    # a quality threshold or a safety check; 130 interrupted
     exit_code: int = 0
-    stopped: str = ""
-    units: UnitCounts = UnitCounts()
-    stages: tuple[StageOutcome, ...] = ()
-    failures: tuple[FailedUnit, ...] = ()
-    blocked: tuple[BlockedUnit, ...] = ()
-    rejected: Mapping[str, ImageReason] = {}
-    doubts: Mapping[str, ImageReason] = {}
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    stopped: str = ""  # why the run ended early; empty if it did not
+    units: UnitCounts = UnitCounts()  # number of units, by outcome
+    stages: tuple[StageOutcome, ...] = ()  # those that began, in the order of the workflow
+    failures: tuple[FailedUnit, ...] = ()  # units that failed
+    blocked: tuple[BlockedUnit, ...] = ()  # units that could not run because others failed
+    rejected: Mapping[str, ImageReason] = {}  # image that a stage left out to the reason
+    doubts: Mapping[str, ImageReason] = {}  # image that a stage finds doubtful to the reason
+    warnings: tuple[str, ...] = ()  # such as damaged files in the cache that were computed again
+    notes: tuple[str, ...] = ()  # of the stages
+    # role (`images`, `pairs`, `poses`, `ranges`, `cloud`, `static`) to the stage that made the final values
     results: Mapping[str, str] = {}
-    poses: PosesSummary = PosesSummary()
-    scores: ScoresSummary = ScoresSummary()
-    all_scores: Mapping[str, ScoresSummary] = {}
-    views: tuple[ViewSummary, ...] = ()
-    cloud: CloudSummary = CloudSummary()
-    workflow_text: str = ""
-    versions: Mapping[str, str] = {}
-    files: Mapping[str, str] = {}
-    left_over: Mapping[str, str] = {}
-    verdict: Verdict | None = None
-    merged: MergedSummary | None = None
-    inputs: Mapping[str, str] = {}
+    poses: PosesSummary = PosesSummary()  # the cameras
+    scores: ScoresSummary = ScoresSummary()  # of the first stage that compares with the ground truth
+    all_scores: Mapping[str, ScoresSummary] = {}  # scores by stage, if several branches were compared
+    views: tuple[ViewSummary, ...] = ()  # the final range maps
+    cloud: CloudSummary = CloudSummary()  # the fused cloud
+    workflow_text: str = ""  # the workflow as it was read
+    versions: Mapping[str, str] = {}  # library to version
+    files: Mapping[str, str] = {}  # file in the output folder to its digest
+    left_over: Mapping[str, str] = {}  # existing files of earlier runs that this run did not write, with their digests
+    verdict: Verdict | None = None  # whether the result is reliable; None if the run ended before it could be judged
+    merged: MergedSummary | None = None  # the blocks, if the folder holds merged runs and not a run
+    inputs: Mapping[str, str] = {}  # file that a source read to its digest
 
     @staticmethod
     def from_json(value: object) -> RunSummary:

@@ -34,24 +34,21 @@ class Files(Record):
             require(inside and bool(path.parts), self, f"target {target!r} is not inside the output folder")
 
     def to_parts(self) -> Parts:
-        """Return the files under numbers, and their targets as JSON."""
-        targets = sorted(self.files)
-        parts: dict[str, FilePart | dict[str, list[str]]] = {"meta": {"targets": targets}}
-        for number, target in enumerate(targets):
-            parts[str(number)] = FilePart(self.files[target])
-        return parts
+        """Return the files under numbers, and their targets and all other fields as JSON."""
+        meta = super().to_parts()["meta"]
+        assert isinstance(meta, dict)
+        targets = sorted(meta.pop("files"))
+        numbered = {str(number): FilePart(self.files[target]) for number, target in enumerate(targets)}
+        return {"meta": {"targets": targets, **meta}, **numbered}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
         """Return the record from the result of `to_parts`; its files are in the store."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
-        files: dict[str, Path] = {}
-        for number, target in enumerate(meta["targets"]):
-            part = parts[str(number)]
-            assert isinstance(part, FilePart)
-            files[target] = part.path
-        return cls(files)
+        numbered = {name: part.path for name, part in parts.items() if isinstance(part, FilePart)}
+        files = {target: numbered[str(number)] for number, target in enumerate(meta["targets"])}
+        return super().from_parts({"meta": meta | {"files": files}})
 
 
 def group_file(name: str, group: int) -> str:
@@ -110,22 +107,6 @@ class FaceFiles(Files):
         Files.check(self)
         require(self.size_px > 0, self, f"size_px must be positive, got {self.size_px}")
 
-    def to_parts(self) -> Parts:
-        """Return the files as `Files` does, with the layout in `meta`."""
-        parts = dict(Files.to_parts(self))
-        meta = parts["meta"]
-        assert isinstance(meta, dict)
-        cut = {"layout": self.layout, "fov_deg": self.fov_deg, "size_px": self.size_px, "suffix": self.suffix}
-        return parts | {"meta": meta | cut}
-
-    @classmethod
-    def from_parts(cls, parts: Parts) -> Self:
-        """Return the record from the result of `to_parts`."""
-        meta = parts["meta"]
-        assert isinstance(meta, dict)
-        files = Files.from_parts(parts).files
-        return cls(files, meta["layout"], meta["fov_deg"], meta["size_px"], meta["suffix"])
-
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -142,19 +123,3 @@ class LevelPanorama(Files):
     level_from_world: Rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     # compass heading of the middle of the picture, or None if north is not known
     heading_deg: float | None = None
-
-    def to_parts(self) -> Parts:
-        """Return the files under numbers, their targets and the rotation as JSON."""
-        parts = dict(super().to_parts())
-        meta = parts["meta"]
-        assert isinstance(meta, Mapping)
-        own = {"picture": self.picture, "level_from_world": self.level_from_world, "heading_deg": self.heading_deg}
-        return parts | {"meta": {**meta, **own}}
-
-    @classmethod
-    def from_parts(cls, parts: Parts) -> Self:
-        """Return the record from the result of `to_parts`."""
-        meta = parts["meta"]
-        assert isinstance(meta, Mapping)
-        rows = tuple(tuple(map(float, row)) for row in meta["level_from_world"])
-        return cls(Files.from_parts(parts).files, meta["picture"], rows, meta["heading_deg"])

@@ -54,7 +54,16 @@ def join_groups(
     """
     order = tuple(name for group in groups for name in group.names) if order is None else tuple(order)
     position = {name: idx for idx, name in enumerate(order)}
-    _require_joinable(groups, position)
+    if not groups:
+        raise UsageError("there is no group to join")
+    if any(group.other_worlds for group in groups):
+        raise UsageError("a group that is joined must not have groups itself; split it first")
+    names = [name for group in groups for name in group.names]
+    if len(set(names)) < len(names):
+        raise UsageError("an image is in two groups")
+    missing = [name for name in names if name not in position]
+    if missing:
+        raise UsageError(f"the order of the images does not have {missing[0]!r}")
     reasons = {**(rejected or {})}
     for group in groups:
         reasons |= group.rejected
@@ -137,19 +146,6 @@ def _renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int32]:
     return positions
 
 
-def _require_joinable(groups: Sequence[Poses], position: Mapping[str, int]) -> None:
-    if not groups:
-        raise UsageError("there is no group to join")
-    if any(group.other_worlds for group in groups):
-        raise UsageError("a group that is joined must not have groups itself; split it first")
-    names = [name for group in groups for name in group.names]
-    if len(set(names)) < len(names):
-        raise UsageError("an image is in two groups")
-    missing = [name for name in names if name not in position]
-    if missing:
-        raise UsageError(f"the order of the images does not have {missing[0]!r}")
-
-
 def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses:
     """Return groups, numbered as they come, with their cameras in the capture's order."""
     names = [name for group in groups for name in group.names]
@@ -164,6 +160,7 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
     points = [group.track_point_idx + np.int32(first) for group, first in zip(groups, first_point, strict=False)]
     images = [group.track_image_idx + np.int32(first) for group, first in zip(groups, first_camera, strict=False)]
     numbers = np.repeat(np.arange(len(groups), dtype=np.int32), np.diff(first_camera))
+    known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
     return replace(
         groups[0],
         names=tuple(names[idx] for idx in order),
@@ -175,18 +172,12 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         track_point_idx=np.concatenate(points),
         track_image_idx=place[np.concatenate(images)],
         track_bearings=joined("track_bearings"),
-        track_sigmas_rad=_joined_sigmas(groups),
+        track_sigmas_rad=np.concatenate(known) if len(known) == len(groups) else None,
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
         doubts={name: why for group in groups for name, why in group.doubts.items()},
         **_joined_values(groups, order),
     )
-
-
-def _joined_sigmas(groups: Sequence[Poses]) -> NDArray[np.float32] | None:
-    """Return the sigmas of all groups' observations, or None if those of a group are unknown."""
-    known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
-    return np.concatenate(known) if len(known) == len(groups) else None
 
 
 def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:

@@ -23,14 +23,6 @@ StereoLayout: TypeAlias = Literal["none", "top_bottom", "left_right"]
 _SIZE_HW = (64, 128)
 
 
-def layout_by_shape(size_hw: tuple[int, int]) -> StereoLayout:
-    """Return how two full spheres would be arranged in a picture of this size, "none" if they could not."""
-    height, width = size_hw
-    if height and width == height:
-        return "top_bottom"
-    return "left_right" if height and width == 4 * height else "none"
-
-
 def eye_size_hw(size_hw: tuple[int, int], layout: StereoLayout) -> tuple[int, int]:
     """Return the size of what `one_eye` returns."""
     height, width = size_hw
@@ -114,6 +106,8 @@ def stereo_layout(
                 "only half of the sphere and cannot be used. If each eye shows the full sphere, set stereo: left_right"
             )
         return stated
-    layout = layout_by_shape(size_hw)
+    height, width = size_hw
+    by_shape: dict[int, StereoLayout] = {height: "top_bottom", 4 * height: "left_right"}
+    layout = by_shape.get(width, "none") if height else "none"
     shown = None if layout == "none" else picture()
     return layout if shown is not None and is_stereo(shown, layout) else "none"

@@ -34,8 +34,7 @@ def mean_up_direction(rotations: ArrayLike) -> NDArray[np.float64] | None:
     return mean / length if length > 0.5 else None
 
 
-_Z_UP_FROM_Y_DOWN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_Y_UP_FROM_Z_UP: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+_QUARTER_TURN: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 _STATES_DOWN: Final = re.compile(r"\by down\b")
 _STATES_NORTH: Final = re.compile(r"\bz north\b")
 
@@ -74,7 +73,7 @@ def z_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
     Args:
         up: (3,) unit vector, the up direction in the world; see `world_up`.
     """
-    rotation = np.array(_Z_UP_FROM_Y_DOWN) @ rotation_from_two_vectors(up, WORLD_UP)
+    rotation = np.array(_QUARTER_TURN) @ rotation_from_two_vectors(up, WORLD_UP)
     # An exchange of axes is exact; adding 0 turns −0 into 0.
     exact = np.round(rotation)
     return (exact if np.allclose(rotation, exact, rtol=0, atol=1e-12) else rotation) + 0.0
@@ -86,4 +85,4 @@ def y_up_from_world(up: ArrayLike = WORLD_UP) -> FloatArray:
     For `up` = −y, it maps (x, y, z) to (x, −y, −z). It agrees with `z_up_from_world` in the way in which programs with
     z up import glTF: (x, y, z) of a file with y up is (x, −z, y) with z up.
     """
-    return np.array(_Y_UP_FROM_Z_UP) @ z_up_from_world(up) + 0.0
+    return np.array(_QUARTER_TURN) @ z_up_from_world(up) + 0.0

@@ -30,19 +30,12 @@ from pano_mvs.session.session import Session, check_output, open_session
 
 @dataclass(frozen=True, slots=True)
 class RunPlan:
-    """What a run would compute, and what that is expected to take.
+    """What a run would compute, and what that is expected to take."""
 
-    Attributes:
-        stages: in the order of the workflow.
-        forecasts: what each stage is expected to take, by earlier runs with this cache.
-        workers: number of units at a time for which `seconds` holds.
-        report_s: expected seconds for the report; 0 if unknown.
-    """
-
-    stages: tuple[StagePlan, ...]
-    forecasts: tuple[StageForecast, ...] = ()
-    workers: int = 1
-    report_s: float = 0.0
+    stages: tuple[StagePlan, ...]  # in the order of the workflow
+    forecasts: tuple[StageForecast, ...] = ()  # what each stage is expected to take, by earlier runs with this cache
+    workers: int = 1  # number of units at a time for which `seconds` holds
+    report_s: float = 0.0  # expected seconds for the report; 0 if unknown
 
     def __getitem__(self, stage: str) -> StagePlan:
         """Return the plan of one stage.

@@ -64,40 +64,25 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class RunStarted:
-    """The run begins.
-
-    Attributes:
-        workflow: its name.
-        stages: names of its stages, in order.
-        executor: such as `processes`.
-        workers: number of units at a time.
-        threads: of each worker.
-        out: the output folder.
-        cache: the folder of the cache.
-    """
+    """The run begins."""
 
     kind: ClassVar[str] = "run_started"
-    workflow: str
-    stages: tuple[str, ...]
-    executor: str
-    workers: int
-    threads: int
-    out: Path
-    cache: Path = Path()
+    workflow: str  # its name
+    stages: tuple[str, ...]  # names of its stages, in order
+    executor: str  # such as `processes`
+    workers: int  # number of units at a time
+    threads: int  # of each worker
+    out: Path  # the output folder
+    cache: Path = Path()  # the folder of the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What the run is expected to take, by earlier runs; this event is missing if the images cannot be listed.
-
-    Attributes:
-        stages: in the order of the workflow.
-        report_s: seconds for the report, after the last stage.
-    """
+    """What the run is expected to take, by earlier runs; this event is missing if the images cannot be listed."""
 
     kind: ClassVar[str] = "forecast"
-    stages: tuple[StageForecast, ...]
-    report_s: float = 0.0
+    stages: tuple[StageForecast, ...]  # in the order of the workflow
+    report_s: float = 0.0  # seconds for the report, after the last stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,33 +91,22 @@ class TimeLeft:
 
     Units that take minutes give no events except, every five seconds, this one; executor `serial` not even that. To
     show the time left at any moment, pass all events to a `pano_mvs.session.time_estimator.TimeEstimator`, and ask it.
-
-    Attributes:
-        seconds_left: until the run ends.
-        at_least: whether this is a lower bound, because nothing is known of some stages yet.
-        done: share of the work that is done, 0 to 1.
-        unknown: the stages of which nothing is known.
     """
 
     kind: ClassVar[str] = "time_left"
-    seconds_left: float
-    at_least: bool = False
-    done: float = 0.0
-    unknown: tuple[str, ...] = ()
+    seconds_left: float  # until the run ends
+    at_least: bool = False  # whether this is a lower bound, because nothing is known of some stages yet
+    done: float = 0.0  # share of the work that is done, 0 to 1
+    unknown: tuple[str, ...] = ()  # the stages of which nothing is known
 
 
 @dataclass(frozen=True, slots=True)
 class KernelsCompiled:
-    """Workers are compiling kernels, which happens once for a version; this event comes at most once a second.
-
-    Attributes:
-        kernels: number of kernels that have been compiled during the run.
-        seconds: since the number was looked up last.
-    """
+    """Workers are compiling kernels, which happens once for a version; this event comes at most once a second."""
 
     kind: ClassVar[str] = "kernels_compiled"
-    kernels: int
-    seconds: float
+    kernels: int  # number of kernels that have been compiled during the run
+    seconds: float  # since the number was looked up last
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,52 +127,31 @@ class Divided:
 
 @dataclass(frozen=True, slots=True)
 class BlockStarted:
-    """A run in blocks begins with a block, which is a run with events of its own.
-
-    Attributes:
-        block: its name, such as block_2.
-        number: the same as a number, from 1.
-        blocks: number of all blocks.
-        images: number of its images.
-        images_left: number of images of the blocks after it.
-    """
+    """A run in blocks begins with a block, which is a run with events of its own."""
 
     kind: ClassVar[str] = "block_started"
-    block: str
-    number: int
-    blocks: int
-    images: int
-    images_left: int
+    block: str  # its name, such as block_2
+    number: int  # the same as a number, from 1
+    blocks: int  # number of all blocks
+    images: int  # number of its images
+    images_left: int  # number of images of the blocks after it
 
 
 @dataclass(frozen=True, slots=True)
 class RunFinished:
-    """The run has ended, also if it was interrupted or raised an error.
-
-    Attributes:
-        exit_code: as of `RunSummary`.
-        stopped: why it ended early; empty if it did not.
-        run: number of computed units.
-        cached: units taken from the cache.
-        failed: units without a result.
-        blocked: units that did not run because an input failed.
-        seconds: that the run took.
-        out: the output folder.
-        verdict: on the result; None if the run was aborted.
-        doubts: doubtful image to the reason.
-    """
+    """The run has ended, also if it was interrupted or raised an error."""
 
     kind: ClassVar[str] = "run_finished"
-    exit_code: int
-    stopped: str
-    run: int = 0
-    cached: int = 0
-    failed: int = 0
-    blocked: int = 0
-    seconds: float = 0.0
-    out: Path = Path()
-    verdict: Verdict | None = None
-    doubts: Mapping[str, str] = field(default_factory=dict)
+    exit_code: int  # as of `RunSummary`
+    stopped: str  # why it ended early; empty if it did not
+    run: int = 0  # number of computed units
+    cached: int = 0  # units taken from the cache
+    failed: int = 0  # units without a result
+    blocked: int = 0  # units that did not run because an input failed
+    seconds: float = 0.0  # that the run took
+    out: Path = Path()  # the output folder
+    verdict: Verdict | None = None  # on the result; None if the run was aborted
+    doubts: Mapping[str, str] = field(default_factory=dict)  # doubtful image to the reason
 
 
 Event = (

@@ -40,29 +40,20 @@ MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
 @dataclass(frozen=True, slots=True)
 class Execution:
-    """How the units of a run are computed.
+    """How the units of a run are computed."""
 
-    Attributes:
-        executor: `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by
-            the other settings and this machine.
-        workers: number of units at a time; 0 for one per core, if memory permits.
-        threads: of each worker; 0 for an equal share of the cores.
-        scheduler: address of a dask scheduler.
-        queue: YAML file with the settings of jobs, for a queueing system.
-        min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
-            of $PANO_MVS_MIN_FREE, or else 200 MB.
-        durable: whether to flush every result to disk.
-        otel: whether to send the run, its stages and units as spans to an OpenTelemetry collector.
-    """
-
+    # `serial`, `processes`, `dask`, or a queueing system: `slurm`, `pbs`, `lsf`, `sge`; empty to choose by the other
+    # settings and this machine
     executor: str = ""
-    workers: int = 0
-    threads: int = 0
-    scheduler: str = ""
-    queue: Path | None = None
+    workers: int = 0  # number of units at a time; 0 for one per core, if memory permits
+    threads: int = 0  # of each worker; 0 for an equal share of the cores
+    scheduler: str = ""  # address of a dask scheduler
+    queue: Path | None = None  # YAML file with the settings of jobs, for a queueing system
+    # free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value of
+    # $PANO_MVS_MIN_FREE, or else 200 MB
     min_free: str = ""
-    durable: bool = False
-    otel: bool = False
+    durable: bool = False  # whether to flush every result to disk
+    otel: bool = False  # whether to send the run, its stages and units as spans to an OpenTelemetry collector
 
 
 def _check_not_merged(out: Path) -> None:
@@ -82,7 +73,10 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
     """Run an open session, all images at once; see `pano_mvs.run`."""
     check_output(session)
     _check_not_merged(session.out)
-    set_aside_foreign_files(session.out)
+    if not exists(session.out / OUTPUT_MARK):
+        for path in (session.out / RUN_JSON, session.out / "report.html"):
+            if is_file(path):
+                set_aside(path)
     min_free = min_free_bytes(execution.min_free)
     store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)
     executor = make_executor(
@@ -189,14 +183,6 @@ def _counted(run: Run | None, end: RunFinished) -> RunFinished:
     return replace(end, **{name: sum(getattr(stage, name) for stage in stages) for name in names})
 
 
-def set_aside_foreign_files(out: Path) -> None:
-    """Rename files that the run is about to write, unless an earlier run wrote into the folder."""
-    if not exists(out / OUTPUT_MARK):
-        for path in (out / RUN_JSON, out / "report.html"):
-            if is_file(path):
-                set_aside(path)
-
-
 def earlier_files(out: Path) -> dict[str, str]:
     """Return the files that an earlier run wrote into a folder, with their digests; empty if unknown."""
     try:
@@ -217,7 +203,17 @@ def write_outputs(run: Run, *, started: datetime, clock: float) -> tuple[RunSumm
     Raises:
         StoreError: if a file cannot be written; run.json is written first.
     """
-    add_dense_doubts(run)
+    poses = latest(run, Poses)
+    stage = _compared_stage(run)
+    if poses is not None and stage:
+        name, figures = stage
+        groups, centers = poses.groups, poses.centers
+        for group in range(len(poses.worlds)):
+            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
+            for image, reason in view_doubts(figures, inside).items():
+                run.result.doubts.setdefault(image, (name, reason))
+    if run.result.doubts and run.result.exit_code == 0:
+        run.result.exit_code = FAILED_ITEMS
     summary = summarise(run, started=started, seconds=time.perf_counter() - clock)
     values = StoredValues.of_run(run, summary.results)
     try:
@@ -244,25 +240,6 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
 
 
 _FIGURES = tuple(Agreement.__dataclass_fields__)
-
-
-def add_dense_doubts(run: Run) -> None:
-    """Mark views that other views contradict as doubtful, so that the run ends with exit code 3.
-
-    The figures of `Agreement` are used from the last stage of the range maps that reports them;
-    filters.consistency does. Cameras that are doubted already keep their reason.
-    """
-    poses = latest(run, Poses)
-    stage = _compared_stage(run)
-    if poses is not None and stage:
-        name, figures = stage
-        groups, centers = poses.groups, poses.centers
-        for group in range(len(poses.worlds)):
-            inside = {image: centers[idx] for idx, image in enumerate(poses.names) if groups[idx] == group}
-            for image, reason in view_doubts(figures, inside).items():
-                run.result.doubts.setdefault(image, (name, reason))
-    if run.result.doubts and run.result.exit_code == 0:
-        run.result.exit_code = FAILED_ITEMS
 
 
 def _compared_stage(run: Run) -> tuple[str, Mapping[str, Agreement]] | None:

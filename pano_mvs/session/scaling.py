@@ -170,17 +170,6 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     Raises:
         UsageError: if the workflow of the run cannot be found, or a stage mixes lengths in ways that cannot be scaled.
     """
-    session = _session_of(run, cache)
-    workflow = _scaled_workflow(session, known)
-    graph = wire(workflow)
-    path = run.out / WORKFLOW_FILE
-    text = resolved_yaml(workflow, graph)
-    with replacing(path) as scratch:
-        scratch.write_text(text, encoding="utf-8")
-    return replace(session, workflow=replace(workflow, path=path, text=text, overrides=()), graph=graph)
-
-
-def _session_of(run: RunOutput, cache: Path | None) -> Session:
     recorded = run.summary.workflow
     if not recorded.path or not is_file(Path(recorded.path)):
         raise UsageError(
@@ -189,21 +178,25 @@ def _session_of(run: RunOutput, cache: Path | None) -> Session:
         )
     moved = any(text.startswith("images.path=") for text in recorded.overrides)
     overrides = [text for text in recorded.overrides if not text.startswith("images.path=")]
-    return open_session(
+    session = open_session(
         recorded.path,
         overrides=overrides,
         images=run.summary.source_folder if moved else None,
         cache=cache or run.summary.cache or None,
         out=resolved(run.out),
     )
-
-
-def _scaled_workflow(session: Session, known: Measurement) -> Workflow:
     stages = dict(session.workflow.stages)
     before = {name: entry for name, entry in stages.items() if name.startswith(_PREFIX)}
     if before:
-        return replace(session.workflow, stages=stages | {n: _again(entry, known) for n, entry in before.items()})
-    return _Rewiring(session, known).workflow()
+        workflow = replace(session.workflow, stages=stages | {n: _again(entry, known) for n, entry in before.items()})
+    else:
+        workflow = _Rewiring(session, known).workflow()
+    graph = wire(workflow)
+    path = run.out / WORKFLOW_FILE
+    text = resolved_yaml(workflow, graph)
+    with replacing(path) as scratch:
+        scratch.write_text(text, encoding="utf-8")
+    return replace(session, workflow=replace(workflow, path=path, text=text, overrides=()), graph=graph)
 
 
 def _again(entry: StageEntry, known: Measurement) -> StageEntry:
@@ -230,7 +223,11 @@ class _Rewiring:
         self.stages = session.workflow.stages
         makers = [name for name in self.graph.order if self._kind(name) is not None]
         self.makers = set(makers)
-        self.upstream = _with_producers(makers, self.graph)
+        needed = set(makers)
+        for name in reversed(self.graph.order):
+            if name in needed:
+                needed.update(edge.producer for edge in self.graph.edges[name].values())
+        self.upstream = needed
         poses = chain_of(session.workflow, self.graph, Poses)
         if not poses:
             raise UsageError("the workflow has no poses, so there is nothing to scale")
@@ -287,14 +284,6 @@ class _Rewiring:
     def _images(self) -> str:
         found = [name for name in self.graph.order if issubclass(self.stages[name].spec.output, Panorama)]
         return found[-1]
-
-
-def _with_producers(names: list[str], graph: Graph) -> set[str]:
-    needed = set(names)
-    for name in reversed(graph.order):
-        if name in needed:
-            needed.update(edge.producer for edge in graph.edges[name].values())
-    return needed
 
 
 def _camera(groups: list[Poses], text: str) -> tuple[int, str]:

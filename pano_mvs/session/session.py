@@ -104,7 +104,13 @@ def open_session(
     if images is not None and not chosen and workflow.stages["images"].spec.name == _FOLDER_SOURCE and is_tour(images):
         overrides = [*_tour_overrides(workflow.stages["images"].params, registry), *overrides]
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
-    workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
+    # The files of the user's plugin folder go along to the workers as well, which need not have it.
+    named = {resolved(path) for path in workflow.plugins}
+    behind = registry.files_behind({entry.spec.name for entry in workflow.stages.values()})
+    workflow = replace(
+        workflow,
+        plugins=dict(workflow.plugins) | {path: digest for path, digest in behind.items() if path not in named},
+    )
     graph = wire(workflow)
     root = Path(cache) if cache else default_cache(path, is_preset=is_preset)
     session = Session(workflow, graph, registry, root, Path(out or default_out(workflow.name)), run_options)
@@ -153,13 +159,3 @@ def _reader_of(folder: Path, session: Session) -> str:
         if any(resolved(path) == place for paths in files_of(entry.params).values() for path in paths):
             return name
     return ""
-
-
-def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:
-    """Return the plugin files that a workflow names, and those of the user's folder that it uses without naming them.
-
-    Both go along to the workers, which need not have the folder.
-    """
-    named = {resolved(path) for path in workflow.plugins}
-    behind = registry.files_behind({entry.spec.name for entry in workflow.stages.values()})
-    return dict(workflow.plugins) | {path: digest for path, digest in behind.items() if path not in named}

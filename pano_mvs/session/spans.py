@@ -92,7 +92,14 @@ class Spans:
             case Warned():
                 self._run.add_event("warning", {"pano_mvs.text": without_controls(event.text)})
             case RunFinished():
-                self._end_run(event)
+                for stage in self._stages.values():
+                    self._end(stage)
+                if event.exit_code not in (0, FAILED_ITEMS):
+                    self._set_error(self._run, event.stopped)
+                found = _attributes(event, "exit_code", "stopped", "run", "cached", "failed", "blocked")
+                if event.verdict is not None:
+                    found |= _attributes(event.verdict, "mood", "judgement")
+                self._end(self._run, found)
             case _:
                 pass
 
@@ -106,16 +113,6 @@ class Spans:
             span.set_attributes(_attributes(failure, "consequence", "log"))
             self._set_error(span, failure.cause)
         self._end(span, at_ns=now_ns)
-
-    def _end_run(self, event: RunFinished) -> None:
-        for stage in self._stages.values():
-            self._end(stage)
-        if event.exit_code not in (0, FAILED_ITEMS):
-            self._set_error(self._run, event.stopped)
-        found = _attributes(event, "exit_code", "stopped", "run", "cached", "failed", "blocked")
-        if event.verdict is not None:
-            found |= _attributes(event.verdict, "mood", "judgement")
-        self._end(self._run, found)
 
     def _start(self, name: str, attributes: Mapping[str, Any], *, within: Any = None, at_ns: int | None = None) -> Any:
         context = None if within is None else self._trace.set_span_in_context(within)
@@ -182,14 +179,11 @@ class _Sender:
 
 
 class _Messages(logging.Handler):
-    """Takes what OpenTelemetry logs, such as each attempt to send, which would appear between the lines of the run.
-
-    Attributes:
-        first: the first warning or error, which names the cause; later ones say that there is no further attempt.
-    """
+    """Takes what OpenTelemetry logs, such as each attempt to send, which would appear between the lines of the run."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
+        # the first warning or error, which names the cause; later ones say that there is no further attempt
         self.first = ""
         self._logger = logging.getLogger("opentelemetry")
         self._logger.addHandler(self)

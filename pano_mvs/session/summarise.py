@@ -7,7 +7,6 @@ import platform
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any, TypeVar
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 import pano_mvs
 from pano_mvs.algorithms.floor_plan.plan_grid import find_storeys
+from pano_mvs.core.extras import installed_version
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.running.events import Failure, StageSummary
@@ -135,13 +135,16 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
     poses, result = latest(run, Poses), run.result
     if poses is None:
         return PosesSummary()
+    cloud = latest(run, PointCloud)
+    clouds = [] if cloud is None else cloud.groups()
+    found = {number: camera_height(*pair) for number, pair in enumerate(zip(split_groups(poses), clouds, strict=False))}
     return poses_summary(
         poses,
         blocked=blocked,
         rejected={image: why for image, (_, why) in result.rejected.items()},
         doubts={image: result.doubts[image][1] for image in poses.names if image in result.doubts},
         links=_links(run),
-        heights=_camera_heights(split_groups(poses), latest(run, PointCloud)),
+        heights={number: float(f"{height:.4g}") for number, height in found.items() if height is not None},
     )
 
 
@@ -282,13 +285,6 @@ def _up(poses: Poses) -> Direction | None:
     return x, y, z
 
 
-def _camera_heights(groups: Sequence[Poses], cloud: PointCloud | None) -> dict[int, float]:
-    """Return the height of the cameras above the floor, by group, where it is known."""
-    clouds = [] if cloud is None else cloud.groups()
-    found = {number: camera_height(*pair) for number, pair in enumerate(zip(groups, clouds, strict=False))}
-    return {number: float(f"{height:.4g}") for number, height in found.items() if height is not None}
-
-
 def _scale_notes(poses: PosesSummary) -> tuple[str, ...]:
     """Return what to say about the unit of the largest group: nothing if it is the metre or no floor is known."""
     height = poses.groups[0].camera_height if poses.groups else None
@@ -342,12 +338,7 @@ def _machine() -> dict[str, Any]:
 
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "pano_mvs": pano_mvs.__version__, "system": platform.platform()}
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 PLAUSIBLE_HEIGHT_M = 1.6  # a usual height of a camera on a tripod or a stick

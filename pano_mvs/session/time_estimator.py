@@ -36,8 +36,6 @@ _OVERDUE = 1.2  # a unit that takes longer than expected is expected to take thi
 _UNKNOWN = 2.0  # … and this one if nothing is known of its stage
 
 _SPEED_PRIOR_S = 10.0
-_SPEED_LIMITS = 0.2, 5.0
-_GLIDE_S = 4.0
 _COMPUTED = ("run", "failed")
 
 
@@ -185,7 +183,11 @@ class TimeEstimator:
     def _estimate(self) -> TimeLeft:
         if self._is_over:
             return TimeLeft(0.0, at_least=False, done=1.0)
-        now, speed = self._clock(), self._speed()
+        timed = [stage for stage in self.stages.values() if stage.forecast.unit_s is not None and stage.computed]
+        taken_s = sum(stage.seconds for stage in timed)
+        expected_s = sum(stage.computed * (stage.forecast.unit_s or 0.0) for stage in timed)
+        least, most = 0.2, 5.0  # earlier runs may have been slower
+        now, speed = self._clock(), min(most, max(least, (taken_s + _SPEED_PRIOR_S) / (expected_s + _SPEED_PRIOR_S)))
         work = {name: stage.work_s(now, speed) for name, stage in self.stages.items()}
         known = {name: found for name, found in work.items() if found is not None}
         unknown = tuple(name for name, found in work.items() if found is None)
@@ -202,14 +204,6 @@ class TimeEstimator:
 
     def _of(self, stage: str) -> StageProgress:
         return self.stages.setdefault(stage, StageProgress(StageForecast(stage)))
-
-    def _speed(self) -> float:
-        """Return the time of the computed units divided by their forecast: earlier runs may have been slower."""
-        known = [stage for stage in self.stages.values() if stage.forecast.unit_s is not None and stage.computed]
-        taken_s = sum(stage.seconds for stage in known)
-        expected_s = sum(stage.computed * (stage.forecast.unit_s or 0.0) for stage in known)
-        least, most = _SPEED_LIMITS
-        return min(most, max(least, (taken_s + _SPEED_PRIOR_S) / (expected_s + _SPEED_PRIOR_S)))
 
     def _note_running(self) -> None:
         """Record how many units run at a time: memory may permit fewer than there are workers."""
@@ -242,7 +236,7 @@ class Countdown:
         else:
             step_s = max(0.0, now - self._at)
             counted_s = self._shown_s - step_s
-            self._shown_s = counted_s + (seconds_left - counted_s) * -math.expm1(-step_s / _GLIDE_S)
+            self._shown_s = counted_s + (seconds_left - counted_s) * -math.expm1(-step_s / 4.0)
         self._at = now
         return max(0.0, self._shown_s)
 

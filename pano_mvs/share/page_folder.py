@@ -53,9 +53,6 @@ class PageFolder:
 
     Each piece of data is a script that hands its value to the page: opened from a disk, a page may load scripts from
     its own folder, but not read other files.
-
-    Attributes:
-        written: sizes of the pieces of data in bytes, by their paths below the folder, in the order of writing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -71,6 +68,7 @@ class PageFolder:
         mark = "This folder was written by pano-mvs share, which may replace its files.\n"
         write_given(folder / _MARK, mark, f"--to {folder}")
         self.folder = folder
+        # sizes of the pieces of data in bytes, by their paths below the folder, in the order of writing
         self.written: dict[str, int] = {}
 
     def put(self, key: str, value: Any) -> None:

@@ -39,26 +39,17 @@ RANGES_HW = (256, 512)  # size of the range map that the page walks and measures
 
 @dataclass(frozen=True)
 class ShareOptions:
-    """What a shared page contains.
+    """What a shared page contains."""
 
-    Attributes:
-        title: heading of the page; empty for the name of the capture's folder.
-        max_points: largest number of points of the cloud; 0 for none. Those kept are drawn at random.
-        max_triangles: about the largest number of triangles of a mesh without texture; 0 for no mesh.
-        max_width: largest width of a panorama in pixels, at least 1024.
-        jpeg_quality: of the panoramas, 1 to 100.
-        rooms: names or patterns of panoramas by room, or the file that `--rooms` takes; None to take them from folders,
-            names, or what is seen.
-        max_single_file_bytes: size up to which everything is also written as one HTML file.
-    """
-
-    title: str = ""
-    max_points: int = 1_500_000
-    max_triangles: int = 300_000
-    max_width: int = 8192
-    jpeg_quality: int = 85
+    title: str = ""  # heading of the page; empty for the name of the capture's folder
+    max_points: int = 1_500_000  # largest number of points of the cloud; 0 for none. Those kept are drawn at random.
+    max_triangles: int = 300_000  # about the largest number of triangles of a mesh without texture; 0 for no mesh
+    max_width: int = 8192  # largest width of a panorama in pixels, at least 1024
+    jpeg_quality: int = 85  # of the panoramas, 1 to 100
+    # names or patterns of panoramas by room, or the file that `--rooms` takes; None to take them from folders, names,
+    # or what is seen
     rooms: Mapping[str, Sequence[str]] | str | Path | None = None
-    max_single_file_bytes: int = 40_000_000
+    max_single_file_bytes: int = 40_000_000  # size up to which everything is also written as one HTML file
 
     def __post_init__(self) -> None:
         """Raise UsageError if an option is out of its range."""

@@ -232,12 +232,7 @@ def plain_surfaces(
     return refined
 
 
-@params_from(exchange_ranges)
-class ExchangeParams(Params):
-    """Settings of depth.exchange."""
-
-
-@stage("depth.exchange", memory=bytes_per_pixel(205, each_source=40))
+@stage("depth.exchange", settings=exchange_ranges, memory=bytes_per_pixel(205, each_source=40))
 def exchange(
     range_map: Each[RangeMap],
     ref: Each[Panorama],
@@ -245,7 +240,7 @@ def exchange(
     sources: Near[RangeMap],
     source_images: Near[Panorama],
     source_poses: Near[Pose],
-    params: ExchangeParams,
+    params: Params,
     ctx: Context,
 ) -> RangeMap:
     """Give unconfirmed pixels the nearer ranges that other views found, where the images match better.

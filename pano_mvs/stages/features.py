@@ -17,13 +17,8 @@ from pano_mvs.api import Context, Each, Features, InputPath, Panorama, Params, a
 from pano_mvs.scene import WeakImage
 
 
-@params_from(extract_sift)
-class SiftParams(Params):
-    """Settings of features.sift_tangent."""
-
-
-@stage("features.sift_tangent")
-def sift_tangent(image: Each[Panorama], params: SiftParams, ctx: Context) -> Features:
+@stage("features.sift_tangent", settings=extract_sift)
+def sift_tangent(image: Each[Panorama], params: Params, ctx: Context) -> Features:
     """SIFT on the overlapping tangent tiles of an icosahedron."""
     features = extract_sift(
         image.load(),

@@ -201,24 +201,14 @@ def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams,
     return result
 
 
-@params_from(median_range)
-class MedianParams(Params):
-    """Settings of filters.median."""
-
-
-@stage("filters.median")
-def median(range_map: Each[RangeMap], params: MedianParams, ctx: Context) -> RangeMap:
+@stage("filters.median", settings=median_range)
+def median(range_map: Each[RangeMap], params: Params, ctx: Context) -> RangeMap:
     """Replace each valid range by the median of the valid ranges in a window; invalid pixels stay invalid."""
     return _measured(median_range(range_map, **arguments_from(median_range, params)), ctx)
 
 
-@params_from(gaussian_range)
-class GaussianParams(Params):
-    """Settings of filters.gaussian."""
-
-
-@stage("filters.gaussian")
-def gaussian(range_map: Each[RangeMap], params: GaussianParams, ctx: Context) -> RangeMap:
+@stage("filters.gaussian", settings=gaussian_range)
+def gaussian(range_map: Each[RangeMap], params: Params, ctx: Context) -> RangeMap:
     """Smooth valid ranges by a Gaussian window; invalid pixels stay invalid."""
     return _measured(gaussian_range(range_map, **arguments_from(gaussian_range, params)), ctx)
 

@@ -11,19 +11,13 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
-from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical
+from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations as without_scale_factors
+from pano_mvs.algorithms.poses.frame.vertical import SURE, Evidence, Vertical, find_vertical, level_poses
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture
-from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
-from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
+from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, stage
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
-
-
-@params_from(level_poses)
-class LevelParams(Params):
-    """Settings of poses.level."""
 
 
 def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
@@ -34,8 +28,8 @@ def one_panorama_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
     return 100_000_000 + 12 * pixels
 
 
-@stage("poses.level", memory=one_panorama_bytes)
-def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Context) -> Poses:
+@stage("poses.level", settings=level_poses, memory=one_panorama_bytes)
+def level(poses: One[Poses], images: All[Panorama], params: Params, ctx: Context) -> Poses:
     """Rotate the world so that y points down along gravity, and z north if compass headings agree.
 
     The origin is the first registered camera; the unit of length does not change. The frame states the evidence and its
@@ -150,7 +144,13 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
     groups = split_groups(poses)
     if params.baseline is not None:
         ends, metres = _ends(images, params.baseline), params.baseline.metres
-        chosen = _holding(ends, groups)
+        homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
+        chosen = homes[0] if len(homes) == 2 else None  # None if one of them is in no group
+        if chosen is not None and chosen != homes[1]:
+            raise InputError(
+                f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
+                "reliable pair connects, so the distance between them gives no scale. Use two images of one group"
+            )
         whole = poses if chosen is None else groups[chosen]
         return _scaled(
             poses, groups, [chosen or 0], scaled=lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx=ctx
@@ -200,19 +200,6 @@ def _scaled(
             why = str(refused.get(number, "the length that is known is of another group"))
             ctx.note(f"{which}keeps its own unit of length ({group.scale}): {why}")
     return join_groups(found, order=poses.names, rejected=poses.rejected)
-
-
-def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
-    """Return the number of the group that contains both images; None if one of them is in no group."""
-    homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
-    if len(homes) < 2:
-        return None
-    if homes[0] != homes[1]:
-        raise InputError(
-            f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
-            "reliable pair connects, so the distance between them gives no scale. Use two images of one group"
-        )
-    return homes[0]
 
 
 def _by_camera_height(poses: Poses, images: All[Panorama], params: ScaleParams) -> Poses:

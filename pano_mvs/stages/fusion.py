@@ -28,7 +28,6 @@ from pano_mvs.api import (
     Poses,
     RangeMap,
     arguments_from,
-    params_from,
     settings_from,
     stage,
 )
@@ -38,15 +37,8 @@ from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
 
 
-@params_from(FusionSettings)
-class FusionParams(Params):
-    """Settings of `fusion.vote`."""
-
-
-@stage("fusion.vote")
-def vote(
-    ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: FusionParams, ctx: Context
-) -> PointCloud:
+@stage("fusion.vote", settings=FusionSettings)
+def vote(ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: Params, ctx: Context) -> PointCloud:
     """Fuse range maps into one coloured cloud with normals, keeping points on which several views agree.
 
     Groups of poses are fused one by one, because their relative positions are unknown.
@@ -61,13 +53,13 @@ def vote(
         clouds.append(fused)
         if not len(clouds[-1]):
             which = f"group {number}: " if len(set(groups.values())) > 1 else ""
-            ctx.note(
-                which
-                + _why_empty(
-                    {name: ranges[name] for name in names},
-                    _min_views(settings, len(names)),
-                )
+            why = (
+                f"at no pixel did {_min_views(settings, len(names))} views agree. Look at the poses, or lower "
+                "min_confidence or min_views"
+                if any(ranges[name].valid.any() for name in names)
+                else "no view has any range. Check the masks and the messages of the depth stage"
             )
+            ctx.note(f"{which}the cloud is empty: {why}")
     cloud = PointCloud.of_groups(clouds)
     ctx.metric("points", len(cloud))
     return cloud
@@ -97,20 +89,13 @@ def scale_cloud(cloud: One[PointCloud], params: ScaleCloudParams, ctx: Context) 
     return PointCloud.of_groups(clouds)
 
 
-@params_from(PhotographColorSettings)
-class PhotographColorParams(Params):
-    """Settings of fusion.photographs."""
-
-
-def colored_memory_bytes(_: PhotographColorParams, inputs: Mapping[str, Any]) -> int:
+def colored_memory_bytes(_: Params, inputs: Mapping[str, Any]) -> int:
     """Return the memory for the cloud's colours and one photograph, of at most 50 megapixels."""
     return 700_000_000 + 400 * len(inputs["cloud"])
 
 
-@stage("fusion.photographs", memory=colored_memory_bytes)
-def photographs(
-    cloud: One[PointCloud], photographs: One[Photographs], params: PhotographColorParams, ctx: Context
-) -> PointCloud:
+@stage("fusion.photographs", settings=PhotographColorSettings, memory=colored_memory_bytes)
+def photographs(cloud: One[PointCloud], photographs: One[Photographs], params: Params, ctx: Context) -> PointCloud:
     """Colour the cloud by photographs that poses.localise has placed, where they see it.
 
     The exposure of each photograph is matched with the colours of the cloud. Points that are hidden, or look different
@@ -172,36 +157,17 @@ def _min_views(settings: FusionSettings, views: int) -> int:
     return min(settings.min_views, max(1, views))
 
 
-def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
-    if not any(range_map.valid.any() for range_map in ranges.values()):
-        return "the cloud is empty: no view has any range. Check the masks and the messages of the depth stage"
-    return (
-        f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
-        "min_views"
-    )
-
-
-@params_from(sample_surface)
-class SurfaceParams(Params):
-    """Settings of points.surface."""
-
-
-@stage("points.surface")
-def surface(image: Each[Panorama], range_map: Each[RangeMap], params: SurfaceParams, ctx: Context) -> SurfaceSamples:
+@stage("points.surface", settings=sample_surface)
+def surface(image: Each[Panorama], range_map: Each[RangeMap], params: Params, ctx: Context) -> SurfaceSamples:
     """Sample the surfaces that each view sees, evenly over its sphere, as input of points.tracked."""
     samples = sample_surface(image.load(), image.load_mask(), range_map, **arguments_from(sample_surface, params))
     ctx.metric("points", len(samples))
     return samples
 
 
-@params_from(track_points)
-class TrackedParams(Params):
-    """Settings of points.tracked."""
-
-
-@stage("points.tracked")
+@stage("points.tracked", settings=track_points)
 def tracked(
-    poses: One[Poses], samples: All[SurfaceSamples], ranges: All[RangeMap], params: TrackedParams, ctx: Context
+    poses: One[Poses], samples: All[SurfaceSamples], ranges: All[RangeMap], params: Params, ctx: Context
 ) -> TrackedPoints:
     """Select evenly distributed points with the views that see them: initial points for splats, tracks for COLMAP."""
     settings = arguments_from(track_points, params)

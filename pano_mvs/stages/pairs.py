@@ -12,12 +12,12 @@ from pano_mvs.algorithms.learned.weak_images import learned_pairs
 from pano_mvs.algorithms.matching.neighbours import (
     automatic_pairs,
     east_north_m,
+    exhaustive_pairs,
     loop_closing_pairs,
     most_pairs,
     position_pairs,
     retrieval_pairs,
 )
-from pano_mvs.algorithms.matching.pairs import exhaustive_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.api import (
     All,
@@ -43,23 +43,19 @@ from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
 
 
-@params_from(automatic_pairs)
-class AutoParams(Params):
-    """Settings of pairs.auto."""
-
-
-def _memory_of_auto(params: AutoParams, count: int) -> int:
+def _memory_of_auto(params: Params, count: int) -> int:
     """Return the memory for pairs of this number of images."""
     # `automatic_pairs` and its parts hold at most eight matrices of float64 at a time.
     return 64 * count**2 if most_pairs(count, _candidates(params)) < count * (count - 1) // 2 else 0
 
 
-def _candidates(params: AutoParams) -> int:
+def _candidates(params: Params) -> int:
     return int(arguments_from(automatic_pairs, params)["candidates"])
 
 
 @stage(
     "pairs.auto",
+    settings=automatic_pairs,
     memory=lambda params, inputs: _memory_of_auto(params, len(inputs["descriptors"])),
     expected_units=lambda params, images: most_pairs(images, _candidates(params)),
     expected_memory=lambda params, images, _: _memory_of_auto(params, images),
@@ -68,7 +64,7 @@ def automatic(
     descriptors: All[GlobalDescriptor],
     images: All[Panorama],
     poses: One[Poses] | None,
-    params: AutoParams,
+    params: Params,
     ctx: Context,
 ) -> Pairs:
     """Match all pairs of up to 57 images; in larger captures, match each image with at most 28 others.

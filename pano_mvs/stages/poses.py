@@ -94,18 +94,13 @@ def _without_false_closures(
     return {pair: view for pair, view in matches.items() if pair not in left_out}
 
 
-@params_from(verify_poses)
-class VerifyParams(Params):
-    """Settings of poses.verify."""
-
-
-@stage("poses.verify")
+@stage("poses.verify", settings=verify_poses)
 def verify(
     poses: One[Poses],
     images: All[Panorama],
     features: All[Features] | None,
     matches: All[TwoView] | None,
-    params: VerifyParams,
+    params: Params,
     ctx: Context,
 ) -> Poses:
     """Check poses of any origin against the images, and correct errors caused by repeated structure.
@@ -210,14 +205,7 @@ def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> 
     Image names are compared with and without their folders and extensions. If the file contains the SHA-256 of its
     images, the hashes are compared too: poses of other images with the same names are rejected.
     """
-    _require_its_pictures(params.path, images, ctx)
-    known = known_poses(params.path, tuple(images))
-    return checked_poses(known, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
-
-
-def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Context) -> None:
-    """Raise InputError if a file of poses belongs to other images with the same names; report single mismatches."""
-    recorded = recorded_pictures(path)
+    recorded = recorded_pictures(params.path)
     matched = {
         name: there
         for name, there in match_image_names(images, recorded).items()
@@ -226,12 +214,14 @@ def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Conte
     others = [name for name, there in matched.items() if images[name].image.sha256() != recorded[there]]
     if others and len(others) == len(matched):
         raise InputError(
-            f"{path}: records other images under these names: not one of {len(others)} ({others[0]} …) has the "
+            f"{params.path}: records other images under these names: not one of {len(others)} ({others[0]} …) has the "
             "SHA-256 in the file. Give the poses of these images: --set poses.path=FILE. If they are the same images, "
             "saved again, remove the sha256 from the file"
         )
     for name in others:
-        ctx.note(f"{name} is not the image whose pose {path.name} records: the files differ")
+        ctx.note(f"{name} is not the image whose pose {params.path.name} records: the files differ")
+    known = known_poses(params.path, tuple(images))
+    return checked_poses(known, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 
 @stage("poses.triangulate", settings=triangulate_tracks)

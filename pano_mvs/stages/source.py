@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +28,7 @@ from pano_mvs.api import (
     source,
 )
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.images.captures import describe_picture, list_pictures
 from pano_mvs.io.images.copies import find_copies
 from pano_mvs.io.images.metadata import find_gpano, position_from_exif, read_container
 from pano_mvs.io.images.names import find_mask, printable_name, require_masks
@@ -99,7 +100,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         )
     for path, (name, problem) in zip(pictures, names, strict=True):
         files = {"image": path}
-        mask = None if problem else _mask_of(name, params)
+        mask = None if problem else (params.masks and find_mask(params.masks, name)) or params.mask
         if mask is not None:
             files["mask"] = mask
         if name in copies:
@@ -131,14 +132,33 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """
     image = item.file("image")
     path, data = image.path, image.read_bytes()
-    if (layout := _layout(path, data, params)) != "none":
+    layout = params.stereo
+    if layout == "auto":
+        layout = stereo_layout(
+            path,
+            stated_size(data) or (0, 0),
+            data,
+            picture=partial(decode_image, path, data, max_pixels=params.max_pixels),
+        )
+    if layout != "none":
         return _left_eye(item, layout, data, params=params, ctx=ctx)
     info = describe_picture(path, data, max_pixels=params.max_pixels)
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"{{count}} images have {trait}")
-    _check_pixels(path, data, info, max_pixels=params.max_pixels)
+    picture = decode_image(path, data, max_pixels=params.max_pixels)
+    height, width = picture.shape[:2]
+    if (height, width) != info.file_size_hw:
+        raise InputError(
+            f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. Save it again"
+        )
+    if info.gpano is None and is_dual_fisheye(picture):
+        raise InputError(
+            f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
+            "the camera maker's program (stitching), or, if the calibration of the lenses is known, use "
+            "source.dual_fisheye (docs/rigs.md)"
+        )
     del data
     panorama = Panorama(
         image=image,
@@ -157,15 +177,6 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     if not valid:
         ctx.note(f"{item.name}: everything in it is masked")
     return panorama
-
-
-def _layout(path: Path, data: bytes, params: FolderParams) -> StereoLayout:
-    def picture() -> NDArray[np.uint8]:
-        return decode_image(path, data, max_pixels=params.max_pixels)
-
-    if params.stereo != "auto":
-        return params.stereo
-    return stereo_layout(path, stated_size(data) or (0, 0), data, picture=picture)
 
 
 def _left_eye(item: SourceItem, layout: StereoLayout, data: bytes, *, params: FolderParams, ctx: Context) -> Panorama:
@@ -199,33 +210,12 @@ def stereo_note(what: str, layout: StereoLayout) -> str:
     return f"{what} show both eyes (stereo); {place} is used, which is that of the left eye"
 
 
-def _check_pixels(path: Path, data: bytes, info: PictureInfo, *, max_pixels: int) -> None:
-    """Decode the whole image once, so that a damaged file is reported here and not in the middle of a sweep."""
-    picture = decode_image(path, data, max_pixels=max_pixels)
-    height, width = picture.shape[:2]
-    if (height, width) != info.file_size_hw:
-        raise InputError(
-            f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. Save it again"
-        )
-    if info.gpano is None and is_dual_fisheye(picture):
-        raise InputError(
-            f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
-            "the camera maker's program (stitching), or, if the calibration of the lenses is known, use "
-            "source.dual_fisheye (docs/rigs.md)"
-        )
-
-
 def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
     """Return the working size: the width is a multiple of four, so that height and half a turn are whole pixels."""
     width = min(source_hw[1], max_width) // 4 * 4
     if width < 16:
         raise InputError(f"a panorama of {source_hw[1]}×{source_hw[0]} px is too small; it needs at least 16 columns")
     return width // 2, width
-
-
-def _mask_of(name: str, params: FolderParams) -> Path | None:
-    own = None if params.masks is None else find_mask(params.masks, name)
-    return own or params.mask
 
 
 def _notes_on_masks(name: str, mask: Path | None, params: FolderParams) -> Iterator[str]:
@@ -285,7 +275,9 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
     known by their names. Cubes are stored without loss, as `<scene>.png`, with the front face in the middle.
     """
     if _WHOLE in item.files:
-        return _equirectangular(item, params, ctx)
+        plain = FolderParams.model_validate(params.model_dump())
+        image = SourceItem(item.name, {"image": item.files[_WHOLE]}, digests={"image": item.digests.get(_WHOLE, "")})
+        return replace(folder(image, plain, ctx), links=item.links)
     faces, rearranged = arranged_faces({face: _joined(item, face) for face in FACES})
     if rearranged:
         ctx.note("the faces of {count} cubes did not fit together and were put in the order in which their edges do")
@@ -305,27 +297,17 @@ def tour(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
     )
 
 
-def _equirectangular(item: SourceItem, params: TourParams, ctx: Context) -> Panorama:
-    plain = FolderParams.model_validate(params.model_dump())
-    image = SourceItem(item.name, {"image": item.files[_WHOLE]}, digests={"image": item.digests.get(_WHOLE, "")})
-    return replace(folder(image, plain, ctx), links=item.links)
-
-
 def _joined(item: SourceItem, face: str) -> NDArray[np.uint8]:
-    tiles = {tuple(map(int, key.split("_")[1:])): key for key in item.files if key.startswith(f"{face}_")}
+    keys = (key for key in item.files if key.startswith(f"{face}_"))
+    tiles = {tuple(map(int, key.split("_")[1:])): item.file(key) for key in keys}
+    pictures = {place: decode_image(tile.path, tile.read_bytes()) for place, tile in tiles.items()}
     rows = [
-        [_picture(item, tiles[row, column]) for column in sorted({column for _, column in tiles})]
+        [pictures[row, column] for column in sorted({column for _, column in tiles})]
         for row in sorted({row for row, _ in tiles})
     ]
     try:
         return np.ascontiguousarray(np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0))
     except ValueError as error:
-        place = item.file(tiles[0, 0]).path
         raise InputError(
-            f"{place}: this tile and those beside it do not fit together. Export the tour again"
+            f"{tiles[0, 0].path}: this tile and those beside it do not fit together. Export the tour again"
         ) from error
-
-
-def _picture(item: SourceItem, key: str) -> NDArray[np.uint8]:
-    file = item.file(key)
-    return decode_image(file.path, file.read_bytes())

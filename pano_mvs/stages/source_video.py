@@ -228,18 +228,17 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
             threads=2,
             stereo=info.stereo,
         )
-        small = (SmallFrame(time_s, reduced_grey(frame), sharpness(_band(frame))) for time_s, frame in frames)
+        # The rows near the equator are enough to compare sharpness.
+        small = (
+            SmallFrame(time_s, reduced_grey(frame), sharpness(frame[len(frame) // 4 : len(frame) - len(frame) // 4]))
+            for time_s, frame in frames
+        )
         times = [frame.time_s for frame in select_keyframes(small, settings, usable)]
         store_times(known, times)
     if params.max_frames is not None and len(times) > params.max_frames:
         kept = np.linspace(0, len(times) - 1, params.max_frames).round().astype(int)
         times = [times[idx] for idx in kept]
     return times
-
-
-def _band(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the rows of a frame whose middle half, which is enough to compare sharpness, is near the equator."""
-    return frame[frame.shape[0] // 4 : frame.shape[0] - frame.shape[0] // 4]
 
 
 def _steps(info: VideoInfo, params: VideoParams) -> list[float]:

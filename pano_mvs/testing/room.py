@@ -1,15 +1,17 @@
-"""A synthetic room whose range is known in closed form, as ground truth for tests."""
+"""A synthetic room, its textures and paint, whose range is known in closed form, as ground truth for tests."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
-from pano_mvs.testing.paint import Pattern, Texture, albedo_at, sky_color
+from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_quat_wxyz, rotation_from_rotvec
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 
 _RAYS_AT_ONCE = 1 << 17
@@ -17,25 +19,19 @@ _RAYS_AT_ONCE = 1 << 17
 
 @dataclass(frozen=True)
 class Room:
-    """Surfaces with a texture, and one lamp.
-
-    Attributes:
-        texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
-            "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
-        lamp: position of the light; the shading is diffuse, without shadows.
-        textures: texture of each surface, if they differ; empty: all have `texture`.
-        sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
-            away; None: black.
-        clouds: strength of the clouds; 0 is a clear sky.
-    """
+    """Surfaces with a texture, and one lamp."""
 
     surfaces: tuple[Surface, ...]
+    # texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic", "outdoor"
+    # (coarse and fine, the fine part fading with distance) or "none" (paint)
     texture: Texture = "strong"
     seed: int = 0
-    lamp: Vector = (0.4, -1.2, 0.3)
-    textures: tuple[Texture | Pattern, ...] = ()
+    lamp: Vector = (0.4, -1.2, 0.3)  # position of the light; the shading is diffuse, without shadows
+    textures: tuple[Texture | Pattern, ...] = ()  # texture of each surface, if they differ; empty: all have `texture`
+    # colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far away;
+    # None: black
     sky: tuple[Vector, Vector] | None = None
-    clouds: float = 0.35
+    clouds: float = 0.35  # strength of the clouds; 0 is a clear sky
 
 
 def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
@@ -186,3 +182,133 @@ def _furniture() -> tuple[Surface, ...]:
         Ball((-1.5, 0.95, 0.6), 0.35, blue),
         Ball((0.9, -0.7, -1.4), 0.3, green),
     )
+
+
+Texture = Literal["strong", "weak", "faint", "isotropic", "outdoor", "none"]
+
+Colors = tuple[Vector, Vector]
+
+
+class Pattern(Protocol):
+    """A texture with its own colours."""
+
+    def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
+        """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), for pixels of width `footprint`."""
+
+
+# Cell sizes in scene units, with the amplitude of the noise on each.
+_LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
+    "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
+    "weak": ((0.047, 0.03), (0.16, 0.05)),
+    "faint": ((0.047, 0.01), (0.16, 0.018)),
+    "isotropic": ((0.015, 0.7), (0.047, 0.7)),
+    "outdoor": ((0.012, 0.25), (0.04, 0.25), (0.13, 0.3), (0.5, 0.3)),
+    "none": (),
+}
+_HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
+    "strong": ((0.06, 1.0),),
+    "weak": ((0.2, 0.15),),
+    "faint": ((0.2, 0.05),),
+    "isotropic": ((0.06, 0.6),),
+    "outdoor": ((0.25, 0.8),),
+    "none": (),
+}
+
+
+def albedo_at(
+    points: FloatArray, colors_rgb: Colors, texture: Texture, *, seed: int, footprint: FloatArray
+) -> FloatArray:
+    """Return the unlit colours (N, 3) of points (N, 3) of a surface.
+
+    Args:
+        points: in world coordinates; a point has the same colour from every viewpoint.
+        colors_rgb: the two colours between which the hue varies.
+        footprint: (N,) width of a pixel at each point. The texture "outdoor" fades where a pixel averages over its
+            waves, since a far wall would otherwise flicker between views; the others do not depend on it.
+    """
+    share = 0.5 + 0.5 * np.tanh(_octaves(points, _HUE[texture], texture, seed=seed, footprint=footprint))
+    lightness = _octaves(points, _LIGHTNESS[texture], texture, seed=seed + 1, footprint=footprint)
+    first, second = np.array(colors_rgb)
+    albedo: FloatArray = share[:, None] * first + (1 - share[:, None]) * second
+    return albedo * (1 + 0.65 * np.tanh(lightness)[:, None])
+
+
+def _octaves(
+    points: FloatArray, cells: tuple[tuple[float, float], ...], texture: Texture, *, seed: int, footprint: FloatArray
+) -> FloatArray:
+    """Return the sum of the noise (N,) of all cell sizes, fading for the texture "outdoor"."""
+    if texture != "outdoor":
+        return noise(points, cells=cells, seed=seed)
+    total = np.zeros(len(points))
+    for octave, (size, strength) in enumerate(cells):
+        # Mean wavelength of the noise in cells.
+        left = np.exp(-((2 * footprint / (7.0 * size)) ** 2))
+        total += left * noise(points, cells=((size, strength),), seed=seed + 7919 * octave)
+    return total
+
+
+def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: int, clouds: float = 0.35) -> FloatArray:
+    """Return the colours (N, 3) of the sky along unit rays (N, 3); clouds are infinitely far away, and 1 is thick."""
+    zenith, horizon = np.array(sky)
+    height = np.clip(-rays_in_world[:, 1], 0, 1)[:, None] ** 0.5
+    clear: FloatArray = height * zenith + (1 - height) * horizon
+    if not clouds:
+        return clear
+    cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=((0.06, 0.8),), seed=seed + 0x5C))[:, None]
+    mixed: FloatArray = clear + clouds * cloud * (1 - clear)
+    return mixed
+
+
+_CELLS = 64
+
+
+def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int) -> FloatArray:
+    """Return smooth noise, about normally distributed, at points.
+
+    Args:
+        points: (N, 3).
+        cells: pairs of cell size in scene units and standard deviation of the noise on that lattice; its wavelengths
+            are 4 to 12 cells.
+        seed: each seed gives an independent texture.
+
+    Returns:
+        (N,) values with mean near 0.
+    """
+    rng = np.random.default_rng(seed)
+    total = np.zeros(len(points))
+    for size, strength in cells:
+        turn = rotation_from_quat_wxyz(rng.normal(size=4))  # so that no lattice is parallel to a wall
+        offset = rng.uniform(0, _CELLS, 3)
+        total += strength * _interpolated(points @ (turn / size) + offset)
+    return total
+
+
+def _interpolated(positions: FloatArray) -> FloatArray:
+    """Return the periodic volume at positions (N, 3) in cells, by trilinear interpolation."""
+    volume = _volume().ravel()
+    low = np.floor(positions)
+    weight = positions - low
+    index = low.astype(np.int64)
+    columns = [
+        ((index[:, k] % _CELLS) * step, ((index[:, k] + 1) % _CELLS) * step)
+        for k, step in enumerate((_CELLS * _CELLS, _CELLS, 1))
+    ]
+    result = np.zeros(len(positions))
+    for corner in np.ndindex(2, 2, 2):
+        share = np.ones(len(positions))
+        for k in range(3):
+            share *= weight[:, k] if corner[k] else 1 - weight[:, k]
+        result += share * volume[columns[0][corner[0]] + columns[1][corner[1]] + columns[2][corner[2]]]
+    return result
+
+
+@lru_cache(maxsize=1)
+def _volume() -> FloatArray:
+    """Return periodic, isotropic, band-limited noise of unit variance, (64, 64, 64)."""
+    white = np.random.default_rng(0x3D).normal(size=(_CELLS,) * 3)
+    frequency = np.fft.fftfreq(_CELLS)
+    radius = np.sqrt(np.sum(np.stack(np.meshgrid(frequency, frequency, frequency)) ** 2, axis=0))
+    # Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
+    band = (radius >= 1 / 12) & (radius <= 1 / 4)
+    filtered = np.fft.ifftn(np.fft.fftn(white) * band).real
+    return np.asarray(filtered / filtered.std())

@@ -100,13 +100,28 @@ class TinyCapture:
         count = len(self.names)
         pairs = tuple((self.names[i], self.names[j]) for i in range(count) for j in range(i + 1, count))
         others = {name: tuple(other for other in self.names if other != name) for name in self.names}
+        pixels = np.zeros((8, 16), np.uint8)
+        pixels[5:, 2:6] = pixels[7:] = 1
+        pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
+        camera = camera_of(self.images[self.names[0]])
+        poses = self._poses_with_points()
         return {
             Pairs: Pairs(pairs),
             Views: Views(others),
             Poses: self._poses_with_points(),
             PointCloud: self._cloud(),
-            TrackedPoints: self._tracked_points(),
-            StaticMasks: self._static_masks(),
+            TrackedPoints: frozen(
+                TrackedPoints(
+                    names=poses.names,
+                    points_in_world=poses.points_in_world,
+                    colors_rgb=poses.point_colors_rgb,
+                    errors_rad=poses.point_errors_rad,
+                    track_point_idx=poses.track_point_idx,
+                    track_image_idx=poses.track_image_idx,
+                    track_bearings=poses.track_bearings,
+                )
+            ),
+            StaticMasks: frozen(StaticMasks(pixels[None], (camera,))),
             Structure: self._structure(),
             Scores: Scores({"registered": 1.0}, {}),
             Photographs: self._photographs(),
@@ -239,20 +254,6 @@ class TinyCapture:
         colors, sure = np.full((count, 3), 128, np.uint8), np.full(count, 200, np.uint8)
         return frozen(SurfaceSamples(self.bearings(idx)[:count], distances.astype(np.float32), colors, sure))
 
-    def _tracked_points(self) -> TrackedPoints:
-        poses = self._poses_with_points()
-        return frozen(
-            TrackedPoints(
-                names=poses.names,
-                points_in_world=poses.points_in_world,
-                colors_rgb=poses.point_colors_rgb,
-                errors_rad=poses.point_errors_rad,
-                track_point_idx=poses.track_point_idx,
-                track_image_idx=poses.track_image_idx,
-                track_bearings=poses.track_bearings,
-            )
-        )
-
     def _photographs(self) -> Photographs:
         """Return a photograph that was taken from the place of the first image."""
         pose = self.poses[0]
@@ -269,14 +270,6 @@ class TinyCapture:
                 pictures=(FilePart(self.folder / "phone" / "1.png"),),
             )
         )
-
-    def _static_masks(self) -> StaticMasks:
-        """Return a mask of two areas, which turn with the images."""
-        pixels = np.zeros((8, 16), np.uint8)
-        pixels[5:, 2:6] = pixels[7:] = 1
-        pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
-        camera = camera_of(self.images[self.names[0]])
-        return frozen(StaticMasks(pixels[None], (camera,)))
 
     def _structure(self) -> Structure:
         """Return the floor and one wall."""

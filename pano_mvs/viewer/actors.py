@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.images.captures import describe_picture
@@ -77,27 +77,15 @@ class CloudActor:
         self.actor.GetProperty().SetPointSize(pixels)
 
 
-@dataclass(frozen=True, eq=False)
-class SphereMesh:
-    """Triangles of a sphere with texture coordinates."""
+def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
+    """Return the actor of a sphere that shows each pixel of a panorama, (H, W, 3) RGB, along that pixel's ray.
 
-    vertices: NDArray[np.float64]  # (V, 3) float64 in the world
-    triangles: NDArray[np.int64]  # (T, 3) int64; clockwise as seen from inside
-    # (V, 2) float32, u to the right, v upwards from the lower edge of the image
-    texture_uv: NDArray[np.float32]
-
-
-def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) -> SphereMesh:
-    """Return a sphere around a camera that shows each pixel of its panorama along that pixel's ray.
-
-    Drawn without the triangles that face the viewer, it shows from outside what lies behind it, like a crystal
-    ball. In neither case is text mirrored.
-
-    Args:
-        cam_from_world: pose.
-        radius: in scene units.
-        rows: of quadrilaterals from pole to pole, twice as many around.
+    Drawn without the triangles that face the viewer, it shows from outside what lies behind it, like a crystal ball. In
+    neither case is text mirrored.
     """
+    import pyvista
+
+    rows = 96 if surrounds else 24
     columns = 2 * rows
     y, x = np.mgrid[0 : rows + 1, 0 : columns + 1].astype(np.float64)
     rays = ray_from_pixel(np.stack([x, y], axis=-1), (rows, columns)).reshape(-1, 3)
@@ -106,18 +94,9 @@ def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) ->
     corners = np.stack([first, first + 1, first + columns + 2, first + columns + 1], axis=-1)
     # Seen from inside, the corners of a quadrilateral run clockwise: from left to right, then down.
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    texture_uv = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
-    return SphereMesh(vertices, triangles, texture_uv)
-
-
-def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
-    """Return the actor of a sphere that shows a panorama, (H, W, 3) RGB, around its camera."""
-    import pyvista
-
-    mesh = panorama_sphere(cam_from_world, radius, rows=96 if surrounds else 24)
-    faces = np.column_stack([np.full(len(mesh.triangles), 3), mesh.triangles])
-    data: Any = pyvista.PolyData(mesh.vertices, faces.ravel())
-    data.active_texture_coordinates = mesh.texture_uv
+    faces = np.column_stack([np.full(len(triangles), 3), triangles])
+    data: Any = pyvista.PolyData(vertices, faces.ravel())
+    data.active_texture_coordinates = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
     as_texture: Any = pyvista.numpy_to_texture  # has no types
     texture = as_texture(np.ascontiguousarray(picture))
     texture.SetInterpolate(True)
@@ -169,8 +148,10 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
     if camera.range_file is None:
         return None, "no ranges of this camera: the workflow has no export.ranges, or the run did not reach it"
     try:
-        ranges = _small(read_range_tiff(camera.range_file))
-        confidence = None if camera.confidence_file is None else _small(read_confidence_png(camera.confidence_file))
+        ranges = narrowed(read_range_tiff(camera.range_file), _WIDTH)
+        confidence = (
+            None if camera.confidence_file is None else narrowed(read_confidence_png(camera.confidence_file), _WIDTH)
+        )
     except InputError as error:
         return None, str(error)
     near, far = range_limits(ranges)
@@ -182,14 +163,6 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
     if not np.isfinite(ranges).all():
         parts.append("grey: no range")
     return colors, "\n".join(parts)
-
-
-def _small(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map at most `_WIDTH` wide, of whole pixels."""
-    if values.shape[1] <= _WIDTH:
-        return values
-    size = _WIDTH, max(1, round(values.shape[0] * _WIDTH / values.shape[1]))
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST))
 
 
 _KEYS = (

@@ -83,7 +83,12 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
         low, high = np.quantile(heights, [0.02, 0.98]) if len(heights) else (0.0, 1.0)
         return Coloring(_mapped(heights, low, high), f"height: blue {low:z.3g} to red {high:z.3g} {unit}")
     if by == "rgb":
-        return _photographed(cloud)
+        if not set(_COLORS) <= set(cloud.vertices.dtype.names or ()):
+            return Coloring(np.full((len(cloud.points), 3), 200, np.uint8), "this cloud has no colours")
+        stacked = np.stack([cloud.vertices[name] for name in _COLORS], axis=-1)
+        # Some programs write colours from 0 to 1.
+        scaled = stacked * 255.0 if stacked.dtype.kind == "f" and stacked.max(initial=0) <= 1 else stacked
+        return Coloring(np.clip(scaled, 0, 255).astype(np.uint8), "")
     values = cloud.vertices[by].astype(np.float32)
     high = 255.0 if by == "confidence" else max(float(values.max(initial=0)), 2.0)
     legend = (
@@ -92,15 +97,6 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
         else (f"views that agree: blue 0 to red {high:.0f}")
     )
     return Coloring(_mapped(values, 0.0, high), legend)
-
-
-def _photographed(cloud: DrawnCloud) -> Coloring:
-    if not set(_COLORS) <= set(cloud.vertices.dtype.names or ()):
-        return Coloring(np.full((len(cloud.points), 3), 200, np.uint8), "this cloud has no colours")
-    stacked = np.stack([cloud.vertices[name] for name in _COLORS], axis=-1)
-    # Some programs write colours from 0 to 1.
-    scaled = stacked * 255.0 if stacked.dtype.kind == "f" and stacked.max(initial=0) <= 1 else stacked
-    return Coloring(np.clip(scaled, 0, 255).astype(np.uint8), "")
 
 
 def _mapped(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,30 +67,25 @@ def write_curve_picture(path: Path, inspection: Inspection) -> None:
                     axes.plot(source_costs, color=_SOURCES[source % len(_SOURCES)], linewidth=0.8)
             is_last = idx == len(panels) - 1
             axes.plot(costs, color=_DECISIVE if is_last else _RAW)
-            _set_scales(axes, curve.ranges, with_labels=is_last)
+            drawn = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
+            highest = float(np.nanmax(drawn[~np.isinf(drawn)]))
+            axes.set(xlim=(0, len(curve.ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
+            axes.yaxis.set_major_formatter("{x:.2f}")
+            values = scale_ticks(float(curve.ranges[0]), float(curve.ranges[-1]))
+            places = [_place_of(value, curve.ranges) for value in values]
+            labels, taken = [], -np.inf
+            for value, place in zip(values, places, strict=True):
+                x = place / (len(curve.ranges) - 1) * (_RIGHT - _LEFT)
+                is_shown = is_last and x - taken > 44
+                labels.append(f"{value:g}" if is_shown else "")
+                taken = x if is_shown else taken
+            axes.set_xticks(places, labels)
+            if is_last:
+                axes.set_xlabel("depth hypothesis, scene units")
             _add_marks(axes, inspection, costs)
         _add_legend(figure, inspection)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, format="png", metadata={"Software": None})  # whose version would change the bytes
-
-
-def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -> None:
-    """Set the limits and ticks of the axes; hypotheses are evenly spaced."""
-    drawn = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
-    highest = float(np.nanmax(drawn[~np.isinf(drawn)]))
-    axes.set(xlim=(0, len(ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
-    axes.yaxis.set_major_formatter("{x:.2f}")
-    values = scale_ticks(float(ranges[0]), float(ranges[-1]))
-    places = [_place_of(value, ranges) for value in values]
-    labels, taken = [], -np.inf
-    for value, place in zip(values, places, strict=True):
-        x = place / (len(ranges) - 1) * (_RIGHT - _LEFT)
-        is_shown = with_labels and x - taken > 44
-        labels.append(f"{value:g}" if is_shown else "")
-        taken = x if is_shown else taken
-    axes.set_xticks(places, labels)
-    if with_labels:
-        axes.set_xlabel("depth hypothesis, scene units")
 
 
 def _add_marks(axes: Axes, inspection: Inspection, costs: NDArray[np.float64]) -> None:
@@ -180,7 +175,11 @@ def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100
     lines = ["cost, combined from the neighbours:", *_plot(curve.raw, group, steps)]
     if curve.aggregated is not None:
         lines += ["after semi-global matching:", *_plot(curve.aggregated, group, steps)]
-    marks = _marks(curve, true_range)
+    marks = {"winner": curve.winner}
+    if curve.runner_up is not None:
+        marks["next valley"] = curve.runner_up
+    if np.isfinite(true_range):
+        marks["truth"] = int(np.abs(np.log(curve.ranges / true_range)).argmin())
     bars = -(-len(curve.ranges) // group)
     row = [" "] * bars
     for name in reversed(list(marks)):
@@ -191,16 +190,11 @@ def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100
 
 
 def _plot(costs: NDArray[np.float64], group: int, steps: str) -> list[str]:
-    cheapest = _cheapest(costs, group)
+    padded = np.pad(costs, (0, -len(costs) % group), mode="edge")
+    cheapest: NDArray[np.float64] = padded.reshape(-1, group).min(axis=1)
     top = max(float(cheapest.max()), 1e-6)
     labels = {0: f"{top:5.2f} ", _ROWS // 2: f"{top / 2:5.2f} "}
     return [labels.get(row, " " * _MARGIN) + "".join(bars) for row, bars in enumerate(_bars(cheapest / top, steps))]
-
-
-def _cheapest(costs: NDArray[np.float64], group: int) -> NDArray[np.float64]:
-    padded = np.pad(costs, (0, -len(costs) % group), mode="edge")
-    cheapest: NDArray[np.float64] = padded.reshape(-1, group).min(axis=1)
-    return cheapest
 
 
 def _bars(heights: NDArray[np.float64], steps: str) -> NDArray[np.str_]:
@@ -209,15 +203,6 @@ def _bars(heights: NDArray[np.float64], steps: str) -> NDArray[np.str_]:
     filled = np.rint(heights * _ROWS * fine).astype(int)
     from_bottom = np.clip(filled[None, :] - fine * np.arange(_ROWS)[:, None], 0, fine)
     return np.array(list(steps))[from_bottom[::-1]]
-
-
-def _marks(curve: CostCurve, true_range: float) -> Mapping[str, int]:
-    marks = {"winner": curve.winner}
-    if curve.runner_up is not None:
-        marks["next valley"] = curve.runner_up
-    if np.isfinite(true_range):
-        marks["truth"] = int(np.abs(np.log(curve.ranges / true_range)).argmin())
-    return marks
 
 
 def _scale(ranges: Sequence[float] | NDArray[np.float64], group: int, bars: int) -> str:

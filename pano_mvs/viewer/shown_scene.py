@@ -17,7 +17,6 @@ from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.upright import WORLD_UP, mean_up_direction, states_y_down
@@ -75,12 +74,26 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         UsageError: if there is no such group.
     """
     if is_file(path):
-        return _scene_of_ply(path)
+        points, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+        if points is not None and not points.count:
+            raise InputError(
+                f"{path}: contains no points, so there is nothing to show. Check the program that wrote it"
+            )
+        return ShownScene(path.name, points, mesh, (), "scene units", *_frame(()))
     if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _summary(path)
     notes: list[str] = []
-    chosen = _group_of(run, group, path, notes=notes)
+    groups = run.poses.by_group()
+    if group >= len(groups):
+        raise UsageError(f"--group {group}: {path} has {len(groups)} {plural(len(groups), 'group')}, numbered from 0")
+    if len(groups) > 1:
+        sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
+        notes.append(
+            f"this is group {group} of {len(groups)}, each with its own frame and scale; --group N "
+            f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
+        )
+    chosen = groups[group]
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
     mesh_file = _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images=images, notes=notes)
@@ -104,27 +117,6 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         ahead=ahead,
         notes=tuple(notes),
     )
-
-
-def _scene_of_ply(path: Path) -> ShownScene:
-    cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
-    if cloud is not None and not cloud.count:
-        raise InputError(f"{path}: contains no points, so there is nothing to show. Check the program that wrote it")
-    return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
-
-
-def _group_of(run: RunSummary, group: int, path: Path, *, notes: list[str]) -> PosesSummary:
-    """Return the poses of a group; if there are several groups, a note names the others."""
-    groups = run.poses.by_group()
-    if group >= len(groups):
-        raise UsageError(f"--group {group}: {path} has {len(groups)} {plural(len(groups), 'group')}, numbered from 0")
-    if len(groups) > 1:
-        sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
-        notes.append(
-            f"this is group {group} of {len(groups)}, each with its own frame and scale; --group N "
-            f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
-        )
-    return groups[group]
 
 
 def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:

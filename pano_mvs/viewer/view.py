@@ -27,35 +27,20 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What a window or an image shows, and how; the options of `pano-mvs view`.
+    """What a window or an image shows, and how; the options of `pano-mvs view`."""
 
-    Attributes:
-        images: folder of the panoramas; None: where the run read them.
-        screenshot: image file to write instead of opening a window.
-        view: "overview", "top", "front" or "inside:NAME".
-        color: of the cloud, see `COLORINGS`.
-        surface: "cloud", "mesh" or "both"; empty for the cloud if it exists.
-        points: maximum number of points to draw; 0: all.
-        size: WIDTHxHEIGHT of the window in pixels.
-        labels: whether cameras are named.
-        blended: whether the cloud is shown within a panorama.
-        backs: whether points and triangles that face away from the viewer are shown.
-        group: group of poses to show; 0 is the largest.
-        ranges: whether a camera's ranges are shown inside it instead of its panorama.
-    """
-
-    images: str | Path | None = None
-    screenshot: str | Path | None = None
-    view: str = "overview"
-    color: str = "rgb"
-    surface: str = ""
-    points: int = POINT_BUDGET
-    size: str = "1280x860"
-    labels: bool = False
-    blended: bool = False
-    backs: bool = False
-    group: int = 0
-    ranges: bool = False
+    images: str | Path | None = None  # folder of the panoramas; None: where the run read them
+    screenshot: str | Path | None = None  # image file to write instead of opening a window
+    view: str = "overview"  # "overview", "top", "front" or "inside:NAME"
+    color: str = "rgb"  # of the cloud, see `COLORINGS`
+    surface: str = ""  # "cloud", "mesh" or "both"; empty for the cloud if it exists
+    points: int = POINT_BUDGET  # maximum number of points to draw; 0: all
+    size: str = "1280x860"  # WIDTHxHEIGHT of the window in pixels
+    labels: bool = False  # whether cameras are named
+    blended: bool = False  # whether the cloud is shown within a panorama
+    backs: bool = False  # whether points and triangles that face away from the viewer are shown
+    group: int = 0  # group of poses to show; 0 is the largest
+    ranges: bool = False  # whether a camera's ranges are shown inside it instead of its panorama
 
 
 def view_run(
@@ -114,7 +99,7 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     if cloud is not None:
         color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # raises if the colouring is not available
     points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
-    corners = mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
+    corners = _mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
     box = box_of(points if corners is None else corners, scene.centers)
     tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
@@ -123,26 +108,18 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     shown = {"labels": options.labels, "blended": options.blended, "backs": backs, "ranges": options.ranges}
     tour.begin(coloring=options.color, **shown)
     if options.surface:
-        tour.begin(surface=_surface(options.surface, scene))
+        if options.surface not in ("cloud", "mesh", "both"):
+            raise UsageError(f"--show {options.surface}: must be cloud, mesh or both")
+        missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
+        absent = [name for name in ("cloud", "mesh") if options.surface in (name, "both") and missing[name]]
+        if absent:
+            raise UsageError(f"--show {options.surface}: there is no {absent[0]}.ply in {scene.name}")
+        tour.begin(surface=options.surface)
     return tour
 
 
-def _surface(wanted: str, scene: ShownScene) -> str:
-    if wanted not in ("cloud", "mesh", "both"):
-        raise UsageError(f"--show {wanted}: must be cloud, mesh or both")
-    missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
-    absent = [name for name in ("cloud", "mesh") if wanted in (name, "both") and missing[name]]
-    if absent:
-        raise UsageError(f"--show {wanted}: there is no {absent[0]}.ply in {scene.name}")
-    return wanted
-
-
-def mesh_points(path: Path) -> NDArray[np.float32]:
-    """Return the vertices of a mesh, (N, 3) float32.
-
-    Raises:
-        InputError: if it cannot be read.
-    """
+def _mesh_points(path: Path) -> NDArray[np.float32]:
+    """Return the vertices of a mesh, (N, 3) float32."""
     from pano_mvs.io.ply import read_ply_points
 
     points = read_ply_points(path)

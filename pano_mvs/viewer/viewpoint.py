@@ -162,14 +162,3 @@ def length_text(length: float, unit: str) -> str:
     if unit != "m":
         return f"{length:.4g} {unit}"
     return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
-
-
-def bar_text(length: float, unit: str) -> str:
-    """Return a round length with its unit, as text."""
-    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
-
-
-def bar_length(extent: float) -> float:
-    """Return the largest length of the form 1, 2 or 5 × 10ⁿ that is at most a quarter of an extent."""
-    power = 10.0 ** np.floor(np.log10(extent / 4))
-    return float(next(step * power for step in (5, 2, 1) if step * power <= extent / 4 * (1 + 1e-9)))

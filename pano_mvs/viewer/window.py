@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
 from pano_mvs.core.text import plural
 from pano_mvs.io.ply import open_ply_points
 from pano_mvs.viewer.actors import (
@@ -23,7 +24,7 @@ from pano_mvs.viewer.actors import (
 )
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour, TourState
-from pano_mvs.viewer.viewpoint import Viewpoint, bar_length, bar_text, length_text
+from pano_mvs.viewer.viewpoint import Viewpoint, length_text
 
 TEXTURED = 64
 """Maximum number of cameras, the nearest ones, that are spheres with pictures; all others are dots."""

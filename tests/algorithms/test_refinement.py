@@ -26,8 +26,8 @@ from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, roll_panorama
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.paint import noise as solid_noise
 from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.room import noise as solid_noise
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map
 from tests.known import known
 from tests.oracles import range_filters as oracle

@@ -14,12 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.io.rig_calibration import MODELS, read_rig
 from pano_mvs.scene import FilePart
-from pano_mvs.stages.frame import LevelParams, ScaleParams
+from pano_mvs.stages.frame import ScaleParams
 from pano_mvs.stages.rigs import DualFisheyeParams
 from pano_mvs.stages.source_video import VideoParams
 from pano_mvs.testing.conformance import stage_contract_tests
@@ -29,6 +30,8 @@ from tests.docs.pages import ROOT, block, copy_plugin, text_of
 from tests.io.images.videos import write_video
 from tests.stored import read_picture
 from tests.synthetic.capture_files import write_capture
+
+LevelParams = Registry.installed().stages["poses.level"].params_type
 
 INPUT, RIGS = text_of("input.md"), text_of("rigs.md")
 

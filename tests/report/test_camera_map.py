@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
+from pano_mvs.algorithms.poses.frame.vertical import level_poses
 from pano_mvs.report import camera_map
 from pano_mvs.report.camera_map import CameraMap
 from pano_mvs.results.records import PosesSummary

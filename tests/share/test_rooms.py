@@ -12,7 +12,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from pano_mvs.share import ShareOptions, share_run
-from pano_mvs.share.rooms import Sight, given_rooms, rooms_by_sight, rooms_of
+from pano_mvs.share.share import Sight, given_rooms, rooms_by_sight, rooms_of
 from tests.share.box_run import NAMES, box_run
 from tests.share.test_share import value_of
 

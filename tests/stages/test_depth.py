@@ -12,12 +12,16 @@ import pytest
 from pydantic import ValidationError
 
 from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import spec_of
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import FilePart, Panorama, Pose, RangeMap
 from pano_mvs.stages import depth
 from pano_mvs.stages.depth import PatchMatchParams, SweepParams, exchange, patchmatch, sweep, sweep_memory_bytes
-from pano_mvs.stages.filters import GaussianParams, MedianParams, bilateral_solver, consistency, fill, planes
+from pano_mvs.stages.filters import bilateral_solver, consistency, fill, planes
+
+MedianParams = Registry.installed().stages["filters.median"].params_type
+GaussianParams = Registry.installed().stages["filters.gaussian"].params_type
 
 PIXELS = 512 * 1024
 

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import angle_between, ray_grid
 from pano_mvs.io.colmap.workspace import read_colmap_map
@@ -29,11 +30,14 @@ from pano_mvs.stages.exports.colmap import (
     colmap_faces,
     colmap_masks,
 )
-from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
+from pano_mvs.stages.fusion import surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.stored import read_picture
 from tools.benchmarks.colmap_dense import deliver, fused_points, wall_distances, write_workspace
 from tools.benchmarks.dense_chain import context
+
+SurfaceParams = Registry.installed().stages["points.surface"].params_type
+TrackedParams = Registry.installed().stages["points.tracked"].params_type
 
 SIZE = (256, 512)
 NAMES = ("a/000.png", "a/b/001.png", "002.jpg")

@@ -14,9 +14,11 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import PointCloud, Pose, RangeMap
-from pano_mvs.stages.fusion import FusionParams, vote
+from pano_mvs.stages.fusion import vote
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
+
+FusionParams = Registry.installed().stages["fusion.vote"].params_type
 
 FEW = {"planes": 12, "near": 0.5, "far": 6.0}
 BOX = FEW | {"aggregation": "box"}

@@ -16,6 +16,7 @@ import pytest
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.ply import read_ply
@@ -24,7 +25,7 @@ from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
-from pano_mvs.stages.depth import ExchangeParams, PatchMatchParams, SweepParams, exchange, patchmatch, sweep
+from pano_mvs.stages.depth import PatchMatchParams, SweepParams, exchange, patchmatch, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
@@ -39,11 +40,16 @@ from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, splat_bundle
 from pano_mvs.stages.filters import ConsistencyParams, consistency
-from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
-from pano_mvs.stages.fusion import FusionParams, TrackedParams, tracked, vote
+from pano_mvs.stages.frame import BaselineParams, ScaleParams, level, scale
+from pano_mvs.stages.fusion import tracked, vote
 from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 from tests.stored import write_npz
+
+FusionParams = Registry.installed().stages["fusion.vote"].params_type
+TrackedParams = Registry.installed().stages["points.tracked"].params_type
+LevelParams = Registry.installed().stages["poses.level"].params_type
+ExchangeParams = Registry.installed().stages["depth.exchange"].params_type
 
 _LARGE = ("000.png", "001.png", "003.png")
 # The smaller room is the same capture's, under other names, in a world that is turned, moved and half as large.

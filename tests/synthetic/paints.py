@@ -1,6 +1,6 @@
 """Colours of the surfaces of synthetic scenes."""
 
-from pano_mvs.testing.paint import Colors
+from pano_mvs.testing.room import Colors
 
 WHITE: Colors = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
 OAK: Colors = ((0.62, 0.44, 0.27), (0.42, 0.28, 0.17))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, ray_grid
-from pano_mvs.testing.paint import noise
+from pano_mvs.testing.room import noise
 
 Point = tuple[float, float, float]
 

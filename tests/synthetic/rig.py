@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import ray_grid
-from pano_mvs.testing.paint import noise
+from pano_mvs.testing.room import noise
 
 Drawn = tuple[FloatArray, NDArray[np.bool_]]
 

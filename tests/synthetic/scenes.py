@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.testing.paint import Texture
-from pano_mvs.testing.room import Room, default_room, render
+from pano_mvs.testing.room import Room, Texture, default_room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 from tests.synthetic.capture_files import write_views
 from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE

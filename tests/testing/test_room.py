@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, roll_panorama, rotation_from_rotvec, sample_panorama
-from pano_mvs.testing.paint import noise
-from pano_mvs.testing.room import Room, capture_poses, default_room, range_along, render
+from pano_mvs.testing.room import Room, capture_poses, default_room, noise, range_along, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
 from tests.synthetic.capture_files import write_capture
 

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
@@ -21,8 +22,6 @@ from pano_mvs.viewer.controller import Tour, camera_under, pixel_readout, point_
 from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
 from pano_mvs.viewer.viewpoint import (
     Viewpoint,
-    bar_length,
-    bar_text,
     box_of,
     length_text,
     looking_along,

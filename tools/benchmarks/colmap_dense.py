@@ -19,18 +19,22 @@ import pycolmap
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Names
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import read_ply_points
 from pano_mvs.scene import Files, Panorama, Poses, RangeMap
 from pano_mvs.scene.files import item_stems
 from pano_mvs.stages.exports.colmap import DenseParams, FacesParams, colmap_dense, colmap_faces
-from pano_mvs.stages.fusion import SurfaceParams, TrackedParams, surface, tracked
+from pano_mvs.stages.fusion import surface, tracked
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along
 from tests.synthetic.scenes import SCENES, Scene
 from tools.benchmarks.captures import Capture, scene_capture
 from tools.benchmarks.dense_chain import DenseChain, context, true_poses
 from tools.benchmarks.table import print_table
+
+SurfaceParams = Registry.installed().stages["points.surface"].params_type
+TrackedParams = Registry.installed().stages["points.tracked"].params_type
 
 _AT = 3.0
 

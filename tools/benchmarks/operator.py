@@ -33,7 +33,7 @@ from pano_mvs.core.arrays import Mask, Picture
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.image_file import decode_image
-from pano_mvs.testing.paint import noise
+from pano_mvs.testing.room import noise
 from tests.synthetic.persons import OUTFITS, Person, draw_people, person
 from tests.synthetic.scenes import courtyard
 from tools.benchmarks.captures import read_capture

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
-from pano_mvs.algorithms.poses.unit_translations import unit_translations
+from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations
 from pano_mvs.evaluation.poses import align_centers
 from pano_mvs.scene import Poses
 from pano_mvs.session.session import presets_folder

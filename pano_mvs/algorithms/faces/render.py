@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import nearest_pixels, sample_view
-from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.fusion.view import normals_from_range
 from pano_mvs.algorithms.ranges.agreement import MAX_SURFACE_STEP
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError

@@ -13,8 +13,6 @@ from pano_mvs.core.settings import Setting
 
 MaxKeypoints: TypeAlias = Annotated[int, Setting("maximum number, spread over the sphere by strength", ge=8)]
 
-_KEYPOINTS_PER_CELL = 8
-
 
 def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, radius_rad: float) -> NDArray[np.intp]:
     """Return the positions of key points without a stronger one within a radius; of equals, the first is kept.
@@ -52,7 +50,13 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
     order = np.argsort(-scores, kind="stable")
     if len(order) <= max_keypoints:
         return order
-    cells = _fibonacci_sphere(max(20, max_keypoints // _KEYPOINTS_PER_CELL))
+    # Directions that are spread nearly evenly, on a Fibonacci spiral.
+    count = max(20, max_keypoints // 8)
+    idx = np.arange(count) + 0.5
+    y = 1 - 2 * idx / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * idx
+    radius = np.sqrt(1 - y**2)
+    cells = np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)
     cell = np.asarray(cKDTree(cells).query(bearings[order])[1], np.intp)
     by_cell = np.argsort(cell, kind="stable")
     first_of_cell = np.searchsorted(cell[by_cell], np.arange(len(cells)))
@@ -60,12 +64,3 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
     rank[by_cell] = np.arange(len(order)) - first_of_cell[cell[by_cell]]
     chosen = np.sort(np.argsort(rank, kind="stable")[:max_keypoints])
     return order[chosen]
-
-
-def _fibonacci_sphere(count: int) -> FloatArray:
-    """Return `count` nearly evenly spread unit vectors, (count, 3)."""
-    idx = np.arange(count) + 0.5
-    y = 1 - 2 * idx / count
-    azimuth = np.pi * (1 + np.sqrt(5)) * idx
-    radius = np.sqrt(1 - y**2)
-    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)

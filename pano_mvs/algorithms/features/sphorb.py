@@ -26,7 +26,6 @@ from pano_mvs.geometry import pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _PAD_PX = 4
-_EDGE_RAD = float(np.arctan(2.0))  # angle between two neighbouring corners of an icosahedron
 # Lattice steps (u, v) to the six neighbours, counter-clockwise; the axes include 60°.
 NEIGHBOURS = np.array([[1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
 
@@ -103,7 +102,8 @@ class GeodesicGrid:
 
     def _weights(self, places_uv: FloatArray) -> FloatArray:
         u, v = places_uv[..., 0] / self.steps, places_uv[..., 1] / self.steps
-        return np.sin(_EDGE_RAD * np.stack([1 - u - v, u, v], axis=-1)).astype(np.float64)
+        # Neighbouring corners of an icosahedron are arctan(2) apart.
+        return np.sin(float(np.arctan(2.0)) * np.stack([1 - u - v, u, v], axis=-1)).astype(np.float64)
 
 
 def hexagon_ring(radius: int) -> NDArray[np.int64]:
@@ -143,7 +143,7 @@ _MARGIN = 32  # at least _CLEARANCE lattice steps, stretched by 1.42, starting 5
 _CLEARANCE = 18  # number of cells around a corner that must not be masked: its patch, and the support of the smoothing
 # Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
 _ANTIALIAS, _CORNER_SIGMA = 0.5, 0.65
-_WINDOW_RADIUS, _WINDOW_SIGMA = 2, 1.0
+_WINDOW_SIGMA = 1.0
 _PATCH_SIGMA = 2.0
 
 
@@ -328,7 +328,7 @@ def lattice_disc(radius: int) -> FloatArray:
 
 @cache
 def _harris_window() -> tuple[NDArray[np.int64], FloatArray]:
-    rings = [np.zeros((1, 2), np.int64), *(hexagon_ring(r) for r in range(1, _WINDOW_RADIUS + 1))]
+    rings = [np.zeros((1, 2), np.int64), *(hexagon_ring(r) for r in range(1, 3))]
     window = np.concatenate(rings)
     squared = np.sum(plane_from_lattice(window) ** 2, axis=1)
     return window, np.exp(-0.5 * squared / _WINDOW_SIGMA**2) / 255**2

@@ -20,7 +20,6 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
-_ORB_SMOOTHING_PX = 1.2
 # Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
 # slide.
 _SIFT_EDGE_RATIO = 20
@@ -124,7 +123,25 @@ def extract_orb(
         # A mask would change which key points ORB keeps as the best of each level.
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
-        return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
+        points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
+        levels = np.array([k.octave for k in keypoints], np.intp)
+        pixels = np.empty_like(points)
+        size_xy = np.array(tile_image.shape[1::-1], np.float64)
+        for level in np.unique(levels):
+            here = levels == level
+            nominal = _ORB_SCALE**level
+            level_size = np.rint(size_xy / nominal)
+            picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
+            whole = np.rint(points[here] / nominal).astype(np.intp)
+            smooth = cv2.GaussianBlur(picture, (0, 0), 1.2)
+            strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
+            x, y = whole.T
+            tops = [
+                _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx])
+                for dx, dy in ((1, 0), (0, 1))
+            ]
+            pixels[here] = ((whole.astype(np.float64) + np.stack(tops, axis=-1)) + 0.5) * (size_xy / level_size)
+        return _Found(pixels, *_sizes_and_scores(keypoints), described)
 
     _check(image, mask)
     return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming", clearance=_ORB_CLEARANCE)
@@ -224,40 +241,6 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return rooted
 
 
-def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], tile_image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return ORB's key points in pixels with (0, 0) at the corner, with subpixel positions.
-
-    OpenCV multiplies the level's integer coordinates, counted from the CENTRE of its first pixel, by the level's scale;
-    so all but the lowest level are off by (s − 1) / 2 pixels. The actual scale of a level is that of its size.
-    """
-    points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
-    levels = np.array([k.octave for k in keypoints], np.intp)
-    pixels = np.empty_like(points)
-    size_xy = np.array(tile_image.shape[1::-1], np.float64)
-    for level in np.unique(levels):
-        here = levels == level
-        nominal = _ORB_SCALE**level
-        level_size = np.rint(size_xy / nominal)
-        picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
-        whole = np.rint(points[here] / nominal).astype(np.intp)
-        pixels[here] = (_blob_tops(picture, whole) + 0.5) * (size_xy / level_size)
-    return pixels
-
-
-def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the subpixel peaks of the Laplacian near pixels (N, 2), (0, 0) being the first pixel's centre.
-
-    These are the maxima of parabolas through its absolute value along x and along y, at most half a pixel away.
-    """
-    smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
-    strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
-    x, y = whole_px.T
-    tops = [
-        _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx]) for dx, dy in ((1, 0), (0, 1))
-    ]
-    return whole_px.astype(np.float64) + np.stack(tops, axis=-1)
-
-
 def _parabola_top(
     before: NDArray[np.float64], center: NDArray[np.float64], after: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -316,3 +299,33 @@ def _owned_pixels(tile: PinholeView, tile_idx: int) -> NDArray[np.uint8]:
         near = beyond_face_rad(bearings, tile_idx) < 2.0 / tile.focal_px
         mask[first : first + 256] = np.where(near, np.uint8(255), np.uint8(0))
     return mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographKeypoints:
+    """Key points of a photograph, strongest first."""
+
+    pixels_px: NDArray[np.float64]  # (N, 2) float64 in pixels of the photograph as stored, (0, 0) its upper-left corner
+    descriptors: NDArray[np.float32]  # (N, 128) float32, RootSIFT as in `extract_sift`
+
+
+def photograph_keypoints(picture: NDArray[np.uint8], *, max_keypoints: int = 6000) -> PhotographKeypoints:
+    """Return the strongest SIFT key points of a photograph.
+
+    Args:
+        picture: (H, W, 3) uint8 RGB.
+        max_keypoints: maximum number of key points.
+    """
+    gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    # Photographs are reduced to this size: panoramas have fewer pixels per degree anyway.
+    scale = min(1.0, 1600 / max(gray.shape))
+    if scale < 1:
+        size_xy = [max(1, round(side * scale)) for side in gray.shape[::-1]]
+        gray = cv2.resize(gray, size_xy, interpolation=cv2.INTER_AREA)
+    keypoints, descriptors = sift_detector().detectAndCompute(gray, None)
+    if descriptors is None:
+        return PhotographKeypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    strongest = np.argsort([-k.response for k in keypoints], kind="stable")[:max_keypoints]
+    pixels = np.array([keypoints[idx].pt for idx in strongest]).reshape(-1, 2) + 0.5
+    back = np.array(picture.shape[1::-1]) / np.array(gray.shape[::-1])
+    return PhotographKeypoints(pixels * back, root_sift(descriptors[strongest]))

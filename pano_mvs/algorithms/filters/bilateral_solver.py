@@ -183,7 +183,6 @@ def _common_sides(
 
 # [1 2 1] along two spatial and three colour dimensions: the centre counts twice for each.
 _BLUR_CENTER = 10.0
-_BISTOCHASTIC_ITERATIONS = 10
 _TOLERANCE = 1e-4
 
 
@@ -333,7 +332,7 @@ def build_system(
     )
     count = len(vertex_keys)
     mass = kernels.sum_at_vertices(mass, vertices, count)
-    n, m = kernels.bistochastise(mass, *graph, _BLUR_CENTER, _BISTOCHASTIC_ITERATIONS)
+    n, m = kernels.bistochastise(mass, *graph, _BLUR_CENTER, 10)
     right = kernels.sum_at_vertices(right, vertices, count)
     return BilateralSystem(cells, elements, vertices, mass, gram, right, graph, n, m)
 

@@ -7,7 +7,7 @@ reliable ranges in and around each connected, uniformly coloured part of the pan
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -28,7 +28,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 _HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
 # The plane must be seen on most sides of the surface: extrapolation is unreliable.
 _SECTORS, _MIN_SECTORS = 8, 6
-_STEPS_BEYOND = 0.8, 1.3
 # Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
 # has this share of the pixels of that one.
 _CLEAR_SHARE, _NEARLY = 0.8, 0.8
@@ -102,7 +101,10 @@ def lay_planes(
     for fit, is_valid in zip(fits, valid, strict=True):
         chosen = fit
         if fit.share < parallel_share:
-            chosen = _parallel_fit(fit, clear, max_relative_error=max_relative_error)
+            # The best plane with a clear normal, unless the free fit holds clearly more pixels.
+            found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in clear]
+            best = max(found, key=lambda other: other.share, default=fit)
+            chosen = best if best.share >= _NEARLY * fit.share else fit
         if not (is_valid if chosen is fit else chosen.is_valid(rays, min_share)):
             continue
         surface = fit.surface & ~open_sky
@@ -162,7 +164,11 @@ def _plane_fits(
     weight = np.where(bare, 0.1, 1.0) * area
     margin = max(1, round(3 * height / 256))
     rays, inverse = ray_grid((height, width)), 1 / range_map.range.astype(np.float64)
-    for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
+    inside = labels >= 0
+    sizes = np.bincount(labels[inside], (area * np.degrees(1) ** 2)[inside], labels.size)
+    large = np.flatnonzero(sizes >= min_area_deg2)
+    for number in large[np.argsort(-sizes[large], kind="stable")]:
+        surface = labels == number
         support = squarely_dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
         if len(points) < _MIN_POINTS:
@@ -170,13 +176,6 @@ def _plane_fits(
         around, seen = rays[support][points], inverse[support][points]
         plane, on_plane = fit_plane(around, seen, max_relative_error=max_relative_error, rng=rng)
         yield _PlaneFit(surface, around, seen, plane, on_plane)
-
-
-def _parallel_fit(fit: _PlaneFit, normals: Sequence[FloatArray], *, max_relative_error: float) -> _PlaneFit:
-    """Return the best plane with one of these unit normals, (3,) each, or `fit` if it fits clearly more pixels."""
-    found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in normals]
-    best = max(found, key=lambda other: other.share, default=fit)
-    return best if best.share >= _NEARLY * fit.share else fit
 
 
 def _plane_along(fit: _PlaneFit, normal: FloatArray, *, max_relative_error: float) -> _PlaneFit:
@@ -237,14 +236,6 @@ def fit_plane(
     return plane, np.abs(points @ plane - 1) < max_relative_error
 
 
-def _large_surfaces(labels: NDArray[np.int64], area: FloatArray, least: float) -> list[Mask]:
-    """Return the parts with at least the minimum area, largest first."""
-    inside = labels >= 0
-    sizes = np.bincount(labels[inside], area[inside], labels.size)
-    large = np.flatnonzero(sizes >= least)
-    return [labels == number for number in large[np.argsort(-sizes[large], kind="stable")]]
-
-
 def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:
     """Return positions among the supporting pixels, drawn by weight."""
     weights = weight[support]
@@ -256,7 +247,7 @@ def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArr
 def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, *, inverse: FloatArray) -> bool:
     """Return whether a plane stays within its points' ranges on the whole surface, and is seen on most sides of it."""
     laid = surface @ plane
-    low, high = _STEPS_BEYOND
+    low, high = 0.8, 1.3
     if len(rays) < _MIN_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
         return False
     middle = surface.mean(axis=0)

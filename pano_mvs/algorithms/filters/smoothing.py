@@ -50,10 +50,6 @@ def gaussian_range(
     return with_ranges(range_map, smoothed)
 
 
-# OpenCV supports float images with these window sizes only, ten times faster than a sort.
-_OPENCV_WINDOWS = (3, 5)
-
-
 @checks_settings
 def median_range(range_map: RangeMap, *, window: Window = 5) -> RangeMap:
     """Replace each valid range by the median of the valid ranges around it.
@@ -68,7 +64,7 @@ def median_range(range_map: RangeMap, *, window: Window = 5) -> RangeMap:
         UsageError: if the window is out of bounds or wider than the panorama.
     """
     padded = pad_panorama(range_map.range, window // 2)
-    if window in _OPENCV_WINDOWS:
+    if window in (3, 5):  # which OpenCV supports for floats, ten times faster than a sort
         inner = slice(window // 2, -(window // 2))
         filtered = cv2.medianBlur(np.nan_to_num(padded), window)[inner, inner].copy()
         holes = cv2.dilate(np.isnan(padded).astype(np.uint8), square_window(window // 2))[inner, inner]

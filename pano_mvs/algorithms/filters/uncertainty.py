@@ -24,8 +24,6 @@ _SCALE = 5.4
 _PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS = 4, 2, 8
 # Smaller reprojection errors, and less roughness, are chance; both in pixels.
 _MIN_ERROR_PX, _MIN_ROUGH_PX = 0.02, 0.01
-# Errors grow slowly with the roughness of the surface.
-_ROUGH_POWER = 0.25
 # Near steps like this, in ln range, a pixel may have the range of the other surface.
 _STEP, _STEP_WEIGHT, _STEP_POWER = 0.1, 5.0, 1 / 3
 LEAST_UNCERTAINTY, MOST_UNCERTAINTY = 0.0005, 0.5
@@ -58,21 +56,17 @@ def confirmed_uncertainty(
     sigma /= np.maximum(box_sum(np.where(consistent, support, 0), near), 1e-9)
     sigma = np.maximum(np.sqrt(np.maximum(sigma, 0)), _MIN_ERROR_PX)
     motion = np.maximum(motion, 1e-9)
-    sigma *= np.maximum(_roughness(consistent, ranges, rough) * motion, _MIN_ROUGH_PX) ** _ROUGH_POWER
+    # The rms relative deviation of 1/range from the mean around it, of the consistent pixels of a window.
+    inverse = np.where(consistent, 1 / np.where(consistent, ranges, 1).astype(np.float64), 0)
+    count = np.maximum(box_sum(consistent.astype(np.float64), rough), 1)
+    mean = np.maximum(box_sum(inverse, rough) / count, 1e-12)
+    deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), rough) / count
+    sigma *= np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, _MIN_ROUGH_PX) ** 0.25  # errors grow slowly with it
     sigma *= (1 + _STEP_WEIGHT * _share(step > _STEP, wide)) ** _STEP_POWER
     sigma *= _SCALE / motion
     return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(
         np.float16
     )
-
-
-def _roughness(consistent: Mask, ranges: NDArray[np.float32], radius: int) -> FloatArray:
-    """Return the rms relative deviation of 1/range from the mean around it, of the consistent pixels of a window."""
-    inverse = np.where(consistent, 1 / np.where(consistent, ranges, 1).astype(np.float64), 0)
-    count = np.maximum(box_sum(consistent.astype(np.float64), radius), 1)
-    mean = np.maximum(box_sum(inverse, radius) / count, 1e-12)
-    deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), radius) / count
-    return np.asarray(np.sqrt(np.maximum(deviation, 0)))
 
 
 def _share(part: Mask, radius: int) -> FloatArray:

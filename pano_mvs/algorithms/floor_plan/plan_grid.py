@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 from pano_mvs.core.arrays import FloatArray
 
 _BINS = 400
-_SMOOTHING_BINS = 1.5
 # A camera that is higher than this times the height of the lowest one above its floor stands on another floor.
 _SAME_STOREY = 2.0
 _QUANTILES = (0.005, 0.995)
@@ -97,7 +96,7 @@ def _levels(heights: FloatArray, step: float) -> list[float]:
         return []
     start = float(heights.min())
     counts = np.bincount(((heights - start) / step).astype(np.int64)).astype(np.float64)
-    density = gaussian_filter1d(np.pad(counts, 4), _SMOOTHING_BINS, mode="constant")
+    density = gaussian_filter1d(np.pad(counts, 4), 1.5, mode="constant")
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]))
     strong = peaks[density[peaks] >= 0.25 * density.max()]
@@ -109,7 +108,6 @@ LAYERS = 32
 """Number of layers between floor and ceiling in which walls are looked for."""
 
 _WALL_FROM, _WALL_TO = 0.08, 0.95
-_BELOW_FLOOR = 0.05
 _HEIGHT_BITS = 20
 
 
@@ -232,7 +230,7 @@ class PlanGrid:
         )
 
     def _add_photo(self, points: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
-        low = self.storey.floor - _BELOW_FLOOR * self.storey.height
+        low = self.storey.floor - 0.05 * self.storey.height
         index, inside = self.extent.cells(points[:, :2])
         inside &= (points[:, 2] >= low) & (points[:, 2] <= self._cut)
         share = (points[inside, 2] - low) / max(self._cut - low, 1e-12)
@@ -259,8 +257,6 @@ def _bits(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
 
 
 _PAPER, _INK, _CAMERA = (255, 255, 255), (24, 32, 56), (214, 72, 36)
-_STRIP_SHARE = 0.06
-_BAR_SHARE = 0.25
 _SUBPIXEL_BITS = 4
 
 
@@ -270,14 +266,18 @@ def bar_length(width: float) -> float:
     >>> bar_length(10.0), bar_length(0.9)
     (2.0, 0.2)
     """
-    limit = _BAR_SHARE * width
-    power = 10.0 ** np.floor(np.log10(limit))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= limit))
+    power = 10.0 ** np.floor(np.log10(width / 4))
+    return float(next(step * power for step in (5, 2, 1) if step * power <= width / 4 * (1 + 1e-9)))
+
+
+def bar_text(length: float, unit: str) -> str:
+    """Return a round length with its unit, as text."""
+    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
 
 
 def strip_px(size_hw: tuple[int, int]) -> int:
     """Return the rows of the strip for the scale bar below a plan of a size."""
-    return max(36, round(_STRIP_SHARE * max(size_hw)))
+    return max(36, round(0.06 * max(size_hw)))
 
 
 def draw_plan(

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.smooth import smooth_surfaces
 from pano_mvs.algorithms.fusion.view import (
     ConfidentView,
@@ -18,6 +17,7 @@ from pano_mvs.algorithms.fusion.view import (
     ViewWindow,
     held_rays,
     nearest_views,
+    normals_from_range,
 )
 from pano_mvs.algorithms.panoramas import columns_per_step
 from pano_mvs.algorithms.ranges.agreement import MAX_REPROJECTION_PX, MAX_SURFACE_STEP
@@ -31,7 +31,6 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 Grid = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _SUPPORT_RADIUS = 2
-_MAX_SUPPORT_STEP = 0.03
 
 
 def fuse_stream(
@@ -133,7 +132,9 @@ def _points_of(
     height, width = reference.ranges.shape
     rays = held_rays((height, width))
     written = _chosen_pixels((height, width), settings)
-    normals = _normals_or_views(reference, rays, written, threads=threads)
+    normals = normals_from_range(reference.ranges, given=reference.normals, wanted=written, threads=threads)
+    unknown = ~np.isfinite(normals[..., 0])
+    normals[unknown] = -rays[unknown]  # towards the camera
     tallies, grid = _own_tallies(reference, rays, normals), sines_of_grid((height, width))
     for window, idx, tie in sources:
         _compare_with(
@@ -230,9 +231,7 @@ def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings)
     kept = confirmed
     if settings.min_support is not None and settings.min_views > 1:
         stretches = columns_per_step((shape[0], shape[1]), steps=2 * _SUPPORT_RADIUS + 1)
-        supported = find_supported(
-            reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, _MAX_SUPPORT_STEP, settings.min_support
-        )
+        supported = find_supported(reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, 0.03, settings.min_support)
         kept = confirmed | (supported & (agreeing == settings.min_views - 1) & (tallies.violations == 0))
     if settings.max_uncertainty is not None and reference.uncertainty is not None:
         kept = kept & (tallies.deviations() <= settings.max_uncertainty * reference.ranges)
@@ -245,16 +244,6 @@ def _tie(*, is_earlier: bool) -> float:
     # one must be 3 % better. Points between these limits are written twice, so that small errors of the footprints
     # leave no gap.
     return 0.97 if is_earlier else 1.05
-
-
-def _normals_or_views(
-    reference: ConfidentView, rays: NDArray[np.float64], wanted: NDArray[np.bool_], *, threads: int
-) -> NDArray[np.float32]:
-    """Return unit normals, (H, W, 3): given or, where wanted, fitted ones, else the direction to the camera."""
-    normals = normals_from_range(reference.ranges, given=reference.normals, wanted=wanted, threads=threads)
-    unknown = ~np.isfinite(normals[..., 0])
-    normals[unknown] = -rays[unknown]
-    return normals
 
 
 def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArray[np.bool_]:

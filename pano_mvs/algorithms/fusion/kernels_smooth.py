@@ -25,7 +25,6 @@ _RADIX = 1 << _RADIX_BITS
 _MIN_COSINE = 0.8
 _MAX_DEVIATIONS = 2.5
 _MAX_OFF_CENTER = 0.3
-_MIN_NEIGHBOURS = 6
 
 
 @inlined
@@ -229,4 +228,4 @@ def find_heights(
             count += add_block(weighed, inside, a, b)
         height, _, _, ok = solve_symmetric(a, b)
         is_central = a[1] * a[1] + a[2] * a[2] < _MAX_OFF_CENTER * _MAX_OFF_CENTER * a[0] * a[0]
-        heights[i] = height if ok and count >= _MIN_NEIGHBOURS and is_central else 0.0
+        heights[i] = height if ok and count >= 6 and is_central else 0.0

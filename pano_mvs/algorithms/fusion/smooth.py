@@ -19,7 +19,6 @@ IntArray = NDArray[np.int64]
 _PASSES = 2
 # Neighbours count within this many standard deviations of the point's position.
 _REACH = 2.0
-_POINTS_PER_COLUMN = 12
 # Points that are sorted into cells together, and those that are moved together: they bound the memory.
 _POINTS_OF_SLAB, _POINTS_OF_PART = 2_000_000, 1_000_000
 _MAX_LEVELS = 16
@@ -65,7 +64,7 @@ def surface_heights(
     sigmas: NDArray[np.float32],
     *,
     chosen: NDArray[np.bool_] | None = None,
-    per_column: int = _POINTS_PER_COLUMN,
+    per_column: int = 12,
     points_of_slab: int = _POINTS_OF_SLAB,
     threads: int = 1,
 ) -> FloatArray:

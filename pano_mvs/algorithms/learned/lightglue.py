@@ -13,8 +13,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.learned.aliked import level_tiles
 from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE_PX, Array, Network, Networks
-from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings

@@ -18,9 +18,6 @@ from pano_mvs.geometry import rotation_from_rotvec, skew
 INTRINSICS = 7  # f, cx, cy, k1, k2, k3, k4
 RIG = slice(2 * INTRINSICS, 2 * INTRINSICS + 6)
 CAMERAS = RIG.stop
-_FIRST_DAMPING = 1e-4
-_GAUGE_WEIGHT = 1e8
-_LEAST_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +79,7 @@ def adjust_rig(
         scale_px: residual at which an observation starts to lose influence.
         max_iterations: maximum number of steps.
     """
-    damping, turned = _FIRST_DAMPING, np.zeros(3)
+    damping, turned = 1e-4, np.zeros(3)
     system = _System(bundle, freedom, turned, scale_px=scale_px)
     for _ in range(max_iterations):
         step, point_steps = system.step(damping)
@@ -153,14 +150,14 @@ class _System:
             place = CAMERAS + 6 * farthest + 3
             along = bundle.translations[farthest] / lengths[farthest]
             self._camera_block[place : place + 3, place : place + 3] += (
-                _GAUGE_WEIGHT / lengths[farthest] ** 2 * np.outer(along, along)
+                1e8 / lengths[farthest] ** 2 * np.outer(along, along)
             )
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the system without the points, its right-hand side, and the inverse of the points' blocks."""
         diagonal = np.einsum("pii->pi", self._point_blocks)
         # Seen from one place, a point may lie anywhere along its ray.
-        least = _LEAST_SHARE * diagonal.sum(axis=1, keepdims=True) + 1e-12
+        least = 1e-9 * diagonal.sum(axis=1, keepdims=True) + 1e-12
         inverse = np.linalg.inv(self._point_blocks + (damping * diagonal + least)[..., None] * np.eye(3))
         size = len(self._camera_side)
         eliminated = np.einsum("cpi,pij->cpj", self._both, inverse).reshape(size, -1)

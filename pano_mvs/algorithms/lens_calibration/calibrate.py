@@ -55,12 +55,10 @@ _SIGMA_FOCAL, _SIGMA_CENTER = 0.2, 0.05
 _SIGMA_DISTORTION = (0.1, 0.05, 0.02, 0.005)
 _SIGMA_TURN_RAD = float(np.radians(10))
 
-_RIM_SCALES = np.arange(0.85, 1.151, 0.01)
 _RIM_MIN, _RIM_THRESHOLD_DEG = 12, 1.5
 
 # Maximum error of a match in each round, and whether the offset of the second lens is adjusted.
 _ROUNDS = ((1.0, False), (0.3, True), (0.15, True))
-_MIN_ANGLE_DEG = 1.0
 _MIN_OBSERVATIONS = 300
 _MAX_RAY_STD_DEG = 0.1
 
@@ -242,7 +240,7 @@ def _start_rigs(
         for lens in (0, 1)
     )
     best_rotation, best_scale, best = np.eye(3), 1.0, np.zeros(len(p), np.bool_)
-    for scale in _RIM_SCALES if len(p) >= _RIM_MIN else ():
+    for scale in np.arange(0.85, 1.151, 0.01) if len(p) >= _RIM_MIN else ():
         rotation, inliers = estimate_rotation(
             _scaled(p, scale), _scaled(q, scale), rng=rng, threshold_rad=float(np.radians(_RIM_THRESHOLD_DEG))
         )
@@ -426,7 +424,7 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
         tracks.track_idx,
         count=tracks.count,
         max_error_rad=float(np.radians(max_error_deg)),
-        min_angle_rad=float(np.radians(_MIN_ANGLE_DEG)),
+        min_angle_rad=float(np.radians(1.0)),
     )
     order_idx = {capture: idx for idx, capture in enumerate(order)}
     bundle = RigBundle(

@@ -138,16 +138,11 @@ def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:
     nearest = np.full(grid_hw, np.inf, np.float32)
     np.minimum.at(nearest, pixels_containing(points.T, grid_hw), distances.astype(np.float32))
     found = np.where(np.isfinite(nearest), nearest, np.float32(0))
-    return _with_holes_filled(found)
-
-
-def _with_holes_filled(ranges: Plane) -> Plane:
-    """Return ranges, 0 where unknown, with small holes filled by the mean of those around; NaN elsewhere."""
-    padded = pad_panorama(ranges, 1)
+    padded = pad_panorama(found, 1)
     count = cv2.blur((padded > 0).astype(np.float32), (3, 3))[1:-1, 1:-1]
     mean = cv2.blur(padded, (3, 3))[1:-1, 1:-1] / np.maximum(count, 1e-6)
     filled = np.where(count >= 2.5 / 9, mean, np.float32(np.nan))
-    return np.asarray(np.where(ranges > 0, ranges, filled), np.float32)
+    return np.asarray(np.where(found > 0, found, filled), np.float32)
 
 
 def _agreed(seen: Plane) -> Plane:
@@ -198,15 +193,11 @@ def _differences(
     least = np.take_along_axis(differences, which[None], axis=0)[0]
     difference, expected = np.full(known.shape, np.nan, np.float32), np.full(own.shape, np.nan, np.float32)
     difference[known] = np.where(count >= 2, least, np.float32(np.nan))
-    expected[known & colors_at] = _nan_median(colors).T
-    return difference, expected
-
-
-def _nan_median(values: Plane) -> Plane:
-    """Return the median over the first axis of the values that are not NaN, the lower one of two; NaN without any."""
-    ordered = np.sort(values, axis=0)
+    # The median of the values that are not NaN, the lower one of two.
+    ordered = np.sort(colors, axis=0)
     middle = np.maximum(np.isfinite(ordered).sum(axis=0) - 1, 0) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
+    expected[known & colors_at] = np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0]).T
+    return difference, expected
 
 
 def _seen_pixels(other: OtherView, points: FloatArray) -> tuple[NDArray[np.intp], Mask]:

@@ -98,7 +98,11 @@ def moving_pixels(
         return Moving(nothing, nothing)
     expected = expected_view(picture, range_map, others)
     changed = np.nan_to_num(expected.difference, nan=0.0) > _CHANGED
-    shadow = _shadows(expected) & valid
+    # A shadow makes the ground darker than expected, by the same factor in all channels.
+    ratio = np.nan_to_num(expected.ratio, nan=1.0)
+    mean = ratio.mean(axis=-1)
+    tint = (ratio.max(axis=-1) - ratio.min(axis=-1)) / np.maximum(mean, 1e-6)
+    shadow = expected.ground & (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (tint < _MAX_TINT) & valid
     found = nothing.copy()
     seen = SeenPanorama(picture)
     vehicles = vehicles and not _has_ceiling(expected)
@@ -186,14 +190,6 @@ def _has_ceiling(expected: Expected) -> bool:
     above = expected.ranges[off_nadir_deg(size_hw) > 180 - _CEILING_DEG]
     known = above[np.isfinite(above)]
     return bool(len(known) > _MIN_CEILING_SHARE * len(above) and np.median(known) < _MAX_CEILING * expected.height)
-
-
-def _shadows(expected: Expected) -> Mask:
-    """Return the pixels of the ground that are darker than expected, by the same factor in all channels."""
-    ratio = np.nan_to_num(expected.ratio, nan=1.0)
-    mean = ratio.mean(axis=-1)
-    tint = (ratio.max(axis=-1) - ratio.min(axis=-1)) / np.maximum(mean, 1e-6)
-    return np.asarray(expected.ground & (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (tint < _MAX_TINT))
 
 
 def _without_gaps(found: Mask) -> Mask:

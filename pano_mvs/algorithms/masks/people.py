@@ -114,9 +114,6 @@ def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
     return narrow, wide
 
 
-_ROLLS_DEG = (-12.0, 12.0)
-
-
 @checks_settings
 def people(
     picture: Picture,
@@ -164,7 +161,18 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
     reduced = np.asarray(cv2.resize(area.astype(np.float32), MAP_HW[::-1], interpolation=cv2.INTER_AREA) >= 0.5)
     if not reduced.any():
         return 0.0, np.zeros_like(area)
-    looks = _views_of(reduced)
+    rays, weights = ray_grid(MAP_HW)[reduced], pixel_weights(MAP_HW)[reduced]
+    center = weights @ rays
+    center /= np.linalg.norm(center)
+    extent_deg = float(np.degrees(np.percentile(np.arccos(np.clip(rays @ center, -1, 1)), 95)))
+    # An area is seen again in the middle of views of its own, this many times as wide.
+    fov_deg = float(np.clip(2.4 * extent_deg, 40.0, 110.0))
+    # There is no upright direction within this angle of the nadir, so people there are not seen as the networks know
+    # them.
+    if center[1] > np.cos(np.radians(15.0)):
+        looks = [look(rolled(_DOWN, roll), fov_deg) for roll in np.radians([0, 90, 180, 270])]
+    else:
+        looks = [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in (-12.0, 12.0)]
     first = looks[0].on_map(seen.probability(looks[0]))
     if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= 0.6 for each in looks):
         return 0.0, np.zeros_like(area)
@@ -177,21 +185,6 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
 
 def _mean_in(probability: Map, area: Mask) -> float:
     return float(np.average(probability[area], weights=pixel_weights(area.shape)[area]))
-
-
-def _views_of(area: Mask) -> list[Look]:
-    """Return views with an area in their middle, in several orientations."""
-    rays, weights = ray_grid(MAP_HW)[area], pixel_weights(MAP_HW)[area]
-    center = weights @ rays
-    center /= np.linalg.norm(center)
-    extent_deg = float(np.degrees(np.percentile(np.arccos(np.clip(rays @ center, -1, 1)), 95)))
-    # An area is seen again in the middle of views of its own, this many times as wide.
-    fov_deg = float(np.clip(2.4 * extent_deg, 40.0, 110.0))
-    # There is no upright direction within this angle of the nadir, so people there are not seen as the networks know
-    # them.
-    if center[1] > np.cos(np.radians(15.0)):
-        return [look(rolled(_DOWN, roll), fov_deg) for roll in np.radians([0, 90, 180, 270])]
-    return [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in _ROLLS_DEG]
 
 
 def _at_size(probability: Map, size_hw: tuple[int, int]) -> Map:

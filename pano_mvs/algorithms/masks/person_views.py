@@ -36,18 +36,6 @@ def person_probability(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.clip(output.reshape(SIDE_PX, SIDE_PX), 0, 1)
 
 
-def person_outline(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return how likely each pixel shows what an upright picture shows in its middle, (256, 256) in [0, 1].
-
-    It is the segmentation of the network for poses, which outlines a person in the middle more exactly than
-    `person_probability` and works for whole bodies. Without a person, it outlines some other object.
-
-    `picture`: (256, 256, 3) uint8 RGB.
-    """
-    logits = _output(_POSE, picture, "Identity_2").reshape(SIDE_PX, SIDE_PX)
-    return np.asarray(1 / (1 + np.exp(-np.clip(logits, -30, 30))), np.float32)
-
-
 def person_presence(picture: NDArray[np.uint8]) -> float:
     """Return how likely an upright picture shows a person in its middle, in [0, 1].
 
@@ -172,8 +160,12 @@ class SeenPanorama:
         return found[:, ::-1] if mirrored else found
 
     def outline(self, look: Look, *, mirrored: bool = False) -> Map:
-        """Return how likely each pixel of a view, (256, 256), is of what is in its middle."""
-        found = person_outline(self.image(look, mirrored=mirrored))
+        """Return how likely each pixel of a view, (256, 256), is of what is in its middle.
+
+        The network for poses outlines a person there more exactly than `person_probability`; otherwise some object.
+        """
+        logits = _output(_POSE, self.image(look, mirrored=mirrored), "Identity_2").reshape(SIDE_PX, SIDE_PX)
+        found = np.asarray(1 / (1 + np.exp(-np.clip(logits, -30, 30))), np.float32)
         return found[:, ::-1] if mirrored else found
 
     def presence(self, look: Look, *, mirrored: bool = False) -> float:

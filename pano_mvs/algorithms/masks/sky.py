@@ -33,8 +33,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
-_RADII = (24, 6)
-_MIN_SEEDS = 40.0
 _TOLERANCE, _SPREAD, _MAX_TOLERANCE = 7.0, 3.0, 40.0
 _BAND_PX, _BAND_BESIDE_PX = 2, 3
 
@@ -61,13 +59,18 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
     `picture`: (H, W, 3) uint8. `seeds`: (H, W), at least one pixel.
     """
     levels = picture.astype(np.float64)
-    mean = _polynomial(levels, seeds)
+    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
+    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
+    step = max(1, int(seeds.sum()) // 4000)
+    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
+    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
+    mean = np.asarray(np.clip(terms @ factors, low, high))
     spread = np.full(seeds.shape, np.sqrt(float(((levels - mean)[seeds] ** 2).max(axis=-1).mean())))
-    for radius in _RADII:
+    for radius in (24, 6):
         if 2 * radius >= picture.shape[0]:
             continue
         count = box_sum(seeds.astype(np.float64), radius)
-        share = np.clip(count / _MIN_SEEDS, 0, 1)
+        share = np.clip(count / 40.0, 0, 1)
         local = box_sum(levels * seeds[..., None], radius) / np.maximum(count, 1)[..., None]
         mean = share[..., None] * local + (1 - share)[..., None] * mean
         squares = box_sum(largest_channel((levels - mean) ** 2) * seeds, radius) / np.maximum(count, 1)
@@ -100,16 +103,6 @@ def sharpened_sky(sky: Mask, colors: SkyColors, picture: Picture) -> Mask:
     return np.where(band, nearer, wide)
 
 
-def _polynomial(levels: NDArray[np.float64], seeds: Mask) -> NDArray[np.float64]:
-    """Return the quadratic function of direction that fits the colours of the seeds, limited to their range."""
-    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
-    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
-    step = max(1, int(seeds.sum()) // 4000)
-    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
-    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
-    return np.asarray(np.clip(terms @ factors, low, high))
-
-
 def _resized(values: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
     if values.shape[:2] == size_hw:
         return values
@@ -131,32 +124,18 @@ MAX_SOURCES = 4
 """More sources than this add little."""
 
 _MIN_WIDTH = 64
-# Grey levels between the darkest and the brightest pixel of a 3×3 window of a smooth area.
-_SMOOTH = 10
 # Errors in grey levels: of the sky at infinity, and by how much those at finite range may be less.
 _MAX_ERROR, _FLAT_RATIO, _FLAT_MARGIN = 4.0, 1.15, 0.5
-_PREFERS_RATIO, _PREFERS_MARGIN = 1.3, 0.1
-# Where there is no range: errors at infinity as a share of the standard deviation of the colours.
-_CONTENT_RATIO = 0.12
 # Without a preference for infinity: the most that may lie on one plane, and that other views may confirm.
 _MAX_PLANE_SHARE, _MAX_CONSISTENT = 0.7, 0.18
-# The smallest such area by which a sky is recognised; smaller ones are blinds and lamps.
-_MIN_FLAT_SHARE = 0.05
 _PLANE_TRIALS, _PLANE_TOLERANCE, _MIN_BORDER_POINTS = 200, 0.06, 30
 _SOLID_MARGIN = 3.0
 # Larger parts of the colours of the sky must agree at infinity too.
 _MAX_PART_SHARE = 0.005
 # Larger ones count as small if they differ by at most this number of grey levels on average.
 _MAX_EXACT_SHARE, _EXACT_LEVELS = 0.03, 5.0
-_MIN_AGREEING = 0.3
-# Farther from known sky, the colours of the sky are not known.
-_REACH_PX = 40
 _CLOUD_RADIUS_PX, _CLOUD_SHARE, _ROUGH_ERRORS = 3, 0.7, 3
 _ROUNDS = 3
-# If less than this share of an area lies away from its border, all of it is compared.
-_MIN_INNER = 0.3
-_CREEP_PX, _CREEP_LEVELS = 4, 16
-_ENCLOSED = 0.7
 # A window: the smallest and the largest pane, how far what is behind it is, and how many pixels beside must show it.
 _PANE_SHARES, _FAR_PARALLAX = (2e-4, 0.01), 0.125
 _BESIDE_PX, _MIN_BESIDE, _MIN_FAR_SHARE = 4, 8, 0.04
@@ -266,12 +245,14 @@ def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> tuple[
 
     If the sky is only seen through windows, other large smooth areas are walls and ceilings.
     """
-    possible = view.valid & ((contrast_around(view.picture, 1) < _SMOOTH) | _clouds(view))
+    # In a smooth area, the pixels of a window of 3×3 differ by fewer grey levels.
+    possible = view.valid & ((contrast_around(view.picture, 1) < 10) | _clouds(view))
     labels, weights = area_labels(possible), pixel_weights(possible.shape)
     sizes = np.bincount(labels[possible], weights[possible], labels.size)
     found, large = np.zeros_like(possible), np.flatnonzero(sizes >= min_share * weights.sum())
     for label in large:
-        if _is_sky(view, area := labels == label, rng, min_flat_share=_MIN_FLAT_SHARE):
+        # Smaller flat areas by which no sky is recognised are blinds and lamps.
+        if _is_sky(view, area := labels == label, rng, min_flat_share=0.05):
             found |= area
     if found.any():
         return found, np.zeros_like(found)
@@ -289,7 +270,10 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
     known = view.consistent & ~is_bare(view.picture)
     usual = float(np.median(parallax[known])) if known.any() else 0.0
     far = known & (parallax > 0) & (parallax < min(_FAR_PARALLAX, _MAX_FAR_RATIO * usual))
-    light = _could_be_light(view)
+    levels = view.picture.astype(np.float64)
+    brightness, blueness = largest_channel(view.picture), (levels[..., 2] + 4) / (levels[..., 0] + 4)
+    is_bright = brightness >= _quantile(brightness, _BRIGHTER_SHARE)
+    light = np.asarray(is_bright & (blueness >= _quantile(blueness, _BLUER_SHARE)))
     best, worst = np.fmin.reduce(at_infinity), np.nan_to_num(np.fmax.reduce(at_range))
     near_far = dilated(far, _BESIDE_PX)
     found: Mask = np.zeros(far.shape, np.bool_)
@@ -305,14 +289,6 @@ def _panes(view: _View, labels: NDArray[np.intp], sizes: NDArray[Any]) -> Mask:
         if is_open and moved and np.median(best[beside]) <= _MAX_BESIDE_ERROR:
             found |= area
     return found
-
-
-def _could_be_light(view: _View) -> Mask:
-    """Return the pixels (H, W) that are bright and not redder than most of the picture, as the sky is from indoors."""
-    levels = view.picture.astype(np.float64)
-    brightness, blueness = largest_channel(view.picture), (levels[..., 2] + 4) / (levels[..., 0] + 4)
-    is_bright = brightness >= _quantile(brightness, _BRIGHTER_SHARE)
-    return np.asarray(is_bright & (blueness >= _quantile(blueness, _BLUER_SHARE)))
 
 
 def _quantile(values: NDArray[Any], share: float) -> float:
@@ -335,15 +311,15 @@ def _clouds(view: _View) -> Mask:
 def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share: float = 0.0) -> bool:
     """Return whether the colours of an area agree at infinity, and nothing speaks for a finite range."""
     inner = area & ~dilated(~area, 2)
-    if inner.sum() < _MIN_INNER * area.sum():
+    if inner.sum() < 0.3 * area.sum():  # too little of it lies away from its border
         inner = area
     at_infinity, at_range = errors_of_area(view.picture, inner, view.comparisons)
     if not at_infinity <= min(_MAX_ERROR, _FLAT_RATIO * at_range + _FLAT_MARGIN):
         return False
     if np.isfinite(at_range):
-        if at_range >= _PREFERS_RATIO * at_infinity + _PREFERS_MARGIN:
+        if at_range >= 1.3 * at_infinity + 0.1:
             return True
-    elif at_infinity <= _CONTENT_RATIO * view.picture[inner].std(axis=0).max():
+    elif at_infinity <= 0.12 * view.picture[inner].std(axis=0).max():
         return True
     border = dilated(area, 3) & ~area & view.consistent & ~is_bare(view.picture)
     return bool(
@@ -390,7 +366,8 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
     sky, most = seeds, _MAX_PART_SHARE * pixel_weights(seeds.shape).sum()
     for _ in range(_ROUNDS):
         colors = sky_colors(view.picture, sky)
-        reached = view.valid & ~walls & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        # Farther from known sky, the colours of the sky are not known.
+        reached = view.valid & ~walls & dilated(sky, min(40, len(sky) // 2 - 1))
         alike = reached & colors.match(view.picture) & (~solid | dilated(sky, 1))
         labels = area_labels(alike & ~sky)
         inside, weights = labels >= 0, pixel_weights(sky.shape)
@@ -399,7 +376,7 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
         away = largest_channel(np.abs(view.picture - colors.mean))
         exact = np.bincount(labels[inside], (weights * away)[inside], labels.size) <= _EXACT_LEVELS * sizes
         taken = (sizes <= most) | (exact & (sizes <= _MAX_EXACT_SHARE / _MAX_PART_SHARE * most))
-        for label in np.flatnonzero(~taken & (agreeing >= _MIN_AGREEING * sizes)):
+        for label in np.flatnonzero(~taken & (agreeing >= 0.3 * sizes)):
             taken[label] = _is_sky(view, labels == label, rng)
         sky = sky | (inside & taken[labels])
         sky = _with_enclosed_parts(_crept(sky, view.picture, agrees), agrees | alike)
@@ -408,10 +385,10 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator, *, walls: Mask) -
 
 def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
     """Return the sky with neighbouring pixels that agree at infinity and whose colours continue it, as at a horizon."""
-    for _ in range(_CREEP_PX):
+    for _ in range(4):
         count = box_sum(sky.astype(np.float64), 2)
         local = box_sum(picture.astype(np.float64) * sky[..., None], 2) / np.maximum(count, 1)[..., None]
-        further = agrees & ~sky & (count > 0) & (largest_channel(np.abs(picture - local)) <= _CREEP_LEVELS)
+        further = agrees & ~sky & (count > 0) & (largest_channel(np.abs(picture - local)) <= 16)
         if not further.any():
             break
         sky = sky | further
@@ -421,4 +398,4 @@ def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
 def _with_enclosed_parts(sky: Mask, possible: Mask) -> Mask:
     """Return the sky with the parts, such as the edges of clouds, whose border is mostly sky."""
     labels = area_labels(possible & ~sky)
-    return sky | ((labels >= 0) & (border_shares(labels, sky) >= _ENCLOSED)[labels])
+    return sky | ((labels >= 0) & (border_shares(labels, sky) >= 0.7)[labels])

@@ -22,18 +22,13 @@ _MIN_PIXELS = 20
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A source as seen from the reference.
+    """A source as seen from the reference."""
 
-    Attributes:
-        at_infinity: (H, W, 3) colours of the source where each pixel would be if it were infinitely far away; NaN where
-            the source is masked.
-        at_range: the same at the pixel's range; NaN where it has none.
-        parallax_px: (H, W) pixels of the reference between the two; 0 without a range.
-    """
-
+    # (H, W, 3) colours of the source where each pixel would be if it were infinitely far away; NaN where the source is
+    # masked
     at_infinity: Colors
-    at_range: Colors
-    parallax_px: NDArray[np.float32]
+    at_range: Colors  # the same at the pixel's range; NaN where it has none
+    parallax_px: NDArray[np.float32]  # (H, W) pixels of the reference between the two; 0 without a range
 
 
 def compare_with_source(

@@ -142,8 +142,6 @@ MAX_VIEWS = 12
 """More views than this add nothing; give an evenly spread choice."""
 
 _MIN_WIDTH = 128
-_SEED_AGREEMENT, _SEED_SHARPNESS = 0.7, 0.03
-_GROWN_AGREEMENT, _GROWN_SHARPNESS = 0.5, -0.02
 _CLOSING_PX, _OVERHANG_PX = 2, 3
 
 
@@ -211,8 +209,8 @@ def static_content(
 
 def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:
     """Return connected areas of agreeing structure that contain seeds and lie in surroundings that move."""
-    agrees = structure & (agreement.agreement >= _GROWN_AGREEMENT) & (agreement.sharpness >= _GROWN_SHARPNESS)
-    seeds = structure & (agreement.agreement >= _SEED_AGREEMENT) & (agreement.sharpness >= _SEED_SHARPNESS)
+    agrees = structure & (agreement.agreement >= 0.5) & (agreement.sharpness >= -0.02)
+    seeds = structure & (agreement.agreement >= 0.7) & (agreement.sharpness >= 0.03)
     labels = area_labels(agrees | seeds)
     weights = pixel_weights(seeds.shape)
     enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= 12
@@ -249,7 +247,10 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
         # A part belongs to the content beside it if this share of its border lies on it, or on an outline.
         if weights[border & outline].sum() >= 0.5 * weights[border].sum():
             result |= area
-    result = _without_pinholes(result)
+    labels = area_labels(~result)
+    weights = pixel_weights(result.shape)
+    sizes = np.bincount(labels[~result], weights[~result], labels.size)
+    result[~result] = sizes[labels[~result]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
     # Windows that agree reach over the outline by most of their radius.
     return np.asarray((result & alike) | ~dilated(~result, _OVERHANG_PX))
 
@@ -259,13 +260,3 @@ def _gains(pictures: Sequence[Picture], pixels: Mask) -> NDArray[np.float64]:
     inner = pixels & ~dilated(~pixels, _CLOSING_PX)
     levels = np.array([picture[inner if inner.any() else pixels] for picture in pictures]) + DARK_LEVEL
     return np.asarray(np.median(np.median(levels, axis=0) / levels, axis=1))
-
-
-def _without_pinholes(found: Mask) -> Mask:
-    """Return areas with the small holes filled that no smaller area surrounds."""
-    labels = area_labels(~found)
-    weights = pixel_weights(found.shape)
-    sizes = np.bincount(labels[~found], weights[~found], labels.size)
-    filled = found.copy()
-    filled[~found] = sizes[labels[~found]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
-    return filled

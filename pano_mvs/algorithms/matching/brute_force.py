@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
-from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
+from pano_mvs.algorithms.matching.nearest_two import can_compare_as_integers, nearest_two, nearest_two_integers
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
@@ -53,17 +52,12 @@ def match_l2(
     first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = 0.8, mutual: bool = True
 ) -> NDArray[np.int32]:
     """Match descriptors, (N, D) and (M, D), by Euclidean distance; see `match_features`."""
-    found = nearest_descriptors(first, second)
+    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
+    found = nearest_two_integers(first, second) if whole else nearest_two(first, second)
     kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)
     if mutual:
         kept &= found.squared <= found.squared_back[found.nearest]
     return _matches(np.flatnonzero(kept), found.nearest, found.squared, mutual=mutual)
-
-
-def nearest_descriptors(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
-    """Return the two nearest of M ≥ 2 descriptors (M, D) for each of (N, D), by exact integers where possible."""
-    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
-    return nearest_two_integers(first, second) if whole else nearest_two(first, second)
 
 
 def one_to_one(kept: NDArray[np.intp], nearest: NDArray[np.intp], distance: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -46,10 +46,6 @@ def _larger(builder: Any, first: Any, second: Any) -> Any:
     return builder.select(builder.icmp_signed(">", first, second), first, second)
 
 
-def _smaller(builder: Any, first: Any, second: Any) -> Any:
-    return builder.select(builder.icmp_signed("<", first, second), first, second)
-
-
 def _products(builder: Any, steps: Any, row_places: list[Any], panel: Any) -> list[list[Any]]:
     """Emit the loop over pairs of components; return ROWS × _REGISTERS registers of scalar products."""
     pairs = cgutils.get_or_insert_function(
@@ -75,7 +71,7 @@ def _take(builder: Any, values: list[Any], indices: list[Any], places: list[Any]
     """Update one row's greatest value, second greatest value and column of the greatest."""
     best, second, nearest = (load_unaligned(builder, place) for place in places)
     for value, index in zip(values, indices, strict=True):
-        second = _larger(builder, second, _smaller(builder, best, value))
+        second = _larger(builder, second, builder.select(builder.icmp_signed("<", best, value), best, value))
         nearest = builder.select(builder.icmp_signed(">", value, best), index, nearest)
         best = _larger(builder, best, value)
     for value, place in zip((best, second, nearest), places, strict=True):

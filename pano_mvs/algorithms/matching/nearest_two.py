@@ -1,4 +1,4 @@
-"""Find the two nearest neighbours of each descriptor by Euclidean distance, and the nearest distances back."""
+"""Find the two nearest neighbours of each descriptor by Euclidean distance; of small integers by exact products."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
 
 _BLOCK_ROWS = 256
 
@@ -18,6 +20,11 @@ class NearestTwo:
     squared: NDArray[np.float32]  # (N,) float32, to the nearest one
     next_squared: NDArray[np.float32]  # (N,) float32, to the second nearest one
     squared_back: NDArray[np.float32]  # (M,) float32, from each descriptor of the other image to its nearest one
+
+    def mutual(self) -> NDArray[np.bool_]:
+        """Return which pass the ratio test of Lowe 2004, section 7.1, and are mutually the nearest, (N,)."""
+        distinct = self.squared < np.float32(0.8**2) * self.next_squared
+        return np.asarray(distinct & (self.squared <= self.squared_back[self.nearest]))
 
 
 def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
@@ -45,3 +52,105 @@ def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> Near
         closeness[row_idx, nearest[rows]] = -np.inf
         runner_up[rows] = closeness.max(axis=1)
     return NearestTwo(nearest, -2 * best, -2 * runner_up, -2 * best_back)
+
+
+# Sums of products stay below 3 × 2^27; padding of the last block is farther away, and the initial value even farther.
+_MAX_SQUARE = 1 << 27
+_FAR = 1 << 29
+_START = -(1 << 30)
+
+
+def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
+    """Return whether descriptors (N, D) are integers small enough for an exact comparison on this machine."""
+    from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
+
+    if not HAS_VECTOR:
+        return False
+    # The comparison is also false for NaN.
+    greatest = float(np.abs(descriptors).max(initial=0))
+    return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
+
+
+def nearest_two_integers(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
+    """Return the two nearest neighbours of each descriptor by Euclidean distance, like `nearest_two`, without rounding.
+
+    Args:
+        first: (N, D) integers for which `can_compare_as_integers` is true.
+        second: (M, D) likewise, M at least 2.
+
+    Raises:
+        UsageError: if there are fewer than two to choose from, or the descriptors are unsuitable.
+    """
+    if len(second) < 2 or first.shape[1] != second.shape[1]:
+        raise UsageError(f"cannot find the nearest two among descriptors {second.shape} for descriptors {first.shape}")
+    return nearest_two_packed(PackedDescriptors.of(first), PackedDescriptors.of(second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedDescriptors:
+    """Descriptors in the memory layout of the compiled comparison, to be compared with many others."""
+
+    count: int  # number of descriptors, N
+    rows: NDArray[np.int16]  # (padded N, padded D) int16
+    columns: NDArray[np.int16]  # the same in blocks of columns, with pairs of components together
+    row_squares: NDArray[np.int32]  # (padded N,) int32 squared lengths
+    column_squares: NDArray[np.int32]  # likewise, for the padded number of columns
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.generic]) -> PackedDescriptors:
+        """Return descriptors (N, D) packed.
+
+        Raises:
+            UsageError: if `can_compare_as_integers` is false for them.
+        """
+        from pano_mvs.algorithms.matching import kernels_vector_match as kernels
+
+        if not can_compare_as_integers(descriptors):
+            raise UsageError("descriptors must be small integers, on a machine with vector instructions")
+        rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
+        packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
+        count = len(descriptors)
+        return cls(count, rows, np.ascontiguousarray(packed), _squares(rows, count), _squares(columns, count))
+
+
+def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
+    """Return the result of `nearest_two_integers`; `second` holds two or more descriptors of the same length."""
+    from pano_mvs.algorithms.matching import kernels_vector_match as kernels
+
+    state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)
+    column_best = np.full(len(second.column_squares), _START, np.int32)
+    kernels.compare_all(first.rows, second.columns, first.row_squares, second.column_squares, state, column_best)
+    best, second_best, nearest = _over_lanes(state[: first.count])
+    squares = first.row_squares[: first.count]
+    return NearestTwo(
+        nearest=nearest,
+        squared=(squares - best).astype(np.float32),
+        next_squared=(squares - second_best).astype(np.float32),
+        squared_back=(second.column_squares - column_best)[: second.count].astype(np.float32),
+    )
+
+
+def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.int16]:
+    """Return descriptors as 16-bit numbers, zero-padded to a multiple of rows and an even number of columns."""
+    count, size = descriptors.shape
+    filled = np.zeros((-(-count // multiple) * multiple, size + size % 2), np.int16)
+    filled[:count, :size] = descriptors
+    return filled
+
+
+def _squares(descriptors: NDArray[np.int16], count: int) -> NDArray[np.int32]:
+    """Return the squared lengths; those after the first `count` are larger than any distance."""
+    squares = np.full(len(descriptors), _FAR, np.int32)
+    squares[:count] = np.einsum("nd,nd->n", descriptors[:count], descriptors[:count], dtype=np.int32)
+    return squares
+
+
+def _over_lanes(state: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.intp]]:
+    """Return the largest and second largest value of each row, and the first column of the largest."""
+    best, second, column = state.transpose(1, 0, 2)
+    greatest = best.max(axis=1)
+    nearest = np.where(best == greatest[:, None], column, np.iinfo(np.int32).max).min(axis=1).astype(np.intp)
+    others = best.copy()
+    lanes = best.shape[1]
+    others[np.arange(len(best)), nearest % lanes] = second[np.arange(len(best)), nearest % lanes]
+    return greatest, np.maximum(others.max(axis=1), second.max(axis=1)), nearest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
 from typing import Annotated
 
 import numpy as np
@@ -10,20 +11,20 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pano_mvs.algorithms.matching.integer_descriptors import (
+from pano_mvs.algorithms.matching.nearest_two import (
+    NearestTwo,
     PackedDescriptors,
     can_compare_as_integers,
+    nearest_two,
     nearest_two_packed,
 )
-from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
-from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry.geodesy import local_from_lla
 from pano_mvs.scene import Features, GlobalDescriptor, Pairs
 
-_SHORTLISTED = 20
 _WINDOW, _NEAREST = 5, 10  # the defaults of pairs.sequential and pairs.position
 
 
@@ -296,7 +297,7 @@ def similarities(features: Collection[Features], *, sample: int = 400) -> FloatA
     """Return the similarity of images, (N, N): matches of samples of their key points, then their VLAD vectors."""
     names = [str(number) for number in range(len(features))]
     descriptors = {name: vlad_descriptor(one, sample=sample) for name, one in zip(names, features, strict=True)}
-    return -_dissimilarities(names, descriptors, _SHORTLISTED)
+    return -_dissimilarities(names, descriptors, 20)
 
 
 def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:
@@ -328,12 +329,9 @@ def sample_matches(
     matches = np.zeros((count, count))
     compare = _comparison(samples)
     for first, second in np.argwhere(listed).tolist():
-        if _comparable(samples[first], samples[second]):
-            found = compare(first, second)
-            distinct = found.squared < np.float32(0.8**2) * found.next_squared
-            matches[first, second] = int(
-                np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest]))
-            )
+        a, b = samples[first], samples[second]
+        if len(a) > 0 and len(b) >= 2 and a.shape[1] == b.shape[1]:  # of one kind, and enough for a ratio test
+            matches[first, second] = np.count_nonzero(compare(first, second).mutual())
     return matches + matches.T
 
 
@@ -345,6 +343,30 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
     return lambda first, second: nearest_two(samples[first], samples[second])
 
 
-def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
-    """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
-    return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
+def exhaustive_pairs(names: Sequence[str]) -> Pairs:
+    """Return every pair of images, in the order of the capture."""
+    return Pairs(tuple(combinations(names, 2)))
+
+
+def sequential_pairs(names: Sequence[str], *, window: int = 5, loop: bool = False) -> Pairs:
+    """Return the pairs of images that are at most `window` positions apart.
+
+    Args:
+        names: image names in the order in which they were taken.
+        window: each image is paired with this number of following images.
+        loop: whether the first image follows the last one.
+
+    Raises:
+        UsageError: if the window is less than 1.
+    """
+    if window < 1:
+        raise UsageError(f"the window of sequential pairs must be at least 1, got {window}")
+    count = len(names)
+    pairs = {
+        (min(first, second), max(first, second))
+        for first in range(count)
+        for second in (first + step for step in range(1, window + 1))
+        for second in ([second] if second < count else [second % count] if loop else [])
+        if first != second
+    }
+    return Pairs(tuple((names[first], names[second]) for first, second in sorted(pairs)))

@@ -8,7 +8,6 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-_EXPECTED_UTILIZATION = 0.75
 # Time grows with the square of the number of charts of a part: 100,000 triangles of a room take 10 CPU-s in 64 parts
 # (706 charts), 28 in 4 parts (632 charts), and over 97 as a whole.
 _TRIANGLES_OF_PART = 3000
@@ -57,7 +56,7 @@ def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels
     xatlas = import_module("xatlas")
     corners = vertices.astype(np.float64)[faces]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-    most = max_px * np.sqrt(_EXPECTED_UTILIZATION / max(area / 2, 1e-30))
+    most = max_px * np.sqrt(0.75 / max(area / 2, 1e-30))  # three quarters of a texture are used
     atlas = xatlas.Atlas()
     parts = [(part, *np.unique(faces[part], return_inverse=True)) for part in _parts(corners.mean(axis=1))]
     for part, used, local in parts:

@@ -23,7 +23,6 @@ from pano_mvs.algorithms.panoramas import filtered, sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
 
-_GREY = 128.0
 _TEXELS_OF_PART = 1 << 20  # bounds the memory
 
 
@@ -49,26 +48,13 @@ def vertex_colors(
             for channel in range(3):
                 sums[:, channel] += np.bincount(vertex, weight * colors[part][shown, channel], vertices)
     known = totals > 1e-3
-    result = np.full((vertices, 3), _GREY if not known.any() else 0.0)
+    result = np.full((vertices, 3), 128.0 if not known.any() else 0.0)
     if not known.any():
         return result.astype(np.float32)
     result[known] = sums[known] / totals[known, None]
     result[~known] = result[known].mean(axis=0)
     _diffuse(result, known, faces)
     return result.astype(np.float32)
-
-
-def fill_unseen(
-    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], of_vertices: FloatImage
-) -> None:
-    """Give the texels that are not seen the colour between those of their triangle's vertices, in place."""
-    for first in range(0, len(seen), _TEXELS_OF_PART):
-        part = slice(first, first + _TEXELS_OF_PART)
-        hidden = ~seen[part]
-        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
-        second, third = weights[:, :1], weights[:, 1:]
-        corners = of_vertices[faces[triangle]]
-        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
 
 
 def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -135,23 +121,19 @@ def view_gains(colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Flo
     seen = usable[:, shared]
     for channel in range(3):
         logs = np.log(np.maximum(colors[:, shared, channel].astype(np.float64), 1.0))
-        gains[:, channel] = np.exp(-_log_exposures(logs, seen))
+        exposure = np.zeros(len(logs))
+        robust = seen.astype(np.float64)
+        for _ in range(30):
+            surface = ((logs - exposure[:, None]) * robust).sum(axis=0) / robust.sum(axis=0)
+            differences = logs - surface
+            # A gain from few points is uncertain: as if this many further points had seen no difference.
+            exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + 30.0)
+            exposure -= exposure.mean()
+            # Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
+            residuals = (differences - exposure[:, None]) / 0.15
+            robust = seen / (1 + residuals**2)
+        gains[:, channel] = np.exp(-exposure)
     return np.clip(gains, *_GAIN_LIMITS)
-
-
-def _log_exposures(logs: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
-    exposure = np.zeros(len(logs))
-    robust = seen.astype(np.float64)
-    for _ in range(30):
-        surface = ((logs - exposure[:, None]) * robust).sum(axis=0) / robust.sum(axis=0)
-        differences = logs - surface
-        # A gain from few points is uncertain: as if this many further points had seen no difference.
-        exposure = (differences * robust).sum(axis=1) / (robust.sum(axis=1) + 30.0)
-        exposure -= exposure.mean()
-        # Differences of the logarithm beyond this are moved things, reflections or wrong ranges.
-        residuals = (differences - exposure[:, None]) / 0.15
-        robust = seen / (1 + residuals**2)
-    return exposure
 
 
 Loader = Callable[[int], PaintView]
@@ -239,7 +221,9 @@ def balanced_views(
     one at a time. `views`: number of panoramas. `threads`: number of threads; the result does not depend on it.
     """
     surface = Surface(vertices_in_world, faces)
-    centers = _triangle_centers(len(faces))
+    count = len(faces)
+    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
+    centers = Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
     colors = np.zeros((views, len(centers.triangle), 3), np.float32)
     weights = np.zeros((views, len(centers.triangle)), np.float32)
     density, sharp = np.zeros(len(centers.triangle)), np.zeros(views)
@@ -292,7 +276,13 @@ def _painted(
         painting.add(look, gain.astype(np.float32), threads=threads)
     colors, seen = painting.colors()
     of_vertices = vertex_colors(colors, seen, texels, faces=surface.faces, vertices=len(surface.vertices_in_world))
-    fill_unseen(colors, seen, texels, faces=surface.faces, of_vertices=of_vertices)
+    for first in range(0, len(seen), _TEXELS_OF_PART):
+        part = slice(first, first + _TEXELS_OF_PART)
+        hidden = ~seen[part]
+        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
+        second, third = weights[:, :1], weights[:, 1:]
+        corners = of_vertices[surface.faces[triangle]]
+        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
     np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
     return colors.astype(np.uint8), seen
 
@@ -329,12 +319,6 @@ class _Painting:
         np.divide(self._sums, total[:, None], out=self._sums)
         self._sums += self._detail
         return self._sums, seen
-
-
-def _triangle_centers(count: int) -> Texels:
-    """Return the centres of evenly spread triangles as if they were texels."""
-    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
-    return Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
 
 
 def _reduced(view: PaintView) -> PaintView:

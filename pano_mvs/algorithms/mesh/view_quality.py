@@ -51,7 +51,11 @@ def pixel_quality(view: PaintView, surface_ranges: FloatImage, *, feather_px: fl
     shape = view.valid.shape
     if view.picture.shape[:2] != shape or surface_ranges.shape != shape:
         raise UsageError(f"a picture of {view.picture.shape[:2]} with a mask of {shape} and {surface_ranges.shape}")
-    border = surface_borders(surface_ranges)
+    inverse = pad_panorama((1 / surface_ranges).astype(np.float32), 1)  # 0 without a surface
+    here = inverse[1:-1, 1:-1]
+    along = np.abs(inverse[1:-1, :-2] - 2 * here + inverse[1:-1, 2:])
+    across = np.abs(inverse[:-2, 1:-1] - 2 * here + inverse[2:, 1:-1])
+    border = np.asarray(np.maximum(along, across) > 0.03 * here)
     worth = np.full(shape, _UNKNOWN, np.float32)
     if view.range_map is not None:
         if view.range_map.range.shape != shape:
@@ -61,16 +65,6 @@ def pixel_quality(view: PaintView, surface_ranges: FloatImage, *, feather_px: fl
     # Near a border, the pixel may show the other surface, but it is better than none.
     feather = np.maximum(np.square(np.minimum(near / feather_px, 1)), 1e-3)
     return np.where(view.valid, worth * feather, np.float32(0)).astype(np.float32)
-
-
-def surface_borders(ranges: FloatImage) -> Mask:
-    """Return the pixels, (H, W), at the border of a surface: where 1 / range is not linear, or ends."""
-    inverse = pad_panorama((1 / ranges).astype(np.float32), 1)  # 0 without a surface
-    here = inverse[1:-1, 1:-1]
-    along = np.abs(inverse[1:-1, :-2] - 2 * here + inverse[1:-1, 2:])
-    across = np.abs(inverse[:-2, 1:-1] - 2 * here + inverse[2:, 1:-1])
-    # The second difference of 1 / range, relative to it, at the border of a surface; on a plane it is 0.
-    return np.asarray(np.maximum(along, across) > 0.03 * here)
 
 
 def _range_worth(range_map: RangeMap, surface_ranges: FloatImage) -> FloatImage:

@@ -329,9 +329,16 @@ def respect_free_space(
     with np.errstate(invalid="ignore"):
         hidden = weak & (nearest < range_map.range * (1 - max_relative_error))
     ranges = np.where(hidden, nearest, range_map.range)
-    seen_through = weak & _seen_through(
-        np.where(weak, ranges, np.float32(np.nan)), confirmed, moved, max_relative_error=max_relative_error
+    # A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
+    comparison = compare_with_sources(
+        np.where(weak, ranges, np.float32(np.nan)),
+        confirmed,
+        moved,
+        # A source contradicts from twice this error on.
+        max_relative_error=max_relative_error / 2,
+        max_angle=np.radians(0.7),
     )
+    seen_through = weak & np.asarray(comparison.contradicting > comparison.agreeing)
     seen_through &= ~large_holes(range_map.valid & ~seen_through, max_hole_deg)
     ranges[seen_through] = np.nan
     confidence = np.where(hidden, np.uint8(WEAK_CONFIDENCE[1]), range_map.confidence)
@@ -350,23 +357,3 @@ def _nearest_points(
         landed, _ = project_range_map(replace(source, normals_in_cam=None), moved, size_hw)
         nearest = np.fmin(nearest, landed)
     return nearest
-
-
-def _seen_through(
-    ranges: FloatImage,
-    sources: Sequence[RangeMap],
-    source_from_reference: Sequence[Rigid3],
-    *,
-    max_relative_error: float,
-) -> Mask:
-    """Return where more sources see through a point than agree with it, (H, W)."""
-    # A source agrees with a pixel if its own point, seen from the reference, lies within this angle.
-    comparison = compare_with_sources(
-        ranges,
-        sources,
-        source_from_reference,
-        # A source contradicts from twice this error on.
-        max_relative_error=max_relative_error / 2,
-        max_angle=np.radians(0.7),
-    )
-    return np.asarray(comparison.contradicting > comparison.agreeing)

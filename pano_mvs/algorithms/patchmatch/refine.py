@@ -72,32 +72,27 @@ class ViewWeights:
             self._match = np.empty_like(self.views)
         for idx, correlation in enumerate(self.views):
             # Standard deviation of the correlation, from 1, of a source that sees the surface.
-            match = _mean_around(np.exp(-(((1 - correlation) / 0.3) ** 2) / 2) * (correlation > -1.5))
+            picture = np.exp(-(((1 - correlation) / 0.3) ** 2) / 2) * (correlation > -1.5)
+            height, width = picture.shape
+            # The mean over each pixel and its neighbours, across the seam and the poles; the same sum at each pixel.
+            padded = pad_panorama(picture.astype(np.float32), _RADIUS)
+            side = 2 * _RADIUS + 1
+            rows = np.zeros((height, width + 2 * _RADIUS), np.float32)
+            for shift in range(side):
+                rows += padded[shift : shift + height]
+            result = np.zeros((height, width), np.float32)
+            for shift in range(side):
+                result += rows[:, shift : shift + width]
+            match = result / np.float32(side**2)
             self._match[idx] = _MEMORY * self._match[idx] + (1 - _MEMORY) * match if self.known else match
         best = np.maximum(self._match.max(axis=0), np.float32(1e-6))
         np.square(self._match / best, out=self.views)
         self.known = True
 
 
-def _mean_around(picture: FloatImage) -> FloatImage:
-    """Return the mean over each pixel and its neighbours, across the seam and the poles; the same sum at each pixel."""
-    height, width = picture.shape
-    padded = pad_panorama(picture.astype(np.float32), _RADIUS)
-    side = 2 * _RADIUS + 1
-    rows = np.zeros((height, width + 2 * _RADIUS), np.float32)
-    for shift in range(side):
-        rows += padded[shift : shift + height]
-    result = np.zeros((height, width), np.float32)
-    for shift in range(side):
-        result += rows[:, shift : shift + width]
-    return result / np.float32(side**2)
-
-
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 # Maximum of a refined range, relative to the farthest swept one.
 _BEYOND = 1.5
-# Maximum step, in pixels of the reference at the widest baseline: beyond it, images are not linear.
-_MAX_STEP_PX = 0.5
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
 # A window extends two pixels per sample from its centre, and one and a half times as far in a source that is nearer.
@@ -187,7 +182,7 @@ class WindowSettings:
             (self.prior_px * pixel_q) ** -2,
             (self.prior_slope * pixel_q) ** -2,
             10.0,
-            np.float32(_MAX_STEP_PX * pixel_q),
+            np.float32(0.5 * pixel_q),  # beyond half a pixel at the widest baseline, images are not linear
         )
 
 

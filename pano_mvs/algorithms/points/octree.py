@@ -14,7 +14,6 @@ NODE_POINTS = 30_000
 """Largest number of points that a node adds."""
 
 _SMALL_CHILD = 500
-_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ def octree(
         return []
     lower, upper = points[used].min(axis=0).astype(np.float64), points[used].max(axis=0)
     size = float((upper - lower).max()) * (1 + 1e-6) or 1.0
-    order = np.random.default_rng(_SEED).permutation(used)
+    order = np.random.default_rng(0).permutation(used)
     nodes: list[OctreeNode] = []
     pending = [("r", lower, size, order)]
     while pending:

@@ -9,14 +9,12 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, poses_with_points
 from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
-from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
-from pano_mvs.algorithms.poses.placement.resection import refine_resection
+from pano_mvs.algorithms.poses.placement.resection import refine_resection, why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 
 _ROUNDS = 3
-_RESECTION_SCALE_RAD = float(np.deg2rad(0.1))
 
 
 @checks_settings
@@ -76,5 +74,5 @@ def _settled(model: GrowingModel, new: list[int]) -> None:
         for image in new:
             points, bearings = model.known_points(image)
             model.cameras[image] = refine_resection(
-                model.cameras[image], points, bearings, scale_rad=_RESECTION_SCALE_RAD
+                model.cameras[image], points, bearings, scale_rad=float(np.deg2rad(0.1))
             )

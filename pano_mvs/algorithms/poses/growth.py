@@ -10,8 +10,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
-from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
-from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed
+from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed, why_few_known, why_few_seen
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.aliases import find_aliases
 from pano_mvs.algorithms.poses.verification.camera_checks import (
@@ -85,16 +84,12 @@ def grown_models(
             break
     models.sort(key=GrownModel.rank)
     if models and models[0].checks is not None and confirmation is not None:
-        models[0] = _corrected(models[0], adjust=adjust, confirmation=confirmation)
+        # Move cameras and blocks of cameras to where the images confirm them best.
+        checks = correct_cameras(models[0].model, confirmation)
+        if checks.moved:
+            settle(models[0].model, adjust=adjust)
+        models[0] = replace(models[0], refused=models[0].refused | checks.removed, checks=checks)
     return models
-
-
-def _corrected(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
-    """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
-    checks = correct_cameras(grown.model, confirmation)
-    if checks.moved:
-        settle(grown.model, adjust=adjust)
-    return replace(grown, refused=grown.refused | checks.removed, checks=checks)
 
 
 def ranked_seeds(

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.fusion.view import normals_from_range
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Features, RangeMap
 
 # A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
 _OFFSETS_PX = (-4, -2, 0, 2, 4)
-_STD, _STD_BOUNDS = 0.005, (0.003, 0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +68,9 @@ def surface_points(
     with np.errstate(invalid="ignore"):
         flat = _planar_share(range_map.range, (x, y), (normals, heights)) >= 0.8
         keep = flat & (slopes < -0.1)
-    stds = np.full(len(good), _STD)
+    stds = np.full(len(good), 0.005)
     if range_map.uncertainty is not None:
-        stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), *_STD_BOUNDS)
+        stds = np.clip(np.nan_to_num(range_map.uncertainty[y, x].astype(np.float64), nan=1.0), 0.003, 0.05)
     return SurfacePoints(cam_from_world, bearings[keep], (heights / slopes)[keep], normals[keep], stds[keep])
 
 
@@ -94,3 +93,46 @@ def _planar_share(
             on_plane = heights / (normals * rays).sum(axis=1)
             share += np.abs(ranges[row, column] / on_plane - 1) < 0.02
     return share / len(_OFFSETS_PX) ** 2
+
+
+_BESIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPoints:
+    """The key points of a panorama whose position is known."""
+
+    descriptors: NDArray[np.generic]  # (N, D)
+    points_in_world: NDArray[np.float64]  # (N, 3) float64
+    keypoints_idx: NDArray[np.intp]  # (N,) their positions among all key points of the panorama
+
+
+def has_sift(features: Features) -> bool:
+    """Return whether key points can be compared with those of photographs."""
+    return features.metric == "l2" and features.descriptors.shape[1] == 128
+
+
+def known_points(
+    features: Features, cam_from_world: Rigid3, range_map: RangeMap, *, min_confidence: int
+) -> KnownPoints:
+    """Return the key points of a panorama that its range map places in the world.
+
+    Key points at edges of surfaces, whose range is uncertain, are left out.
+
+    Args:
+        features: key points by `extract_sift`.
+        cam_from_world: the panorama's pose.
+        range_map: its ranges.
+        min_confidence: smallest confidence of a range that is used.
+    """
+    height, width = range_map.range.shape
+    x, y = np.floor(pixel_from_ray(features.bearings, (height, width))).astype(np.intp).T
+    x, y = x % width, np.clip(y, 0, height - 1)
+    ranges = range_map.range[y, x].astype(np.float64)
+    beside = np.stack([range_map.range[np.clip(y + dy, 0, height - 1), (x + dx) % width] for dx, dy in _BESIDE])
+    with np.errstate(invalid="ignore"):
+        # Ranges are used where the surface is continuous: the relative difference to the pixels beside it.
+        smooth = (np.abs(beside - ranges) <= 0.03 * ranges).all(axis=0)
+    keep = smooth & np.isfinite(ranges) & (range_map.confidence[y, x] >= min_confidence)
+    points = cam_from_world.inverse().apply(features.bearings[keep] * ranges[keep, None])
+    return KnownPoints(features.descriptors[keep], points, np.flatnonzero(keep))

@@ -10,9 +10,9 @@ import numpy as np
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
 from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
+from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
+from pano_mvs.algorithms.poses.placement.resection import why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.poses.verification.camera_checks import check_cameras
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture

@@ -110,7 +110,9 @@ class GuidedSweep:
         """Sweep tiles over all ranges where the guides do not match, and let better matches replace a guide."""
         settings, unit = self.work.settings, 255.0 if self._by_paths else self.work.settings.worst_cost
         least = self.volume.min(axis=1).astype(np.float32)
-        tiles = self._tiles_to_search(least, unit)
+        usual = spread_tiles(tile_means(least), least.shape)
+        odd = (least > _NO_MATCH * unit) & (least > usual + _UNUSUAL * unit) & ~is_bare(self.work.reference)
+        tiles = tile_means(odd) > 0.03
         runs = runs_of(tiles, least.shape, self._shared.windows)
         if not runs:
             return
@@ -123,12 +125,6 @@ class GuidedSweep:
         padded = [pad_panorama(picture, _ADOPT_RADIUS) for picture in (plane, costs)]
         adopt_candidates(*padded, _ADOPT_RADIUS, np.float32(_ADOPT_GAP), adopted)
         self._adopt(np.where(spread_tiles(tiles, least.shape), adopted, np.nan))
-
-    def _tiles_to_search(self, least: NDArray[np.float32], unit: float) -> NDArray[np.bool_]:
-        """Return the tiles, (bands, tiles), in which pixels match much worse than most of their tile do."""
-        usual = spread_tiles(tile_means(least), least.shape)
-        odd = (least > _NO_MATCH * unit) & (least > usual + _UNUSUAL * unit) & ~is_bare(self.work.reference)
-        return tile_means(odd) > 0.03
 
     def _search_run(self, plane: NDArray[np.float32], costs: NDArray[np.float32], run: TileRun) -> None:
         state, planes = fresh_state(run.rows, len(run.with_margin))
@@ -206,10 +202,18 @@ def find_winners_coarse_to_fine(work: SweepInput, *, find_coarsest: Callable[[Sw
     if coarse is None:
         return find_coarsest(work)
     found = find_winners_coarse_to_fine(coarse, find_coarsest=find_coarsest)
-    guides = _guides(found, coarse, work)
+    position = found.position + subplane_offset(found, planes=coarse.settings.planes, shape="parabola")
+    position *= (work.settings.planes - 1) / (coarse.settings.planes - 1)
+    layers = np.empty((2, *position.shape), np.float32)
+    padded = pad_panorama(position.astype(np.float32), _SPLIT_RADIUS)
+    split_layers(padded, _SPLIT_RADIUS, np.float32(_SPLIT_GAP), layers)
+    guides = np.stack([_doubled(layer) for layer in layers])
     with workers() as pool:
         winners = GuidedSweep(work, guides, pool).find_winners()
-    return replace(winners, rival=_rival(winners, found))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nan_to_num(found.rival / found.cost, nan=np.inf, posinf=np.inf)
+        farther = winners.cost * ratio.repeat(2, axis=0).repeat(2, axis=1)
+    return replace(winners, rival=np.asarray(np.fmin(winners.rival, farther), dtype=np.float32))
 
 
 def _coarse_input(work: SweepInput) -> SweepInput | None:
@@ -247,26 +251,8 @@ def _halved_masks(work: SweepInput) -> tuple[NDArray[np.bool_], ...] | None:
     return tuple(pixels_with_valid_window(half, -(-radius // 2)) for half in halves)
 
 
-def _guides(found: Winners, coarse: SweepInput, work: SweepInput) -> NDArray[np.float32]:
-    """Return the positions, among the planes of `work`, of the near and the far surface at every pixel, (2, H, W)."""
-    position = found.position + subplane_offset(found, planes=coarse.settings.planes, shape="parabola")
-    position *= (work.settings.planes - 1) / (coarse.settings.planes - 1)
-    layers = np.empty((2, *position.shape), np.float32)
-    padded = pad_panorama(position.astype(np.float32), _SPLIT_RADIUS)
-    split_layers(padded, _SPLIT_RADIUS, np.float32(_SPLIT_GAP), layers)
-    return np.stack([_doubled(layer) for layer in layers])
-
-
 def _doubled(picture: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a panorama of twice the size, bilinear, over the seam and the poles."""
     height, width = picture.shape
     doubled = cv2.resize(pad_panorama(picture, 1), (2 * width + 4, 2 * height + 4), interpolation=cv2.INTER_LINEAR)
     return np.asarray(doubled[2:-2, 2:-2], dtype=np.float32)
-
-
-def _rival(winners: Winners, coarse: Winners) -> NDArray[np.float32]:
-    """Return the rival's cost, (H, W): among the candidates if it is near, from the coarse sweep if it is far away."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.nan_to_num(coarse.rival / coarse.cost, nan=np.inf, posinf=np.inf)
-        farther = winners.cost * ratio.repeat(2, axis=0).repeat(2, axis=1)
-    return np.asarray(np.fmin(winners.rival, farther), dtype=np.float32)

@@ -152,26 +152,21 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
         winners, range_at=work.range_at, settings=work.settings, seen=np.full((1, 1), not reason)
     )
     winner = int(winners.plane[0, 0])
+    padded = np.pad(decisive, 1, constant_values=np.inf)
+    bottom = (decisive <= padded[:-2]) & (decisive <= padded[2:]) & (np.abs(np.arange(len(decisive)) - winner) > 1)
+    valleys = np.flatnonzero(bottom)
     return CostCurve(
         ranges=work.ranges,
         by_source=np.stack([_of_source(work, idx, row=row, column=column) for idx in range(len(work.sources))]) / worst,
         raw=raw / worst,
         aggregated=None if sums is None else sums / (_PATHS * _WORST),
         winner=winner,
-        runner_up=_other_valley(decisive, winner),
+        runner_up=int(valleys[np.argmin(decisive[valleys])]) if len(valleys) else None,
         uniqueness=_uniqueness(float(winners.cost[0, 0]), float(winners.rival[0, 0])),
         range=float(found.range[0, 0]),
         confidence=int(found.confidence[0, 0]),
         reason=reason,
     )
-
-
-def _other_valley(costs: FloatArray, winner: int) -> int | None:
-    """Return where the deepest valley of a curve is that is not the winner's, or None if there is no other."""
-    padded = np.pad(costs, 1, constant_values=np.inf)
-    bottom = (costs <= padded[:-2]) & (costs <= padded[2:]) & (np.abs(np.arange(len(costs)) - winner) > 1)
-    valleys = np.flatnonzero(bottom)
-    return int(valleys[np.argmin(costs[valleys])]) if len(valleys) else None
 
 
 def _uniqueness(cost: float, rival: float) -> float:

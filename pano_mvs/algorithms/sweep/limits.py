@@ -32,8 +32,6 @@ _SETTINGS = SURFACE_SETTINGS.replace(planes=_PLANES)
 _MAX_PICTURES = 5
 # The small sweeps begin at this share of the mean baseline.
 _NEAREST_BASELINES = 0.05
-_NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
-_NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
 # A plain surface nearer than any textured one ends in the nearest planes, in an area of at least this share of the
 # sphere. The near limit is then lowered in steps of half an octave. Where four do not help, chance decides.
 _NEAREST_PLANES, _MIN_ENDED_SHARE, _MAX_STEPS = 3, 0.003, 4
@@ -92,7 +90,7 @@ def limits_by_sweeping(
     if solid_angle[agreed].sum() <= 0.01 * seen_angle:
         return nearest, farthest
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
-    steps = np.log2([min(nearest, _NEAR_MARGIN * near), _FAR_MARGIN * far]) * _STEPS_PER_OCTAVE
+    steps = np.log2([min(nearest, 0.7 * near), 1.3 * far]) * _STEPS_PER_OCTAVE
     near, far = (
         float(2 ** (np.floor(steps[0]) / _STEPS_PER_OCTAVE)),
         float(2 ** (np.ceil(steps[1]) / _STEPS_PER_OCTAVE)),
@@ -168,5 +166,5 @@ def textured_pixels(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tuple[float, float]:
     order = np.argsort(ranges, kind="stable")
     below = np.cumsum(weights[order]) / weights.sum()
-    near, far = np.searchsorted(below, [_NEAR_QUANTILE, _FAR_QUANTILE])
+    near, far = np.searchsorted(below, [0.005, 0.995])
     return float(ranges[order[near]]), float(ranges[order[min(far, len(order) - 1)]])

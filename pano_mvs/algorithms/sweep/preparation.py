@@ -191,9 +191,6 @@ def parallax_weights(size_hw: tuple[int, int], source_from_reference: Sequence[R
     return np.asarray(parallax / parallax.sum(axis=0), dtype=np.float32)
 
 
-_CONTRAST_RADIUS = 2
-
-
 def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """Return where the winner means something, (H, W).
 
@@ -220,4 +217,4 @@ def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
 def is_bare(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), around which no colour of a picture (H, W, C) changes enough to be matched."""
     # Grey levels between the darkest and the brightest pixel of a window below which it is bare.
-    return contrast_around(picture, _CONTRAST_RADIUS) < 10
+    return contrast_around(picture, 2) < 10

@@ -10,8 +10,6 @@ from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, SweepCost
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import check_settings, setting
 
-_PENALTY_ROWS = 512
-
 
 @dataclass(frozen=True)
 class SweepSettings:
@@ -111,7 +109,7 @@ class SweepSettings:
 
     def penalties(self, height: int) -> tuple[int, int]:
         """Return P1 and the largest P2 for a picture of `height` rows, such that sums of paths fit 16 bits."""
-        scale = height / _PENALTY_ROWS
+        scale = height / 512
         # Eight paths of at most 255 + P2 each must fit uint16, and P1 on top of a plane that does not exist.
         return min(round(self.p1 * scale), 5000), min(round(self.p2 * scale), 7900)
 

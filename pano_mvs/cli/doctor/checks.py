@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import requires
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
+from pano_mvs.core.extras import installed_version
 from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
 from pano_mvs.core.memory import free_memory_bytes, size_text
@@ -135,14 +136,6 @@ class _Requirement(NamedTuple):
     name: str
     minimum: str
     extra: str
-
-
-def installed_version(name: str) -> str | None:
-    """Return the version of an installed distribution, or None."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def package_findings(

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from types import FrameType
-from typing import TextIO
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import next_commands, print_summary
@@ -48,10 +47,10 @@ def run_with_events(run: Callable[[Progress], RunOutput], watch: Progress = igno
         watch: receives the events as well.
     """
     stream = apart(sys.stdout)
-    events = JsonEvents(stream)
 
     def report(event: Event) -> None:
-        events(event)
+        stream.write(line_from_event(event))
+        stream.flush()
         watch(event)
 
     try:
@@ -96,15 +95,3 @@ def interrupted_by_termination() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-class JsonEvents:
-    """A progress callback that writes the events of a run as JSON lines."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def __call__(self, event: Event) -> None:
-        """Write one event."""
-        self._stream.write(line_from_event(event))
-        self._stream.flush()

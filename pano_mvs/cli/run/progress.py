@@ -87,7 +87,12 @@ class ProgressDisplay:
                 for line in event.said[-5:]:
                     self.console.say(f"  | {escape(line)}")
             case StageFinished():
-                self._print_stage(event)
+                parts = [f"{event.run} run", f"{event.cached} cached"]
+                parts += [
+                    f"{count} {what}" for what, count in (("failed", event.failed), ("blocked", event.blocked)) if count
+                ]
+                name = one_line(event.stage).ljust(_NAME_WIDTH)
+                self.console.print(escape(f"{name} {', '.join(parts)}  {event.seconds:.1f} s"), highlight=False)
             case Warned(text=text):
                 self.console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False)
             case _:
@@ -152,14 +157,6 @@ class ProgressDisplay:
         if left.at_least and seconds < 1:
             return f"time left not known yet: no earlier run has computed {unknown}"
         return f"more than {shown} left; not known: {unknown}" if left.at_least else f"about {shown} left"
-
-    def _print_stage(self, summary: StageFinished) -> None:
-        parts = [f"{summary.run} run", f"{summary.cached} cached"]
-        parts += [
-            f"{count} {what}" for what, count in (("failed", summary.failed), ("blocked", summary.blocked)) if count
-        ]
-        name = one_line(summary.stage).ljust(_NAME_WIDTH)
-        self.console.print(escape(f"{name} {', '.join(parts)}  {summary.seconds:.1f} s"), highlight=False)
 
 
 def _count(stage: StageProgress) -> str:

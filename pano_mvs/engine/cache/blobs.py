@@ -294,11 +294,7 @@ class BlobStore:
 
 
 def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:
-    """Return whether the bytes are those that the reference names.
-
-    Raises:
-        OSError: if they cannot be read.
-    """
+    """Return whether the bytes are those that the reference names."""
     if isinstance(place, Packed):
         return place.content_digest() == ref.digest
     found = place.stat()
@@ -310,11 +306,7 @@ def _mapped(place: Path | Packed) -> NDArray[np.uint8]:
 
 
 def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:
-    """Return the array in the bytes of a .npy file, read-only and without a copy; nothing in them is executed.
-
-    Raises:
-        ValueError: if the bytes are not valid, hold Python objects, or have not as many values as the header says.
-    """
+    """Return the array in the bytes of a .npy file, read-only and without a copy; nothing in them is executed."""
     start = bytes(data[: len(_MAGIC) + 2])
     if not start.startswith(_MAGIC):
         return _other_format(bytes(data))
@@ -336,11 +328,7 @@ def _array(data: bytes | NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _other_format(data: bytes) -> NDArray[Any]:
-    """Return the array in a .npy file of a format that this package does not write.
-
-    Raises:
-        ValueError: if the bytes are not valid, or hold Python objects.
-    """
+    """Return the array in a .npy file of a format that this package does not write."""
     try:
         array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     except Exception as error:  # numpy reads the header with Python's parser, which raises many kinds of errors
@@ -377,15 +365,15 @@ _forms: dict[tuple[tuple[str, str, bool], ...], Form] = {}
 class PackedRefs(Mapping[str, BlobRef]):
     """References to blobs by name; equal to a dict with the same entries."""
 
-    __slots__ = ("_form", "_packed")
+    __slots__ = ("form", "packed")
 
     def __init__(self, parts: Mapping[str, BlobRef]) -> None:
         """Pack references; values with the same names and suffixes share these."""
         form = tuple((name, ref.suffix, ref.external) for name, ref in parts.items())
         if form not in _forms:
             _forms[form] = {name: (idx, suffix, external) for idx, (name, suffix, external) in enumerate(form)}
-        self._form = _forms[form]
-        self._packed = b"".join(
+        self.form = _forms[form]  # what values with the same names and suffixes share
+        self.packed = b"".join(
             bytes.fromhex(ref.digest) + ref.size_bytes.to_bytes(_SIZE_BYTES, "big") for ref in parts.values()
         )
 
@@ -393,31 +381,21 @@ class PackedRefs(Mapping[str, BlobRef]):
     def from_packed(form: Form, packed: bytes) -> PackedRefs:
         """Return the references whose `form` and `packed` are known."""
         parts = PackedRefs.__new__(PackedRefs)
-        parts._form, parts._packed = form, packed
+        parts.form, parts.packed = form, packed
         return parts
 
-    @property
-    def form(self) -> Form:
-        """What values with the same names and suffixes share."""
-        return self._form
-
-    @property
-    def packed(self) -> bytes:
-        """The digests and sizes."""
-        return self._packed
-
     def __getitem__(self, name: str) -> BlobRef:
-        idx, suffix, external = self._form[name]
+        idx, suffix, external = self.form[name]
         start = idx * _PART_BYTES
         middle, end = start + DIGEST_BYTES, start + _PART_BYTES
-        size_bytes = int.from_bytes(self._packed[middle:end], "big")
-        return BlobRef(self._packed[start:middle].hex(), size_bytes, suffix, external)
+        size_bytes = int.from_bytes(self.packed[middle:end], "big")
+        return BlobRef(self.packed[start:middle].hex(), size_bytes, suffix, external)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._form)
+        return iter(self.form)
 
     def __len__(self) -> int:
-        return len(self._form)
+        return len(self.form)
 
     def __repr__(self) -> str:
         return repr(dict(self))

@@ -15,6 +15,7 @@ import re
 import stat
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -118,7 +119,19 @@ def verify(store: Store) -> Verification:
     """
     found = Verification()
     intact: set[str] = set()
-    _verify_names(store, found)
+    for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
+        for file in _files(store.root / folder):
+            if _own_name(store, file, pattern):
+                continue
+            is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
+            if pattern.fullmatch(file.name) and is_special:
+                make_room(Path(file.path))
+                found.removed.append(file.path)
+            else:
+                found.foreign.append(file.path)
+    for index in store.blobs.packs.damaged_indexes():
+        store.blobs.packs.remove(index.with_suffix(".pack"))
+        found.removed.append(str(index))
     for value in _blobs(store):
         digest = _digest(value.place)
         if digest == value.digest:
@@ -135,23 +148,6 @@ def verify(store: Store) -> Verification:
     for entry in _sorted(store.blobs.temporary):
         found.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
     return found
-
-
-def _verify_names(store: Store, found: Verification) -> None:
-    """Remove what is not a file in the place of one, and indexes that cannot be read; list what is not of the cache."""
-    for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
-        for file in _files(store.root / folder):
-            if _own_name(store, file, pattern):
-                continue
-            is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
-            if pattern.fullmatch(file.name) and is_special:
-                make_room(Path(file.path))
-                found.removed.append(file.path)
-            else:
-                found.foreign.append(file.path)
-    for index in store.blobs.packs.damaged_indexes():
-        store.blobs.packs.remove(index.with_suffix(".pack"))
-        found.removed.append(str(index))
 
 
 def _remove_damaged(store: Store, value: _Value, found: Verification) -> None:
@@ -254,7 +250,11 @@ def collect(
             found.size_bytes += value.size_bytes
         else:
             kept_blobs.update(_packed(ref.digest) for ref in record.blobs())
-    unfinished = (_Value(path, "", stat.st_size, stat.st_mtime) for path, stat in _unfinished(store))
+    unfinished = (
+        _Value(path, "", stat.st_size, stat.st_mtime)
+        for path in store.blobs.packs.without_index()
+        if (stat := _stat(path)) is not None
+    )
     for value in chain(_blobs(store), unfinished):
         if _packed(value.digest) in kept_blobs or not _is_unused(value.used_s, now, unused_s):
             found.kept_bytes += value.size_bytes
@@ -289,13 +289,6 @@ def _delete(store: Store, found: GarbageCollection, *, now: float, unused_s: flo
             if stat is not None and _is_unused(stat.st_mtime, now, unused_s):
                 _remove(Path(str(place)))
     packs.rewrite({place.pack for place in (*found.records, *found.blobs) if isinstance(place, Packed)})
-
-
-def _unfinished(store: Store) -> Iterator[tuple[Path, os.stat_result]]:
-    for path in store.blobs.packs.without_index():
-        stat = _stat(path)
-        if stat is not None:
-            yield path, stat
 
 
 def _packed(digest: str) -> bytes:
@@ -357,37 +350,37 @@ def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) ->
 
 def _read(place: Path | Packed) -> bytes | None:
     """Return the bytes of a value, or None if another process has deleted it."""
-    try:
+    with suppress(FileNotFoundError), _reading(place):
         return place.read_bytes() if isinstance(place, Packed) else read_regular(place)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise _cannot_read(place.pack if isinstance(place, Packed) else place, error) from error
+    return None
 
 
 def _digest(place: Path | Packed) -> str:
     """Return the digest of a value, or nothing if another process has deleted it, or it is not a regular file."""
-    try:
-        if isinstance(place, Path) and not stat.S_ISREG(place.lstat().st_mode):
-            return ""
-        return place.content_digest() if isinstance(place, Packed) else digest_from_file(place)
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise _cannot_read(place.pack if isinstance(place, Packed) else place, error) from error
+    with suppress(FileNotFoundError), _reading(place):
+        if isinstance(place, Packed) or stat.S_ISREG(place.lstat().st_mode):
+            return place.content_digest() if isinstance(place, Packed) else digest_from_file(place)
+    return ""
 
 
 def _stat(path: str | Path) -> os.stat_result | None:
-    try:
+    with suppress(FileNotFoundError), _reading(path):
         return Path(path).lstat()
+    return None
+
+
+@contextmanager
+def _reading(place: str | Path | Packed) -> Iterator[None]:
+    """Name a file that cannot be read, unless it is missing."""
+    try:
+        yield
     except FileNotFoundError:
-        return None
+        raise
     except OSError as error:
-        raise _cannot_read(path, error) from error
-
-
-def _cannot_read(path: str | Path, error: OSError) -> StoreError:
-    return StoreError(f"{path} cannot be read: {error.strerror}. Check the permissions of the cache and its disk")
+        path = place.pack if isinstance(place, Packed) else place
+        raise StoreError(
+            f"{path} cannot be read: {error.strerror}. Check the permissions of the cache and its disk"
+        ) from error
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -403,10 +396,6 @@ def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
 
 
 def _sorted(folder: Path) -> Iterable[os.DirEntry[str]]:
-    try:
-        with os.scandir(folder) as entries:
-            return sorted(entries, key=lambda entry: entry.name)
-    except FileNotFoundError:
-        return ()
-    except OSError as error:
-        raise _cannot_read(folder, error) from error
+    with suppress(FileNotFoundError), _reading(folder), os.scandir(folder) as entries:
+        return sorted(entries, key=lambda entry: entry.name)
+    return ()

@@ -239,24 +239,20 @@ def _problem(name: str, path: Path, *, index: Path) -> str:
         record = record_from_bytes(read_regular(path))
         return "" if record is not None and record.key == stem else "is damaged"
     if folder == "packs" and name.endswith(".index"):
-        return _problem_of_pack(path, index.with_suffix(".pack"))
+        try:
+            values = values_of(index.with_suffix(".pack"), path)
+        except ValueError:
+            return "is damaged"
+        for value in values:
+            if value.kind == RECORD:
+                record = record_from_bytes(value.read_bytes())
+                is_intact = record is not None and record.key == value.digest
+            else:
+                is_intact = value.content_digest() == value.digest
+            if not is_intact:
+                return f"lists {value.digest}, which is damaged"
+        return ""
     if folder == "packs":
         return ""  # it is checked with its index, which is copied after it
     checksum, _, body = read_regular(path).partition(b"\n")
     return "" if checksum.decode(errors="replace") == digest_from_bytes(body) else "is damaged"
-
-
-def _problem_of_pack(index: Path, pack: Path) -> str:
-    try:
-        values = values_of(pack, index)
-    except ValueError:
-        return "is damaged"
-    for value in values:
-        if value.kind == RECORD:
-            record = record_from_bytes(value.read_bytes())
-            is_intact = record is not None and record.key == value.digest
-        else:
-            is_intact = value.content_digest() == value.digest
-        if not is_intact:
-            return f"lists {value.digest}, which is damaged"
-    return ""

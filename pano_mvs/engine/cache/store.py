@@ -135,7 +135,7 @@ class ItemRef:
     It is packed, because a run holds one for each unit.
     """
 
-    __slots__ = ("_form", "_kind", "_packed")
+    __slots__ = ("_form", "_packed", "kind")
 
     def __init__(self, kind: str, digest: str, parts: Mapping[str, BlobRef]) -> None:
         """Make a reference.
@@ -146,13 +146,8 @@ class ItemRef:
         if not IS_DIGEST.fullmatch(digest):
             raise ValueError(f"not a digest: {digest!r}")
         found = parts if isinstance(parts, PackedRefs) else PackedRefs(parts)
-        self._kind, self._form = kind, found.form
+        self.kind, self._form = kind, found.form
         self._packed = bytes.fromhex(digest) + found.packed
-
-    @property
-    def kind(self) -> str:
-        """The name of its kind."""
-        return self._kind
 
     @property
     def digest(self) -> str:
@@ -167,9 +162,9 @@ class ItemRef:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ItemRef):
             return NotImplemented
-        if (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form):
+        if (self.kind, self._packed, self._form) == (other.kind, other._packed, other._form):
             return True
-        same = (self._kind, self.digest) == (other._kind, other.digest)
+        same = (self.kind, self.digest) == (other.kind, other.digest)
         return same and self.parts == other.parts  # in any order
 
     __hash__ = None  # type: ignore[assignment]  # as that of the mapping of its parts

@@ -72,12 +72,6 @@ def _collect(path: Path, roots: _Roots, trees: dict[str, str]) -> None:
         return
     tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
     trees[name] = ast.dump(_without_docstrings(tree), include_attributes=False)
-    for imported in _imported_files(tree, path.parent, roots):
-        _collect(imported, roots, trees)
-
-
-def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]:
-    """Return the local files that a module imports anywhere; absolute names are looked up from the roots."""
     files: list[Path] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -86,12 +80,13 @@ def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]
         elif isinstance(node, ast.ImportFrom):
             module = node.module or ""
             dotted = [module, *(f"{module}.{alias.name}" if module else alias.name for alias in node.names)]
-            base = folder.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else None
+            base = path.parent.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else None
             if base is not None and (base / "__init__.py").is_file():
                 files.append(base / "__init__.py")  # the names may be its own
             for name in dotted:
                 files.extend(roots.files(name) if base is None else _module_files(base, name))
-    return files
+    for imported in files:
+        _collect(imported, roots, trees)
 
 
 def _module_files(base: Path, dotted: str) -> list[Path]:

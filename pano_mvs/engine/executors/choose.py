@@ -15,7 +15,7 @@ from pano_mvs.engine.executors.queues import SYSTEMS, QueueExecutor, read_queue
 from pano_mvs.engine.executors.threads import WORKER_BYTES, available_threads, share_cores
 
 
-class SerialExecutor:
+class SerialExecutor(Executor):
     """Computes each job when `wait` is called."""
 
     name = "serial"
@@ -37,18 +37,6 @@ class SerialExecutor:
             return None
         job = self._jobs.pop(0)
         return job.number, unit_outcome(job.unit, self._store, threads=job.threads, log=job.log)
-
-    def free_memory_bytes(self) -> int:
-        """Return the free memory of this host."""
-        return free_memory_bytes()
-
-    def places(self) -> int:
-        """Return 1."""
-        return 1
-
-    def notice(self) -> str:
-        """Return nothing."""
-        return ""
 
     def cancel(self) -> None:
         """Forget the job."""

@@ -17,7 +17,6 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -25,21 +24,20 @@ from urllib.parse import urlsplit
 import pano_mvs
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.extras import import_extra
+from pano_mvs.core.extras import import_extra, installed_version
 from pano_mvs.core.files import make_folder, temporary_prefix
-from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.core.paths import below, children, is_file
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors.processes import WorkerProcess
-from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.executors.unit_json import request_to_json
 
 _CONNECT_S = 20.0
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """Submits units to a dask scheduler."""
 
     name = "dask"
@@ -153,17 +151,13 @@ class DaskExecutor:
     def free_memory_bytes(self) -> int:
         """Return the free memory of this host, or, for a remote cluster, the smallest limit times the workers."""
         if self._cluster is not None:
-            return free_memory_bytes()
+            return super().free_memory_bytes()
         limits = [worker["memory_limit"] for worker in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return int(min(limits, default=0)) * len(limits)
 
     def places(self) -> int:
         """Return the number of threads of the workers, each of which computes a unit."""
         return sum(self._client.nthreads().values())
-
-    def notice(self) -> str:
-        """Return nothing: the workers were there when the run began."""
-        return ""
 
     def cancel(self) -> None:
         """Cancel all jobs and end their processes."""
@@ -308,12 +302,7 @@ def versions() -> dict[str, str]:
         "python": ".".join(platform.python_version_tuple()[:2]),
         "pano_mvs": f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}",
     }
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 def _new_worker(threads: int) -> WorkerProcess:

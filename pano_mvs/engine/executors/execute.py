@@ -96,12 +96,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 
 
 def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
-    """Return what the stage returns, with the state of the process as before.
-
-    Raises:
-        ChangedStateError: if a plugin changed the state while a built-in stage was running.
-        Exception: any exception of the stage.
-    """
+    """Return what the stage returns, with the state of the process as before."""
     process, before, changes = os.getpid(), ProcessState.now() if has_plugins() else None, Changes()
     try:
         offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}

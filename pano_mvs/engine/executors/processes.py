@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.files import make_folder, temporary_prefix
-from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import tail
-from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.started_processes import MARK, end_started
 from pano_mvs.engine.executors.threads import bound_environment
 from pano_mvs.engine.executors.unit_json import request_to_json
@@ -33,7 +32,7 @@ UNITS_PER_PROCESS = 500
 _LISTEN_S = 0.5  # some systems notice interrupts only between waits
 
 
-class ProcessExecutor:
+class ProcessExecutor(Executor):
     """A pool of long-lived workers, started as needed, each served by a thread."""
 
     name = "processes"
@@ -86,18 +85,6 @@ class ProcessExecutor:
                 return number, outcome
         return None
 
-    def free_memory_bytes(self) -> int:
-        """Return the free memory of this host."""
-        return free_memory_bytes()
-
-    def places(self) -> int:
-        """Return the number of workers."""
-        return self.capacity
-
-    def notice(self) -> str:
-        """Return nothing: the workers are here."""
-        return ""
-
     def cancel(self) -> None:
         """End the processes of all jobs; later jobs get new ones."""
         self._out.clear()
@@ -149,12 +136,7 @@ _BOOT = (
 
 
 class WorkerProcess:
-    """A process that computes one unit at a time; it is started for the first one.
-
-    Attributes:
-        served: number of units that the present process has received.
-        refused: whether the latest process exited by itself before it was ready for a unit.
-    """
+    """A process that computes one unit at a time; it is started for the first one."""
 
     def __init__(self, threads: int, errors: Path) -> None:
         """Prepare a worker.
@@ -165,8 +147,8 @@ class WorkerProcess:
         """
         self.threads = threads
         self.errors = errors
-        self.served = 0
-        self.refused = False
+        self.served = 0  # number of units that the present process has received
+        self.refused = False  # whether the latest process exited by itself before it was ready for a unit
         self._ready = False
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import Unit
 
@@ -92,13 +93,16 @@ class Executor(Protocol):
         """
 
     def free_memory_bytes(self) -> int:
-        """Return the memory for all running units together; 0 if unknown."""
+        """Return the memory for all running units together, by default that of this host; 0 if unknown."""
+        return free_memory_bytes()
 
     def places(self) -> int:
         """Return the number of units that can be computed at a time at this moment, as workers come and go."""
+        return self.capacity
 
     def notice(self) -> str:
         """Return what the user should know now, such as that no worker has started; usually empty."""
+        return ""
 
     def cancel(self) -> None:
         """End all jobs at once and forget them."""

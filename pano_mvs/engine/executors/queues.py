@@ -150,22 +150,6 @@ def cluster_class(system: str) -> Any:
     return getattr(library, f"{system.upper()}Cluster")
 
 
-def _encryption(keys: Path) -> Any:
-    """Return settings for encrypted connections, with new keys in files that only this user can read.
-
-    Otherwise anyone who can reach a port of this host could run code as this user.
-    """
-    security = importlib.import_module("distributed").Security
-    keys.mkdir(mode=0o700, parents=True)
-    for name, text in security.temporary().get_tls_config_for_role("worker").items():
-        if text:
-            (keys / name).touch(mode=0o600)
-            (keys / name).write_text(text, encoding="ascii")
-    roles = [f"{role}_{name}" for role in ("client", "scheduler", "worker") for name in ("cert", "key")]
-    files = {f"tls_{name}": str(keys / name.partition("_")[2]) for name in roles}
-    return security(require_encryption=True, tls_ca_file=str(keys / "ca_file"), **files)
-
-
 def patient(base: Any) -> Any:
     """Return a class of jobs that are submitted again later if the queueing system refuses them.
 
@@ -217,9 +201,19 @@ class QueueExecutor(DaskExecutor):
         kind = cluster_class(system)
         options = importlib.import_module("dask").config.get(f"jobqueue.{system}.scheduler-options", {})
         try:
+            # Encrypted, with new keys that only this user can read: otherwise anyone who can reach a port of this host
+            # could run code as this user.
+            security = importlib.import_module("distributed").Security
+            self._keys.mkdir(mode=0o700, parents=True)
+            for name, text in security.temporary().get_tls_config_for_role("worker").items():
+                if text:
+                    (self._keys / name).touch(mode=0o600)
+                    (self._keys / name).write_text(text, encoding="ascii")
+            roles = [f"{role}_{name}" for role in ("client", "scheduler", "worker") for name in ("cert", "key")]
+            files = {f"tls_{name}": str(self._keys / name.partition("_")[2]) for name in roles}
             cluster = kind(
                 job_cls=patient(kind.job_cls),
-                security=_encryption(self._keys),
+                security=security(require_encryption=True, tls_ca_file=str(self._keys / "ca_file"), **files),
                 scheduler_options={"dashboard_address": None, **options},
                 **job_settings(system, queue, places=places, logs=self._logs),
             )

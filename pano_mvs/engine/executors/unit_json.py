@@ -94,13 +94,19 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
     identity = dict(unit.identity)
     if large:
         identity["inputs"] = {name: [] if name in large else part for name, part in identity["inputs"].items()}
+    values = _plain(unit.entry.params)
+    if _plain(unit.entry.spec.params_type.model_validate(values)) != values:
+        raise UsageError(
+            f"stage {unit.entry.name!r} ({unit.entry.spec.origin}): its settings change when they are validated a "
+            "second time, so that they cannot be sent to a worker. Use --executor serial"
+        )
     return {
         "text_version": TEXT_VERSION,
         "stage": unit.entry.name,
         "use": spec.name,
         "version": spec.version,
         "code": spec.code_digest,
-        "params": params_to_json(unit.entry),
+        "params": values,
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in inputs.items()}
@@ -178,21 +184,6 @@ def _changed(spec: StageSpec) -> str:
         f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed during the "
         "run, or another version is installed there. Run the same command again"
     )
-
-
-def params_to_json(entry: StageEntry) -> dict[str, Any]:
-    """Return a stage's settings as JSON values from which the same settings can be made again.
-
-    Raises:
-        UsageError: if that is impossible.
-    """
-    values = _plain(entry.params)
-    if _plain(entry.spec.params_type.model_validate(values)) != values:
-        raise UsageError(
-            f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
-            "second time, so that they cannot be sent to a worker. Use --executor serial"
-        )
-    return values
 
 
 def _plain(params: Params) -> dict[str, Any]:

@@ -30,8 +30,10 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
         store = _store(*request["store"])
         if request["plugins"]:
             load_libraries()
-        files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
-        plugins = {files[path]: digest for path, digest in request["plugins"].items()}
+        given, texts = request["plugins"], request.get("plugin_texts", {})
+        # Files sent with the request are written to a temporary folder.
+        files = {path: _written(digest, *texts[path]) if path in texts else path for path, digest in given.items()}
+        plugins = {files[path]: digest for path, digest in given.items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
@@ -45,11 +47,6 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
 
 _LEFT: list[ProcessState] = []
 """The state of this process after its last unit, if it has loaded plugins; a list, which is the same for each unit."""
-
-
-def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:
-    """Return the path of each plugin file; files sent with the request are written to a temporary folder."""
-    return {path: _written(digest, *texts[path]) if path in texts else path for path, digest in plugins.items()}
 
 
 _folders: dict[str, TemporaryDirectory[str]] = {}

@@ -54,11 +54,7 @@ class _Stage:
 
 
 class ReadyQueue:
-    """The state of all stages during a pass, and the units that can run.
-
-    Attributes:
-        states: stage to its results so far, in the order of the workflow.
-    """
+    """The state of all stages during a pass, and the units that can run."""
 
     def __init__(
         self,
@@ -70,6 +66,7 @@ class ReadyQueue:
         listing: SourceListing | None = None,
     ) -> None:
         self.listing = listing or SourceListing()
+        # stage to its results so far, in the order of the workflow
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
         self._only = graph.only
@@ -165,7 +162,14 @@ class ReadyQueue:
             if self.states[edge.producer].open or (lists_units and edge.producer not in self._complete):
                 return
         if stage.entry.spec.list_items is not None:
-            blocked = self._list_source(stage, state)
+            resolution = resolve_source(
+                stage.entry, self._store, only=self._only.get(stage.entry.name), listing=self.listing
+            )
+            stage.found = {unit.item: unit for unit in resolution.units}
+            state.members.update(resolution.members)
+            notes = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
+            self._listener.source_listed(stage.entry, {item: notes.get(item, ()) for item in resolution.members})
+            blocked = resolution.blocked
         else:
             members = stage.resolver.unit_names()
             assert members is not None, name
@@ -185,16 +189,6 @@ class ReadyQueue:
         if not items:
             self._end(name)
         self._open_behind(name)
-
-    def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
-        resolution = resolve_source(
-            stage.entry, self._store, only=self._only.get(stage.entry.name), listing=self.listing
-        )
-        stage.found = {unit.item: unit for unit in resolution.units}
-        state.members.update(resolution.members)
-        notes = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
-        self._listener.source_listed(stage.entry, {item: notes.get(item, ()) for item in resolution.members})
-        return resolution.blocked
 
     def _wait(self, stage: _Stage, item: str) -> None:
         tokens = {token for token in self._needs(stage, item) if not self._is_available(token)}

@@ -162,7 +162,7 @@ def resolve_source(
             resolution.blocked[item.name] = str(error)
             continue
         inputs = {"files": digests, "name": item.name, **({"links": list(item.links)} if item.links else {})}
-        key = _key(common, inputs)
+        key = digest_from_value([common, inputs])
         unit = Unit(
             entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, replace(item, digests=digests)
         )
@@ -193,11 +193,7 @@ def resolve(
 
 
 class Resolver:
-    """Finds the units of a stage that is not a source: all in turn for a plan, or one by name in a run.
-
-    Attributes:
-        near: unit to its neighbours, if the stage has an index and its unit names are known.
-    """
+    """Finds the units of a stage that is not a source: all in turn for a plan, or one by name in a run."""
 
     def __init__(self, entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store) -> None:
         self.entry = entry
@@ -207,6 +203,7 @@ class Resolver:
         self.states = states
         self.store = store
         self.resolution = Resolution()
+        # unit to its neighbours, if the stage has an index and its unit names are known
         self.near: Mapping[str, tuple[str, ...]] = {}
         self._static: dict[str, Any] = {}
         self._common = ""
@@ -259,7 +256,9 @@ class Resolver:
         leading = [edge for edge in each if not edge.exploded and self.states[edge.producer].axis is self.axis]
         names: dict[str, tuple[str, ...]] = {}
         for number, edge in enumerate(leading or each):
-            found = self._members(edge)
+            state = self.states[edge.producer]
+            exploded: dict[str, tuple[str, ...]] = {name: (name,) for name in state.exploded}
+            found = exploded if edge.exploded else dict(state.members)
             names = found if number == 0 else {name: names[name] for name in names if name in found}
         return self._with_neighbours(names) if INDEX_PORT in self.edges else names
 
@@ -270,12 +269,6 @@ class Resolver:
             return views
         self.near = {name: (name, *self.near[name]) if name in views else () for name in names}
         return names
-
-    def _members(self, edge: Edge) -> dict[str, tuple[str, ...]]:
-        state = self.states[edge.producer]
-        if edge.exploded:
-            return {name: (name,) for name in state.exploded}
-        return dict(state.members)
 
     def _units_of_index(self, edge: Edge) -> Mapping[str, tuple[str, ...]] | None:
         state = self.states[edge.producer]
@@ -314,7 +307,8 @@ class Resolver:
             self._common = digest_from_value(self._static)
         encoded = {port: self._encode(port, value) for port, value in inputs.items()}
         identity = self._static | {"inputs": encoded}
-        self.resolution.units.append(Unit(self.entry, name, members, inputs, _key(self._common, encoded), identity))
+        key = digest_from_value([self._common, encoded])
+        self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
 
     def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
         """Return a unit's input at a port, the reason why there is none, and whether it is not known yet."""
@@ -384,11 +378,6 @@ class Resolver:
             return list(value)
         state = self.states[self.edges[port].producer]
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
-
-
-def _key(common: str, inputs: Mapping[str, Any]) -> str:
-    """Return a unit's key; `common` is the digest of what all units of the stage share, encoded only once."""
-    return digest_from_value([common, inputs])
 
 
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:

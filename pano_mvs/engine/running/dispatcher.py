@@ -149,7 +149,14 @@ class Dispatcher:
 
     def _loading_of(self, unit: Unit) -> int:
         """Return the temporary memory for reading the largest of a unit's inputs."""
-        return max((self._loading_of_item(ref, kind) for ref, kind in _inputs_of(unit)), default=0)
+        found: list[tuple[ItemRef, type[Record]]] = []
+        for port in unit.entry.spec.ports:
+            value = unit.inputs.get(port.name)
+            if value is None or port.kind.loading_bytes is Record.loading_bytes:
+                continue
+            refs = [value] if isinstance(value, ItemRef) else value.values()
+            found.extend((ref, port.kind) for ref in refs if ref is not PENDING)
+        return max((self._loading_of_item(ref, kind) for ref, kind in found), default=0)
 
     def _loading_of_item(self, ref: ItemRef, kind: type[Record]) -> int:
         if ref.digest not in self._loading_bytes:
@@ -185,18 +192,6 @@ def _remove_inputs_file(job: Job) -> None:
     if has_large_inputs(job.unit):
         with suppress(OSError):
             job.inputs_file.unlink(missing_ok=True)
-
-
-def _inputs_of(unit: Unit) -> list[tuple[ItemRef, type[Record]]]:
-    """Return the inputs that take extra memory while they are read, each with its kind."""
-    found: list[tuple[ItemRef, type[Record]]] = []
-    for port in unit.entry.spec.ports:
-        value = unit.inputs.get(port.name)
-        if value is None or port.kind.loading_bytes is Record.loading_bytes:
-            continue
-        refs = [value] if isinstance(value, ItemRef) else value.values()
-        found.extend((ref, port.kind) for ref in refs if ref is not PENDING)
-    return found
 
 
 def memory_of(unit: Unit, store: Store) -> int:

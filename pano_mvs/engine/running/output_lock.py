@@ -37,7 +37,17 @@ def output_lock(out: Path) -> Iterator[None]:
     Raises:
         StoreError: if another run holds it or may hold it, or the folder cannot be written.
     """
-    path, own = out / LOCK_NAME, _own_text()
+    owner = {
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "process_started": start_of(os.getpid()),
+        "place": process_place(),
+        "boot": boot_id().strip(),
+        "machine": machine_id(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+        "token": uuid.uuid4().hex,
+    }
+    path, own = out / LOCK_NAME, json.dumps(owner, indent=1).encode() + b"\n"
     try:
         _acquire(path, own)
     except OSError as error:
@@ -70,7 +80,11 @@ def _acquire(path: Path, own: bytes) -> None:
         if owner is not None and _is_gone(owner):
             _remove_stale(path, text)
         elif owner is not None:
-            raise StoreError(_refusal(path, owner))
+            who = f"process {owner['process']} on {owner.get('host')}, since {owner.get('since')}"
+            remedy = "Wait until it has ended, or choose another folder with --out DIR"
+            if owner.get("place") != process_place() or os.name != "posix":
+                remedy += f". If that process has ended, which cannot be checked from here, delete {path}"
+            raise StoreError(f"another run is writing into {path.parent}: {who}. {remedy}")
         elif text is not None:
             time.sleep(_PAUSE_S)  # it may be incomplete on file systems without links
     raise StoreError(
@@ -123,20 +137,6 @@ def _remove_stale(path: Path, stale: bytes | None) -> None:
         os.close(handle)
 
 
-def _own_text() -> bytes:
-    owner = {
-        "host": socket.gethostname(),
-        "process": os.getpid(),
-        "process_started": start_of(os.getpid()),
-        "place": process_place(),
-        "boot": boot_id().strip(),
-        "machine": machine_id(),
-        "since": datetime.now(UTC).isoformat(timespec="seconds"),
-        "token": uuid.uuid4().hex,
-    }
-    return json.dumps(owner, indent=1).encode() + b"\n"
-
-
 def _owner(text: bytes | None) -> dict[str, Any] | None:
     try:
         owner = json.loads(text or b"")
@@ -155,11 +155,3 @@ def _is_gone(owner: dict[str, Any]) -> bool:
     # The machine has been restarted since then.
     same = (socket.gethostname(), machine_id()) == (owner.get("host"), owner.get("machine") or None)
     return same and bool(owner.get("boot")) and owner["boot"] != boot_id().strip()
-
-
-def _refusal(path: Path, owner: dict[str, Any]) -> str:
-    who = f"process {owner['process']} on {owner.get('host')}, since {owner.get('since')}"
-    remedy = "Wait until it has ended, or choose another folder with --out DIR"
-    if owner.get("place") != process_place() or os.name != "posix":
-        remedy += f". If that process has ended, which cannot be checked from here, delete {path}"
-    return f"another run is writing into {path.parent}: {who}. {remedy}"

@@ -21,14 +21,11 @@ from pano_mvs.scene.files import item_stems
 
 
 class NameClashError(UsageError):
-    """A unit would write the same file as another unit of its stage, or write a file twice.
-
-    Attributes:
-        losers: units of the same stage whose files were withdrawn because they clash with those of this unit: item to
-            the reason.
-    """
+    """A unit would write the same file as another unit of its stage, or write a file twice."""
 
     def __init__(self, text: str, losers: Mapping[str, str] = MappingProxyType({})) -> None:
+        # units of the same stage whose files were withdrawn because they clash with those of this unit: item to the
+        # reason
         self.losers = losers
         super().__init__(text)
 
@@ -143,13 +140,7 @@ _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
 
 
 class Publisher:
-    """Writes the files of one run into one folder.
-
-    Attributes:
-        published: every file of the run, and its digest.
-        earlier: file to digest, as an earlier run or an earlier pass of this run wrote them.
-        set_aside: files of the user that were renamed to make room: original name to new name.
-    """
+    """Writes the files of one run into one folder."""
 
     def __init__(self, out: Path, store: Store) -> None:
         """Create the folder if necessary, and check that it can be written.
@@ -161,8 +152,9 @@ class Publisher:
         self.out = out
         self.store = store
         self.written: list[str] = []
-        self.published: dict[str, str] = {}
-        self.earlier: dict[str, str] = {}
+        self.published: dict[str, str] = {}  # every file of the run, and its digest
+        self.earlier: dict[str, str] = {}  # file to digest, as an earlier run or an earlier pass of this run wrote them
+        # files of the user that were renamed to make room: original name to new name
         self.set_aside: dict[str, str] = {}
         self._claims = FileClaims(self._order)
         self._stems: dict[str, str] = {}

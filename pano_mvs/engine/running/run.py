@@ -56,12 +56,7 @@ class UnusableInputError(RunStoppedError):
 
 
 class Run:
-    """One run of a workflow: what its passes share, and what happens before and after them.
-
-    Attributes:
-        keys: stage to unit to cache key, of all units that were looked up.
-        refreshed: labels of the units that `--refresh` named and that were reached.
-    """
+    """One run of a workflow: what its passes share, and what happens before and after them."""
 
     def __init__(
         self,
@@ -94,9 +89,9 @@ class Run:
             raise UsageError(f"--isolate has no effect with --executor {self.executor.name}: use another one")
         self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins, isolate=options.isolate)
         self.listing = SourceListing()
-        self.keys: dict[str, dict[str, str]] = {}
+        self.keys: dict[str, dict[str, str]] = {}  # stage to unit to cache key, of all units that were looked up
         self.computed: set[str] = set()
-        self.refreshed: set[str] = set()
+        self.refreshed: set[str] = set()  # labels of the units that `--refresh` named and that were reached
         self._planned: dict[str, UnitRecord] = {}
         self._has_passed = False  # whether the last pass ended without an error
         self._warnings: list[str] = []
@@ -142,12 +137,27 @@ class Run:
                 self.result.removed = self.publisher.remove_stale(self.publisher.earlier, complete=self.result.complete)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
-            self._wait_for_running_units()
+            deadline = time.monotonic() + GRACE_S
+            if self.dispatcher and self.executor.enforces_timeouts:
+                count = len(self.dispatcher)
+                text = f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s"
+                self.observer(Warned(f"{text}; interrupt again to stop at once"))
+                while self.dispatcher and (left := deadline - time.monotonic()) > 0:
+                    self.dispatcher.next_finished(left)
             raise
         finally:
             self.dispatcher.cancel()
             self._remember()
-            self._list_files()
+            for name, new_name in self.publisher.set_aside.items():
+                self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
+            published = self.publisher.published
+            self.result.written = sorted(set(self.publisher.written))
+            self.result.published = published
+            self.result.left_over = {
+                name: digest
+                for name, digest in self.publisher.earlier.items()
+                if name not in published and is_file(self.out / name)
+            }
         return self.result
 
     def load(self, stage: str, kind: type[Record], item: str = "") -> Record | None:
@@ -232,48 +242,22 @@ class Run:
             self.store.unit_times.add(summary.use, sample)
         self.store.unit_times.save()
 
-    def _list_files(self) -> None:
-        """Enter into the result which files the run wrote and which ones of earlier runs are left."""
-        for name, new_name in self.publisher.set_aside.items():
-            self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
-        published = self.publisher.published
-        self.result.written = sorted(set(self.publisher.written))
-        self.result.published = published
-        self.result.left_over = {
-            name: digest
-            for name, digest in self.publisher.earlier.items()
-            if name not in published and is_file(self.out / name)
-        }
-
-    def _wait_for_running_units(self) -> None:
-        """Give units that run in other processes some time after an interrupt; a second interrupt ends them."""
-        deadline = time.monotonic() + GRACE_S
-        if self.dispatcher and self.executor.enforces_timeouts:
-            count = len(self.dispatcher)
-            text = f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s"
-            self.observer(Warned(f"{text}; interrupt again to stop at once"))
-            while self.dispatcher and (left := deadline - time.monotonic()) > 0:
-                self.dispatcher.next_finished(left)
-
 
 class RunPass:
-    """One pass over a workflow, with a result and statistics of its own.
-
-    Attributes:
-        queue: the units that can run, and the results so far.
-        damaged: damaged files of the cache (which have been removed) and changed input files that this pass met.
-            Units that need any of them are left to the next pass, while the others go on, so that much damage takes no
-            more passes than little.
-    """
+    """One pass over a workflow, with a result and statistics of its own."""
 
     def __init__(self, run: Run, warnings: list[str]) -> None:
         self.result = RunResult(warnings=warnings)
+        # damaged files of the cache (which have been removed) and changed input files that this pass met. Units that
+        # need any of them are left to the next pass, while the others go on, so that much damage takes no more passes
+        # than little.
         self.damaged: list[str] = []
         self._run = run
         self._store = run.store
         self._statistics = RunStatistics(
             self.result, run.observer, states=lambda name: self.queue.states[name], name_items=run.publisher.name_items
         )
+        # the units that can run, and the results so far
         self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
         self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
 

@@ -170,7 +170,20 @@ class RunStatistics:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:10])
             listed = len(state.members)
             raise InputError(f"{entry.name}: none of the {listed} {plural(listed, 'item')} can be used{shown}")
-        _check_thresholds(entry, summary)
+        done = summary.run + summary.cached
+        if summary.units and done / summary.units < entry.policy.min_success:
+            raise RunStoppedError(
+                f"stage {entry.name!r}: {done} of {summary.units} {plural(summary.units, 'unit')} succeeded, "
+                f"min_success is {entry.policy.min_success}"
+            )
+        for metric, limits in entry.policy.gate.items():
+            if metric not in summary.metrics:
+                known = ", ".join(summary.metrics) or "none"
+                raise RunStoppedError(f"stage {entry.name!r}: `gate` names {metric!r}, but the stage reports: {known}")
+            if objection := limits.objection(summary.metrics[metric]):
+                raise RunStoppedError(
+                    f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, but `gate` requires {objection}"
+                )
 
     @staticmethod
     def _stop_clock(count: _StageCount, item: str) -> None:
@@ -215,23 +228,6 @@ class RunStatistics:
 def _counted(note: str, units: int, total: int) -> str:
     """Return a note with the number of units that gave it, if it asks for that; see `Context.note`."""
     return note.replace(COUNT_IN_NOTES, f"{units:,} of {total:,}", 1) if note.startswith(COUNT_IN_NOTES) else note
-
-
-def _check_thresholds(entry: StageEntry, summary: StageSummary) -> None:
-    done = summary.run + summary.cached
-    if summary.units and done / summary.units < entry.policy.min_success:
-        raise RunStoppedError(
-            f"stage {entry.name!r}: {done} of {summary.units} {plural(summary.units, 'unit')} succeeded, "
-            f"min_success is {entry.policy.min_success}"
-        )
-    for metric, limits in entry.policy.gate.items():
-        if metric not in summary.metrics:
-            known = ", ".join(summary.metrics) or "none"
-            raise RunStoppedError(f"stage {entry.name!r}: `gate` names {metric!r}, but the stage reports: {known}")
-        if objection := limits.objection(summary.metrics[metric]):
-            raise RunStoppedError(
-                f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, but `gate` requires {objection}"
-            )
 
 
 _positions: dict[tuple[str, ...], tuple[dict[str, int], Struct]] = {}

@@ -306,7 +306,15 @@ def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Pat
     variable = environment.get(PLUGINS_VARIABLE)
     if variable is not None:
         return [Path(folder) for folder in variable.split(os.pathsep) if folder]
-    settings = _settings_folder(environment)
+    home = home_folder()
+    if sys.platform == "win32":
+        given = Path(environment.get("APPDATA") or "")
+        settings = given if given.is_absolute() else home and home / "AppData" / "Roaming"
+    elif sys.platform == "darwin":
+        settings = home and home / "Library" / "Application Support"
+    else:
+        given = Path(environment.get("XDG_CONFIG_HOME") or "")
+        settings = given if given.is_absolute() else home and home / ".config"
     return [] if settings is None else [settings / "pano-mvs" / "plugins"]
 
 
@@ -346,15 +354,3 @@ def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
     folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
     files = [file for folder in folders for file in below(folder, "*.py")]
     return names_in_files(files if folders else [Path(spec.origin)] if spec.origin else [])
-
-
-def _settings_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the folder for user settings, or None if there is none."""
-    home = home_folder()
-    if sys.platform == "win32":
-        given = Path(environment.get("APPDATA") or "")
-        return given if given.is_absolute() else home and home / "AppData" / "Roaming"
-    if sys.platform == "darwin":
-        return home and home / "Library" / "Application Support"
-    given = Path(environment.get("XDG_CONFIG_HOME") or "")
-    return given if given.is_absolute() else home and home / ".config"

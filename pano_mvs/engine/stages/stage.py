@@ -379,23 +379,19 @@ def _check_settings(settings: object, signature: _Signature, where: str) -> None
                 f"{source!r}"
             )
         called = getattr(source, "__qualname__", repr(source))
-        for setting in _settings_in(source, called, where):
+        try:
+            names = settings_of(source)
+        except (TypeError, NameError) as error:
+            raise PluginError(f"{where}: the settings of {called} in settings= cannot be read: {error}") from error
+        if not names:
+            raise PluginError(
+                f"{where}: {called} in settings= has no settings; annotate its keyword-only parameters with Setting, "
+                "or declare the fields of a dataclass by setting()"
+            )
+        for setting in names:
             if setting in found:
                 raise PluginError(
                     f"{where}: both {found[setting]} and {called} in settings= have a setting {setting!r}; rename one "
                     "of the two"
                 )
             found[setting] = called
-
-
-def _settings_in(source: Callable[..., Any], called: str, where: str) -> Iterable[str]:
-    try:
-        names = settings_of(source)
-    except (TypeError, NameError) as error:
-        raise PluginError(f"{where}: the settings of {called} in settings= cannot be read: {error}") from error
-    if not names:
-        raise PluginError(
-            f"{where}: {called} in settings= has no settings; annotate its keyword-only parameters with Setting, or "
-            "declare the fields of a dataclass by setting()"
-        )
-    return names

@@ -27,6 +27,12 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
             the settings of the stage that they use.
     """
     specs = dict(sorted(registry.stages.items()))
+    own = Policy.model_json_schema(by_alias=True)
+    keys = {
+        f"key.{name}": {"description": value.pop("description", ""), "anyOf": [value, {"type": "null"}]}
+        for name, value in _without_titles(own["properties"]).items()
+        if name != "use"
+    }
     return {
         "$schema": DIALECT,
         "title": "pano_mvs workflow",
@@ -44,7 +50,8 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
             "stage": _entry(specs),
             "override": {"anyOf": [{"type": "null"}, _override(specs)]},
             **{f"use.{name}": _settings(spec) for name, spec in specs.items()},
-            **_reserved_definitions(),
+            **keys,
+            **own.get("$defs", {}),
         },
     }
 
@@ -120,6 +127,7 @@ def _settings(spec: StageSpec) -> Schema:
     own = spec.params_type.model_json_schema(
         by_alias=True, ref_template=f"{_pointer(f'use.{spec.name}')}/$defs/{{model}}"
     )
+    ports = {port.name: {"type": "string", "description": str(port)} for port in spec.all_ports}
     schema: Schema = {
         "type": "object",
         "title": spec.name,
@@ -129,7 +137,10 @@ def _settings(spec: StageSpec) -> Schema:
             "use": {"const": spec.name, "description": _first_line(spec)},
             **_without_titles(own.get("properties", {})),
             **_reserved(),
-            "in": _ports(spec),
+            "in": {
+                "description": "port to the stage of this workflow that feeds it, if there are several candidates",
+                "anyOf": [{"type": "object", "additionalProperties": False, "properties": ports}, {"type": "null"}],
+            },
         },
     }
     return schema | ({"$defs": own["$defs"]} if "$defs" in own else {})
@@ -145,17 +156,6 @@ def _reserved() -> Schema:
     return {name: _ref(f"key.{name}") for name in RESERVED_KEYS if name != "use"}
 
 
-def _reserved_definitions() -> Schema:
-    """Return the schemas of the reserved keys; null stands for the default."""
-    own = Policy.model_json_schema(by_alias=True)
-    keys = {
-        f"key.{name}": {"description": value.pop("description", ""), "anyOf": [value, {"type": "null"}]}
-        for name, value in _without_titles(own["properties"]).items()
-        if name != "use"
-    }
-    return {**keys, **own.get("$defs", {})}
-
-
 def _ref(name: str) -> Schema:
     return {"$ref": _pointer(name)}
 
@@ -163,14 +163,6 @@ def _ref(name: str) -> Schema:
 def _pointer(name: str) -> str:
     """Return the URI fragment of a definition, escaped by RFC 6901."""
     return f"#/$defs/{quote(name.replace('~', '~0').replace('/', '~1'))}"
-
-
-def _ports(spec: StageSpec) -> Schema:
-    ports = {port.name: {"type": "string", "description": str(port)} for port in spec.all_ports}
-    return {
-        "description": "port to the stage of this workflow that feeds it, if there are several candidates",
-        "anyOf": [{"type": "object", "additionalProperties": False, "properties": ports}, {"type": "null"}],
-    }
 
 
 def _without_titles(properties: Schema) -> Schema:

@@ -127,11 +127,7 @@ class _Composer(Composer):
         self._level = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return the next node.
-
-        Raises:
-            MarkedYAMLError: if it is nested too deeply.
-        """
+        """Return the next node."""
         self._level += 1
         if self._level > MAX_DEPTH + 1:
             mark = self.parser.peek_event().start_mark

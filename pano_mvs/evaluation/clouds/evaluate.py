@@ -69,28 +69,17 @@ class CloudTruth:
 
 @dataclass(frozen=True, eq=False)
 class CloudEvaluation:
-    """Scores of a cloud, and its distances from the truth.
+    """Scores of a cloud, and its distances from the truth."""
 
-    Attributes:
-        source: name of the cloud's source.
-        truth: name of the truth's source.
-        scores: accuracy, completeness and F-score at each tolerance.
-        cloud: the points, in the truth's frame.
-        is_aligned: whether poses brought the cloud into the truth's frame; otherwise it was taken to lie in it.
-        distances: from cloud to truth and back, measured up to `farthest`.
-        limits: the tolerances in rising order.
-        farthest: in the truth's unit.
-    """
-
-    source: str
-    truth: str
-    scores: tuple[CloudScore, ...]
-    cloud: PointSource
-    is_aligned: bool
+    source: str  # name of the cloud's source
+    truth: str  # name of the truth's source
+    scores: tuple[CloudScore, ...]  # accuracy, completeness and F-score at each tolerance
+    cloud: PointSource  # the points, in the truth's frame
+    is_aligned: bool  # whether poses brought the cloud into the truth's frame; otherwise it was taken to lie in it
     compared: CloudTruth
-    distances: CloudDistances
-    limits: tuple[float, ...]
-    farthest: float
+    distances: CloudDistances  # from cloud to truth and back, measured up to `farthest`
+    limits: tuple[float, ...]  # the tolerances in rising order
+    farthest: float  # in the truth's unit
 
     def __repr__(self) -> str:
         """Return the main figures in a line."""

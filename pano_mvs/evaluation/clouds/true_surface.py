@@ -39,7 +39,11 @@ def view_points(view: TrueView) -> NDArray[np.float32]:
 
     Rows away from the equator are thinned to an even density per solid angle.
     """
-    rows, columns = np.nonzero(np.isfinite(view.range) & _even_columns(view.range.shape))
+    height, width = view.range.shape
+    samples = np.maximum(1, np.rint(width * np.sin(np.pi * (np.arange(height) + 0.5) / height)))
+    number = np.floor(np.arange(width) * samples[:, None] / width)
+    even: NDArray[np.bool_] = np.diff(number, axis=1, prepend=-1) > 0
+    rows, columns = np.nonzero(np.isfinite(view.range) & even)
     return _points(view, rows, columns)
 
 
@@ -145,12 +149,3 @@ def _is_seen(points_in_world: NDArray[np.float32], view: TrueView) -> NDArray[np
     nearest, farthest = np.fmin.reduce(corners), np.fmax.reduce(corners)
     seen: NDArray[np.bool_] = (nearest * (1 - _SEEN_WITHIN) <= distance) & (distance <= farthest * (1 + _SEEN_WITHIN))
     return seen
-
-
-def _even_columns(size_hw: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return a mask (H, W) that keeps the share cos φ of the pixels in a row at elevation φ."""
-    height, width = size_hw
-    samples = np.maximum(1, np.rint(width * np.sin(np.pi * (np.arange(height) + 0.5) / height)))
-    number = np.floor(np.arange(width) * samples[:, None] / width)
-    even: NDArray[np.bool_] = np.diff(number, axis=1, prepend=-1) > 0
-    return even

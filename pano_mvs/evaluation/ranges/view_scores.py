@@ -354,19 +354,12 @@ class ViewScores:
 
 @dataclass(frozen=True, slots=True)
 class ScoreSettings:
-    """How range maps are scored.
+    """How range maps are scored."""
 
-    Attributes:
-        peak: the range that counts as 1 in mse, in the truth's unit.
-        bad: limits of bad pixels.
-        align: how estimates are fitted to the truth before they are scored (see `aligning_scale`).
-        min_confidence: estimates below it count as missing, except in the sparsification.
-    """
-
-    peak: float = 10.0
-    bad: Sequence[BadLimit] = DEFAULT_BAD
-    align: Align = "none"
-    min_confidence: int = 0
+    peak: float = 10.0  # the range that counts as 1 in mse, in the truth's unit
+    bad: Sequence[BadLimit] = DEFAULT_BAD  # limits of bad pixels
+    align: Align = "none"  # how estimates are fitted to the truth before they are scored (see `aligning_scale`)
+    min_confidence: int = 0  # estimates below it count as missing, except in the sparsification
 
     def __post_init__(self) -> None:
         if not 0 < self.peak < float("inf"):

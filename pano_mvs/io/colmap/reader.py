@@ -39,7 +39,6 @@ CAMERA_MODELS = (
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
-_EQUIRECTANGULAR_PARAMS_BYTES = 16
 _IMAGE = struct.Struct("<I7dI")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT3D = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
@@ -326,7 +325,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
         camera_id, number, width, height = _CAMERA.unpack_from(data, offset)
         known = 0 <= number < len(CAMERA_MODELS)
         yield camera_id, ModelCamera(CAMERA_MODELS[number] if known else f"camera model {number}", (height, width))
-        offset += _CAMERA.size + _EQUIRECTANGULAR_PARAMS_BYTES
+        offset += _CAMERA.size + 16  # the parameters of EQUIRECTANGULAR
         if offset > len(data):
             raise ValueError("it ends within a camera")
 

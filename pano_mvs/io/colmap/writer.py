@@ -206,20 +206,14 @@ class _Picture(NamedTuple):
 
 
 class _RigModel:
-    """A pycolmap model of rigs, whose ids of cameras, images and frames follow from the order in which they are added.
-
-    Attributes:
-        model: the pycolmap.Reconstruction.
-        points: the points of the poses.
-        seen: image name to the number of points that it observes.
-    """
+    """A pycolmap model of rigs, whose cameras, images and frames have ids in the order in which they are added."""
 
     def __init__(self, poses: Poses) -> None:
         import pycolmap
 
-        self.model = pycolmap.Reconstruction()
-        self.points = _ModelPoints(poses)
-        self.seen: dict[str, int] = {}
+        self.model = pycolmap.Reconstruction()  # the pycolmap.Reconstruction
+        self.points = _ModelPoints(poses)  # the points of the poses
+        self.seen: dict[str, int] = {}  # image name to the number of points that it observes
         self._rigs: dict[Hashable, tuple[int, list[int]]] = {}
 
     def add_rig(self, key: Hashable, cameras: Sequence[_Camera], from_first: Sequence[Rigid3]) -> None:

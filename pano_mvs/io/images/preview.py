@@ -47,7 +47,20 @@ def write_preview(
     if confidence is not None:
         sure = cv2.resize(confidence, (_WIDTH, height), interpolation=cv2.INTER_NEAREST)
         colors, legend = mark_unconfirmed(colors, sure), unconfirmed_classes(confidence)
-    stack = [shown, np.full((4, _WIDTH, 3), 255, np.uint8), colors, _scale_bar(near, far)]
+    strip = np.full((_MARGIN + _BAR_HEIGHT + 46, _WIDTH, 3), _PAPER, np.uint8)
+    left, right = 2 * _MARGIN, _WIDTH - 220
+    positions = np.linspace(0, 1, right - left, dtype=np.float32)
+    ranges = (near * (far / near) ** positions).astype(np.float32)
+    bottom = _MARGIN + _BAR_HEIGHT
+    strip[_MARGIN:bottom, left:right] = color_mapped(np.tile(ranges, (_BAR_HEIGHT, 1)), near, far)
+    for value in scale_ticks(near, far):
+        x = left + round((right - left - 1) * np.log(value / near) / np.log(far / near))
+        cv2.line(strip, (x, bottom), (x, bottom + 7), _INK, 2)
+        _write(strip, f"{value:g}", (x, bottom + 35), centered=True)
+    box = (right + 28, _MARGIN), (right + 28 + _BAR_HEIGHT, bottom)
+    cv2.rectangle(strip, *box, (_INVALID_GREY,) * 3, cv2.FILLED)
+    _write(strip, "no range", (right + 64, bottom - 3), centered=False)
+    stack = [shown, np.full((4, _WIDTH, 3), 255, np.uint8), colors, strip]
     if legend:
         stack.append(_legend(legend))
     bgr = cv2.cvtColor(np.vstack(stack), cv2.COLOR_RGB2BGR)
@@ -116,24 +129,6 @@ def _legend(classes: Sequence[Literal["weak", "filled"]]) -> NDArray[np.uint8]:
         confidence[:, -1] = CONSISTENT_CONFIDENCE[1]  # so that weak ones are pale
         strip[:_BAR_HEIGHT, left : left + 3 * _BAR_HEIGHT] = mark_unconfirmed(colors, confidence)[:, :-1]
         _write(strip, meanings[name], (left + 3 * _BAR_HEIGHT + _MARGIN, _BAR_HEIGHT - 3), centered=False)
-    return strip
-
-
-def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:
-    """Return a strip (h, W, 3) with the colours of the scale and the ranges that they stand for."""
-    strip = np.full((_MARGIN + _BAR_HEIGHT + 46, _WIDTH, 3), _PAPER, np.uint8)
-    left, right = 2 * _MARGIN, _WIDTH - 220
-    positions = np.linspace(0, 1, right - left, dtype=np.float32)
-    ranges = (near * (far / near) ** positions).astype(np.float32)
-    bottom = _MARGIN + _BAR_HEIGHT
-    strip[_MARGIN:bottom, left:right] = color_mapped(np.tile(ranges, (_BAR_HEIGHT, 1)), near, far)
-    for value in scale_ticks(near, far):
-        x = left + round((right - left - 1) * np.log(value / near) / np.log(far / near))
-        cv2.line(strip, (x, bottom), (x, bottom + 7), _INK, 2)
-        _write(strip, f"{value:g}", (x, bottom + 35), centered=True)
-    box = (right + 28, _MARGIN), (right + 28 + _BAR_HEIGHT, bottom)
-    cv2.rectangle(strip, *box, (_INVALID_GREY,) * 3, cv2.FILLED)
-    _write(strip, "no range", (right + 64, bottom - 3), centered=False)
     return strip
 
 

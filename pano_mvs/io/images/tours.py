@@ -164,7 +164,9 @@ def _stated(capture: _Capture, notes: list[str]) -> Iterator[TourScene]:
     cubes = {name: tiles for name, levels in by_path.items() if (tiles := _finest(levels))}
     cube_of = {path: name for name in cubes for tiles in by_path[name].values() for path in tiles.values()}
     scenes, taken, missing = list[tuple[Path, StatedScene, Tiles, Path | None]](), set[Path](), list[str]()
-    for file in _likely_configurations(capture):
+    files = [path for path in capture.files if path.suffix.lower() in {".js", ".json", ".xml", ".html", ".htm"}]
+    files.sort(key=lambda path: (len(path.parts), natural_key(path.relative_to(capture.folder).as_posix())))
+    for file in files[:200]:
         try:
             stated = stated_scenes(file)
         except (OSError, ValueError) as error:
@@ -197,13 +199,6 @@ def _stated(capture: _Capture, notes: list[str]) -> Iterator[TourScene]:
         links = (by_file.get((file, key)) or by_key.get(key) for key in scene.links)
         others = dict.fromkeys(link for link in links if link and link != name)
         yield TourScene(name, tiles, tuple(others), panorama)
-
-
-def _likely_configurations(capture: _Capture) -> list[Path]:
-    """Return the files that may be configurations, those nearest to the folder first."""
-    files = [path for path in capture.files if path.suffix.lower() in {".js", ".json", ".xml", ".html", ".htm"}]
-    files.sort(key=lambda path: (len(path.parts), natural_key(path.relative_to(capture.folder).as_posix())))
-    return files[:200]
 
 
 def _pictures_of(scene: StatedScene, capture: _Capture, file: Path) -> tuple[Tiles, Path | None]:

@@ -86,7 +86,10 @@ def describe_video(path: Path, stereo: StereoSetting = "auto") -> VideoInfo:
             f"{path}: does not say how long it lasts ({count:.0f} frames at {rate:g} a second): the "
             "recording was not finished. Copy it into an .mp4 with a video program"
         )
-    layout = _stereo_layout(path, (height, width)) if stereo == "auto" else stereo
+    layout = stereo
+    if layout == "auto":
+        frames = (frame for _, frame in frames_between(path, 0.0, np.inf))
+        layout = stereo_layout(path, (height, width), _movie_header(path), picture=lambda: next(frames, None))
     if layout != "none":
         height, width = eye_size_hw((height, width), layout)
     if width != 2 * height:
@@ -96,13 +99,6 @@ def describe_video(path: Path, stereo: StereoSetting = "auto") -> VideoInfo:
             "`stereo` to top_bottom or left_right"
         )
     return VideoInfo((height, width), int(count), float(rate), is_turned, layout)
-
-
-def _stereo_layout(path: Path, size_hw: tuple[int, int]) -> StereoLayout:
-    def first_frame() -> NDArray[np.uint8] | None:
-        return next((frame for _, frame in frames_between(path, 0.0, np.inf)), None)
-
-    return stereo_layout(path, size_hw, _movie_header(path), picture=first_frame)
 
 
 def _movie_header(path: Path) -> bytes:

@@ -53,7 +53,8 @@ def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: key 'filename' must be the name of the image, got {name!r}")
         camera = cameras.get(about.get("id_intrinsic"), {})
-        kind = camera.get("polymorphic_name", kinds.get(_class_of(camera)))
+        number = camera.get("polymorphic_id")
+        kind = camera.get("polymorphic_name", kinds.get(number | _NEW if isinstance(number, int) else -1))
         if kind != _SPHERICAL:
             raise InputError(f"{where} ({name}): its camera is {kind}, expected spherical. Only panoramas can be used")
         folder = str(about.get("local_path") or "").replace("\\", "/").strip("/")
@@ -82,12 +83,6 @@ def _inner(view: dict[str, Any], where: str) -> dict[str, Any]:
     # Views with a prior of the position hold those of an ordinary view inside.
     inner = about.get("value0") if "filename" not in about else about
     return inner if isinstance(inner, dict) else about
-
-
-def _class_of(camera: dict[str, Any]) -> int:
-    """Return the number of a camera's class; the highest bit marks its first mention."""
-    number = camera.get("polymorphic_id")
-    return number | _NEW if isinstance(number, int) else -1
 
 
 def _pose(value: dict[str, Any], where: str) -> Rigid3:

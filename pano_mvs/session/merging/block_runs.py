@@ -63,19 +63,15 @@ def split_images(images: Path, to: Path, division: Division) -> list[ImageBlock]
         raise UsageError(f"--out {to}: exists and is not an empty folder. Choose a new one")
     if resolved(images) in (resolved(to), *resolved(to).parents):
         raise UsageError(f"--out {to}: is in the folder of the images. Choose a folder elsewhere")
-    return link_blocks(images, to, divide_images(images, division))
+    return _link_blocks(images, to, _divide_images(images, division))
 
 
-def divide_images(images: Path, division: Division, *, ignored: Sequence[Path] = ()) -> list[tuple[str, ...]]:
+def _divide_images(images: Path, division: Division, *, ignored: Sequence[Path] = ()) -> list[tuple[str, ...]]:
     """Return the names of the images of each block, relative to the folder of the capture.
 
     Args:
         images: the folder of the capture, in natural order.
         ignored: files and folders in it that do not belong to the capture, such as masks.
-
-    Raises:
-        UsageError: if a setting cannot be used, or all images fit into one block.
-        InputError: if there are no images, or the poses are of other images.
     """
     names = tuple(path.relative_to(images).as_posix() for path in _pictures(images, ignored))
     positions = None if division.poses is None else _positions(division.poses, names)
@@ -95,12 +91,8 @@ def _pictures(images: Path, ignored: Sequence[Path]) -> list[Path]:
     return [path for path in found if not any(path.absolute().is_relative_to(place) for place in left_out)]
 
 
-def link_blocks(images: Path, to: Path, blocks: Sequence[Sequence[str]]) -> list[ImageBlock]:
-    """Write a folder of links to the images of each block, and to their masks.
-
-    Raises:
-        StoreError: if a link cannot be made.
-    """
+def _link_blocks(images: Path, to: Path, blocks: Sequence[Sequence[str]]) -> list[ImageBlock]:
+    """Write a folder of links to the images of each block, and to their masks."""
     found = []
     for number, names in enumerate(blocks, start=1):
         folder = to / f"block_{number}"
@@ -163,7 +155,7 @@ def divided(session: Session, division: Division) -> list[tuple[str, ...]]:
     check_output(session)
     require_free(session.out)
     require_mergeable(session)
-    return divide_images(_images(session), division, ignored=_ignored(session))
+    return _divide_images(_images(session), division, ignored=_ignored(session))
 
 
 def pictures_of(session: Session) -> list[Path]:
@@ -230,7 +222,7 @@ def block_runs(
     """
     place = folder / within
     remove_whole(place / "images")
-    linked = link_blocks(_images(session), place / "images", blocks)
+    linked = _link_blocks(_images(session), place / "images", blocks)
     return [
         BlockRun(_over(session, block.folder, place / block.folder.name), block.names, folder, number, len(linked))
         for number, block in enumerate(linked, start=1)

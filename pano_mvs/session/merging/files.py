@@ -25,7 +25,7 @@ from pano_mvs.io.ply import open_ply_points, write_ply_parts
 from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
 from pano_mvs.io.splats import NerfstudioFrame, transforms_document
 from pano_mvs.io.thinning import chunks
-from pano_mvs.results.records import PosesSummary, ViewSummary
+from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.run_output import RunOutput, RunView, load
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import PointCloud, Poses
@@ -124,19 +124,14 @@ def _loaded(out: Path, cache: Path | None) -> Block:
     if len(largest.names) < 2:
         raise InputError(f"{out}: only {len(largest.names)} {plural(len(largest.names), 'image')} has a pose")
     if run.values.poses is None:
-        largest = _as_stated(largest, run.summary.poses)
+        largest = replace(
+            largest,
+            frame=run.summary.poses.frame or largest.frame,
+            scale=run.summary.poses.scale or largest.scale,
+            metric=run.summary.poses.metric,
+            doubts={name: run.summary.poses.doubts[name] for name in largest.names if name in run.summary.poses.doubts},
+        )
     return Block(run, largest, tuple(name for group in others for name in group.names))
-
-
-def _as_stated(poses: Poses, stated: PosesSummary) -> Poses:
-    """Return the poses of a COLMAP model with what run.json states about them, which the model does not hold."""
-    return replace(
-        poses,
-        frame=stated.frame or poses.frame,
-        scale=stated.scale or poses.scale,
-        metric=stated.metric,
-        doubts={name: stated.doubts[name] for name in poses.names if name in stated.doubts},
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +170,6 @@ class MergeFiles:
             "equirectangular",
             frames,
             depth_unit=1.0,
-            about={"file_from_world": turn.tolist()},
             file_from_world=turn,
             seed="cloud.ply" if has_cloud else "",
         )

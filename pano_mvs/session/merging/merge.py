@@ -89,8 +89,8 @@ def merge_outputs(outs: Sequence[Path], to: Path, *, cache: Path | None = None) 
         range(len(blocks)), key=lambda number: (blocks[number].poses.metric, len(blocks[number].poses.names), -number)
     )
     alignment = align_blocks([block.poses.cameras for block in blocks], reference)
-    require_connected(blocks, alignment)
-    require_agreement(blocks, alignment)
+    _require_connected(blocks, alignment)
+    _require_agreement(blocks, alignment)
     similarities = [similarity for similarity in alignment.world_from_block if similarity is not None]
     order = sorted({name for block in blocks for name in block.poses.names}, key=natural_key)
     merged = merge_blocks([block.poses for block in blocks], similarities, order=order, reference=reference)
@@ -147,7 +147,7 @@ def _written(files: MergeFiles, alignment: BlockAlignment, *, exports_of: RunSum
     points = files.write_cloud()
     files.write_model(has_cloud=points > 0)
     views = files.write_ranges()
-    exported, left_out = repeat_exports(files, exports_of, has_cloud=points > 0)
+    exported, left_out = _repeat_exports(files, exports_of, has_cloud=points > 0)
     notes = (*_notes(blocks, alignment), *_adjustment_notes(files.merged), *left_out)
     doubts = {name: ImageReason(stage=_STAGE, reason=why) for name, why in poses.doubts.items()}
     rejected = _rejected(blocks, poses)
@@ -256,12 +256,8 @@ DOUBTFUL_OFFSET, REFUSED_OFFSET = 0.05, 0.25
 DOUBTFUL_TURN_DEG, REFUSED_TURN_DEG = 0.5, 3.0
 
 
-def require_connected(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
-    """Check that all blocks are connected by common cameras.
-
-    Raises:
-        InputError: if one is not; it names the block.
-    """
+def _require_connected(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
+    """Check that all blocks are connected by common cameras."""
     lost = [number for number, similarity in enumerate(alignment.world_from_block) if similarity is None]
     if not lost:
         return
@@ -282,12 +278,8 @@ def require_connected(blocks: Sequence[Block], alignment: BlockAlignment) -> Non
     )
 
 
-def require_agreement(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
-    """Check that the common cameras of all pairs of blocks agree at least roughly.
-
-    Raises:
-        InputError: if those of a pair do not; it names the blocks and the disagreement.
-    """
+def _require_agreement(blocks: Sequence[Block], alignment: BlockAlignment) -> None:
+    """Check that the common cameras of all pairs of blocks agree at least roughly."""
     bad = [
         link for link in alignment.links if link.relative_offset > REFUSED_OFFSET or link.turn_deg > REFUSED_TURN_DEG
     ]
@@ -348,7 +340,7 @@ _MERGED = {"export.colmap", "export.ply", "export.ranges", "export.previews", "e
 _ARRAYS = ("points_in_world", "normals_in_world", "colors_rgb", "view_counts", "confidence", "uncertainty")
 
 
-def repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) -> tuple[dict[str, str], list[str]]:
+def _repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) -> tuple[dict[str, str], list[str]]:
     """Write what the exports of a block make of the merged poses and cloud.ply; return file to digest, and notes.
 
     Exports of plugins are not repeated. An export that fails loses nothing else.
@@ -357,9 +349,6 @@ def repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) -> 
         files: whose model and cloud have been written.
         block: the run whose exports and settings are taken.
         has_cloud: whether cloud.ply has points.
-
-    Raises:
-        StoreError: if the disk is full, or the cloud cannot be copied into arrays of its own.
     """
     stages = Registry.installed().stages
     found = [(outcome, stages[outcome.use]) for outcome in block.stages if outcome.use in stages]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.fusion.view import normals_from_range
 from pano_mvs.algorithms.points.octree import NODE_POINTS, octree
 from pano_mvs.api import (
     All,

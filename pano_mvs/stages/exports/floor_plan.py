@@ -164,7 +164,11 @@ class _GroupPlan:
         )
         places = self.centers[:, :2].tolist()
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
-        drawing = self._drawing(number, extent, walls=walls.ends_xy, cameras=names)
+        rows, columns = extent.size_hw
+        width, height = columns * extent.pixel, rows * extent.pixel
+        unit = "m" if self.poses.metric else "scene units"
+        box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
+        drawing = PlanDrawing(f"storey {number}", walls.ends_xy, names, box, bar_length(width), unit, self.poses.metric)
         files = self._write_files(f"storey_{number}", grid, drawing)
         return {
             **files,
@@ -179,15 +183,6 @@ class _GroupPlan:
             "walls": len(walls.ends_xy),
             "cameras": {name: list(place) for name, place in names.items()},
         }
-
-    def _drawing(
-        self, number: int, extent: Extent, *, walls: FloatArray, cameras: dict[str, tuple[float, float]]
-    ) -> PlanDrawing:
-        rows, columns = extent.size_hw
-        width, height = columns * extent.pixel, rows * extent.pixel
-        unit = "m" if self.poses.metric else "scene units"
-        box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
-        return PlanDrawing(f"storey {number}", walls, cameras, box, bar_length(width), unit, self.poses.metric)
 
     def _write_files(self, stem: str, grid: PlanGrid, drawing: PlanDrawing) -> dict[str, str]:
         """Write the files of a storey in all formats, and return their names."""

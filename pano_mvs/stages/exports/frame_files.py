@@ -126,11 +126,8 @@ class FrameFiles:
         else:
             path += suffix
             write_picture(self._file("equirectangular", path, suffix), picture)
-        size, focal = (width, height), (width / 2, float(height))
-        mask, depth, normal, confidence = self._add_layers("equirectangular", "{name}", layers)
-        self.frames.append(
-            NerfstudioFrame("equirectangular", path, mask, depth, size, focal, _NO_TURN, normal, confidence)
-        )
+        camera = {"size_wh": (width, height), "focal_xy": (width / 2, float(height)), "frame_from_cam": _NO_TURN}
+        self._add_layers("equirectangular", "{name}", layers, image=path, **camera)
 
     def _add_face(self, face: Face, picture: NDArray[np.uint8], layers: Layers) -> None:
         view, suffix = face.view, f".{self.params.image_format}"
@@ -138,29 +135,30 @@ class FrameFiles:
         path = f"images/{name}{suffix}"
         write_picture(self._file("faces", path, suffix), face_image(picture, view))
         seen = _seen_by(face, layers, threads=self.ctx.threads)
-        mask, depth, normal, confidence = self._add_layers("faces", name, seen)
         turn = tuple(tuple(map(float, row)) for row in view.view_from_cam)
-        size, focal = (view.size_hw[1], view.size_hw[0]), (view.focal_px, view.focal_px)
-        self.frames.append(NerfstudioFrame("faces", path, mask, depth, size, focal, turn, normal, confidence))
+        focal = (view.focal_px, view.focal_px)
+        self._add_layers(
+            "faces", name, seen, image=path, size_wh=view.size_hw[::-1], focal_xy=focal, frame_from_cam=turn
+        )
 
-    def _add_layers(self, variant: Variant, name: str, layers: Layers) -> tuple[str, str, str, str]:
-        """Write mask, depth, normals and confidence; return their paths, each empty if there is nothing to write."""
-        paths = ["", "", "", ""]
+    def _add_layers(self, variant: Variant, name: str, layers: Layers, **frame: Any) -> None:
+        """Write mask, depth, normals and confidence where there are any, and add the frame with their paths."""
+        paths: dict[str, Any] = {"mask": "", "depth": ""}
         if not layers.valid.all():
-            paths[0] = f"masks/{name}.png"
-            write_png(self._file(variant, paths[0]), np.where(layers.valid, np.uint8(255), np.uint8(0)))
+            paths["mask"] = f"masks/{name}.png"
+            write_png(self._file(variant, paths["mask"]), np.where(layers.valid, np.uint8(255), np.uint8(0)))
         if layers.ranges is not None:
-            paths[1] = f"depths/{name}.png"
+            paths["depth"] = f"depths/{name}.png"
             self.depths += int(np.isfinite(layers.ranges).sum())
-            file = self._file(variant, paths[1])
+            file = self._file(variant, paths["depth"])
             self.beyond += write_range_png(file, layers.ranges, unit=self.params.depth_unit)
         if layers.normals_in_cam is not None:
-            paths[2] = f"normals/{name}.png"
-            write_normals_png(self._file(variant, paths[2]), layers.normals_in_cam)
+            paths["normal"] = f"normals/{name}.png"
+            write_normals_png(self._file(variant, paths["normal"]), layers.normals_in_cam)
         if layers.confidence is not None:
-            paths[3] = f"confidence/{name}.png"
-            write_confidence_png(self._file(variant, paths[3]), layers.confidence)
-        return paths[0], paths[1], paths[2], paths[3]
+            paths["confidence"] = f"confidence/{name}.png"
+            write_confidence_png(self._file(variant, paths["confidence"]), layers.confidence)
+        self.frames.append(NerfstudioFrame(variant, **paths, **frame))
 
     def _file(self, variant: Variant, path: str, suffix: str = ".png") -> Path:
         """Return where to write the file for a target."""
@@ -241,9 +239,7 @@ def write_transforms(
     poses = group.poses
     seed = _write_seed(group, cloud, params, ctx=ctx, file_from_world=file_from_world)
     seed_name = "" if seed is None else group_file("seed.ply", group.number)
-    about: dict[str, Any] = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
-    if file_from_world is not None:
-        about["file_from_world"] = file_from_world.tolist()
+    about = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
     cameras = poses.cameras
     for variant, listed in group.listed().items():
         document = transforms_document(
@@ -292,15 +288,9 @@ def write_photographs(
     for idx, name in enumerate(photographs.names):
         height, width = photographs.sizes_hw[idx].tolist()
         focal = float(photographs.focals_px[idx])
+        radial = float(photographs.radials[idx])
         frame = NerfstudioFrame(
-            "faces",
-            f"images/{name}",
-            "",
-            "",
-            (width, height),
-            (focal, focal),
-            _NO_TURN,
-            radial=float(photographs.radials[idx]),
+            "faces", f"images/{name}", "", "", (width, height), (focal, focal), _NO_TURN, radial=radial
         )
         frames.append((name, photographs.cam_from_world(idx), frame))
         files[f"{folder}/images/{name}"] = photographs.pictures[idx].path
@@ -308,8 +298,7 @@ def write_photographs(
         "faces",
         frames,
         depth_unit=group.depth_unit,
-        about={"world_frame": group.poses.frame}
-        | ({} if file_from_world is None else {"file_from_world": file_from_world.tolist()}),
+        about={"world_frame": group.poses.frame},
         file_from_world=file_from_world,
         seed="seed.ply" if seed else "",
     )

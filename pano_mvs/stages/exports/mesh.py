@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -226,18 +226,26 @@ def textured_mesh(
     """Return the textured surface of the cloud of one group of panoramas."""
     # Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
     solved, _ = solved_mesh(cloud, params, folder, deepest=9)
-    names = [name for name in views[0].names if name in views[1]]
+    poses, images, ranges = views
+    names = [name for name in poses.names if name in images]
 
     def load(idx: int) -> PaintView:
         name = names[idx]
-        poses, images, ranges = views
         image, range_map = images[name], ranges.get(name)
         if range_map is not None and range_map.range.shape != image.size_hw:
             range_map = None
         pose = poses.cam_from_world(poses.names.index(name))
         return PaintView(pose, image.load(), image.load_mask(), range_map)
 
-    solved = _without_free_space(solved, names, views, smallest_part=params.smallest_part)
+    space = FreeSpace(solved.vertices_in_world)
+    for name in names:
+        if name in ranges:
+            space.add(ranges[name], poses.cam_from_world(poses.names.index(name)), images[name].load_mask())
+    free = space.free()
+    solved = used_part(solved, solved.faces[~free[solved.faces].any(axis=1)])
+    solved = without_crumbs(solved, smallest_share=params.smallest_part)
+    if not len(solved.faces):
+        raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
     vertices, faces = decimated(solved.vertices_in_world, solved.faces, triangles=params.triangles)
 
     balance = balanced_views(vertices, faces, load, views=len(names), threads=ctx.threads)
@@ -247,27 +255,6 @@ def textured_mesh(
         )
     atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
     return textured(vertices, faces, atlas, load=load, balance=balance, threads=ctx.threads)
-
-
-def _without_free_space(
-    mesh: Mesh,
-    names: Sequence[str],
-    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
-    *,
-    smallest_part: float,
-) -> Mesh:
-    """Return a mesh without the parts through which panoramas look."""
-    space = FreeSpace(mesh.vertices_in_world)
-    for name in names:
-        if name in views[2]:
-            pose = views[0].cam_from_world(views[0].names.index(name))
-            space.add(views[2][name], pose, views[1][name].load_mask())
-    free = space.free()
-    kept = used_part(mesh, mesh.faces[~free[mesh.faces].any(axis=1)])
-    kept = without_crumbs(kept, smallest_share=smallest_part)
-    if not len(kept.faces):
-        raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
-    return kept
 
 
 def _write(

@@ -223,18 +223,14 @@ def _write_models(group: PosedGroup, poses: Poses, photographs: Photographs | No
         if variant == "faces":
             write_rig_model(folder, poses, _cuts(listed), photographs=photographs, form="bin")
         else:
-            _write_panoramas(folder, poses, dict(listed))
+            frames = dict(listed)
+            kept = with_cameras(poses, np.array([name in frames for name in poses.names]))
+            names = tuple(_image_name(name, frames[name]) for name in kept.names)
+            sizes = {image: frames[name].size_wh[::-1] for image, name in zip(names, kept.names, strict=True)}
+            write_colmap_model(folder, replace(kept, names=names, doubts={}), sizes, form="bin")
         target = f"{ROOT}/{variant}/sparse/{group.number}"
         files |= {f"{target}/{path.name}": path for path in children(folder)}
     return files
-
-
-def _write_panoramas(folder: Path, poses: Poses, frames: Mapping[str, NerfstudioFrame]) -> None:
-    """Write a model of EQUIRECTANGULAR cameras; panoramas without frames are not in it."""
-    kept = with_cameras(poses, np.array([name in frames for name in poses.names]))
-    names = tuple(_image_name(name, frames[name]) for name in kept.names)
-    sizes = {image: frames[name].size_wh[::-1] for image, name in zip(names, kept.names, strict=True)}
-    write_colmap_model(folder, replace(kept, names=names, doubts={}), sizes, form="bin")
 
 
 def _cuts(listed: Sequence[tuple[str, NerfstudioFrame]]) -> dict[str, CutPanorama]:

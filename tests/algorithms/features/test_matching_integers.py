@@ -7,8 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
-from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
+from pano_mvs.algorithms.matching.nearest_two import (
+    NearestTwo,
+    can_compare_as_integers,
+    nearest_two,
+    nearest_two_integers,
+)
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.core.errors import UsageError
 from tests.algorithms.features.test_matching import features

@@ -15,14 +15,15 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import (
     automatic_pairs,
     east_north_m,
+    exhaustive_pairs,
     loop_closing_pairs,
     most_pairs,
     nearest_links,
     position_pairs,
     retrieval_pairs,
     sample_matches,
+    sequential_pairs,
 )
-from pano_mvs.algorithms.matching.pairs import exhaustive_pairs, sequential_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import GlobalDescriptor

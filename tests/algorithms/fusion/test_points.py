@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.points.selection import spread_points
-from pano_mvs.algorithms.points.tracking import sample_surface, track_points
+from pano_mvs.algorithms.points.tracking import sample_surface, spread_points, track_points
 from pano_mvs.algorithms.ranges.kernels_agreement import see_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.learned import networks
-from pano_mvs.algorithms.learned.aliked import extract_aliked, maxima_of_scores
+from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles, maxima_of_scores
 from pano_mvs.algorithms.learned.lightglue import LightGlue, match_learned
 from pano_mvs.algorithms.learned.networks import DIGESTS, PACKAGED, TILE_PX, Networks
 from pano_mvs.algorithms.learned.photographs import match_photograph, view_of_photograph
-from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, angle_between, ray_grid, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import Features

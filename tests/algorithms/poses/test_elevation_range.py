@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.adjustment.elevation_range import ElevationRange
-from pano_mvs.algorithms.poses.adjustment.refine import fitted_elevation_range, refine_poses
+from pano_mvs.algorithms.poses.adjustment.refine import ElevationRange, fitted_elevation_range, refine_poses
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import noisy_bearings, points_in_box, random_poses

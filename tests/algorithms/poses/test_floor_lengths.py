@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.floor_lengths import floor_lengths
+from pano_mvs.algorithms.poses.adjustment.refine import floor_lengths
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
 

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses import photograph_panoramas
-from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
+from pano_mvs.algorithms.poses.photograph_alignment import (
+    MIN_SIDE_PX,
+    PanoramaPatches,
+    PhotographPatches,
+    panorama_levels,
+    photograph_levels,
+    sight_points,
+)
 from pano_mvs.algorithms.poses.photograph_camera import (
     FocalPrior,
     PhotographCamera,
@@ -23,11 +30,9 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas as similar_to_each
 from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
-from pano_mvs.algorithms.poses.photograph_patches import MIN_SIDE_PX, panorama_levels, photograph_levels, sight_points
-from pano_mvs.algorithms.poses.photograph_points import KnownPoints, known_points
-from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints, surface_points
+from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas as similar_to_each
+from pano_mvs.algorithms.poses.photograph_surface import KnownPoints, SurfacePoints, known_points, surface_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, RangeMap

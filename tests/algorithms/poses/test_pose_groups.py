@@ -15,8 +15,8 @@ import pytest
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
+from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.algorithms.views import select_views
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.uncertainty import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec, spiral_rays

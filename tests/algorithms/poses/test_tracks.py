@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, triangulate_tracks
-from pano_mvs.algorithms.poses.placement.scale import estimate_scale
+from pano_mvs.algorithms.poses.placement.pair_evidence import estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups, consistent_edges, relative_pose
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec

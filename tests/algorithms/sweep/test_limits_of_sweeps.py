@@ -20,8 +20,7 @@ from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, roll_panorama
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.paint import Texture
-from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.room import Texture, capture_poses, default_room, render
 from tests.synthetic.places import plain_table
 from tests.synthetic.scenes import courtyard, desk
 

@@ -16,8 +16,7 @@ from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
-from pano_mvs.testing.paint import Texture
-from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.room import Texture, capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import plane_position
 
 NEAR, FAR = 0.5, 6.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.unit_translations import unit_translations
+from pano_mvs.algorithms.poses.frame.metric_scale import unit_translations
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.io.ranges import read_range_tiff
 from pano_mvs.scene import Poses

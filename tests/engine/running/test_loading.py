@@ -13,13 +13,16 @@ from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.execute import LazyMapping, max_kept_items
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import SourceItem, spec_of
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.stages.features import SiftParams, sift_tangent
+from pano_mvs.stages.features import sift_tangent
 from pano_mvs.stages.source import FolderParams, folder
 from tests.io.images.pictures import png_chunk
+
+SiftParams = Registry.installed().stages["features.sift_tangent"].params_type
 
 
 @pytest.fixture

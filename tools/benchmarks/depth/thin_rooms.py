@@ -8,8 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.testing.paint import Texture
-from pano_mvs.testing.room import default_room, render
+from pano_mvs.testing.room import Texture, default_room, render
 from pano_mvs.testing.surfaces import Cuboid, Surface
 from tests.synthetic.paints import BLUE, OAK, RED, STEEL
 from tests.synthetic.rod import Rod

@@ -33,7 +33,7 @@ from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
-from pano_mvs.testing import paint, room, surfaces
+from pano_mvs.testing import room, surfaces
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.poses.captures_with_truth import MAPPERS, SEED, Cameras, Pictures, matched, native
 from tools.benchmarks.poses.placements import judge_placements
@@ -105,7 +105,7 @@ def rendered(scene: Scene, work: Path, label: str, width: int) -> tuple[Pictures
 def _fingerprint(scene: Scene) -> str:
     """Return a digest of the scene and of the code that renders it."""
     digest = hashlib.sha256(repr(scene).encode())
-    for module in (drawings, fittings, paint, prints, room, surfaces):
+    for module in (drawings, fittings, prints, room, surfaces):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:12]
 

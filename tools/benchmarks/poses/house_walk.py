@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.testing.paint import Colors
-from pano_mvs.testing.room import Room, render
+from pano_mvs.testing.room import Colors, Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Surface, Vector
 from tests.synthetic.bounded import Bounded
 from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_file import write_png
-from pano_mvs.testing.paint import Colors, albedo_at
+from pano_mvs.testing.room import Colors, albedo_at
 from pano_mvs.testing.surfaces import Ball, Cuboid, Surface, Vector
 from tests.synthetic.bounded import Bounded
 from tests.synthetic.rod import Rod

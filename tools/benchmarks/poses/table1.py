@@ -28,7 +28,7 @@ from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
+from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.two_view import verify_pair

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.testing.paint import Colors
+from pano_mvs.testing.room import Colors
 
 Image: TypeAlias = NDArray[np.float32]
 Kind: TypeAlias = Literal[

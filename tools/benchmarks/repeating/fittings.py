@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.testing.paint import Colors, Pattern, Texture
+from pano_mvs.testing.room import Colors, Pattern, Texture
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 from tests.synthetic.bounded import Bounded
 from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE

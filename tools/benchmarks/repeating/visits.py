@@ -8,8 +8,7 @@ import numpy as np
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
-from pano_mvs.testing.paint import Colors
-from pano_mvs.testing.room import Room
+from pano_mvs.testing.room import Colors, Room
 from pano_mvs.testing.surfaces import Vector
 from tests.synthetic.scenes import Scene
 from tools.benchmarks.repeating.drawings import Drawing, Kind

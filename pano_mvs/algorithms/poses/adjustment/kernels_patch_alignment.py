@@ -11,7 +11,6 @@ from pano_mvs.geometry.kernels_sphere import pixel_from_ray
 
 _PARAMETERS = 6
 _ITERATIONS, _CONVERGED = 12, 0.003
-_MIN_CONTRAST = 0.5  # grey levels
 
 
 @kernel
@@ -286,7 +285,7 @@ def align_patches(
         shifts[m, :] = 0.0
         correlations[m], deviations[m] = 0.0, np.inf
         contrast = _prepare(patches[reference_idx[m]], size, margin, weights, total, template, columns)
-        if contrast < _MIN_CONTRAST:
+        if contrast < 0.5:  # grey levels
             continue
         _normal_matrix(columns, weights, stiffness, factor)
         _factorise(factor)

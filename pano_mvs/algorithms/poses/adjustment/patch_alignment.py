@@ -22,7 +22,6 @@ _MAX_WIDTH = 4096  # wider panoramas are rarely sharp to a pixel, and their patc
 _PAD_PX = 8
 # All of these were tuned on rendered and synthetic captures; the result changes little around them.
 _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
-_STIFFNESS = 6.0
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
 _FLOOR = 0.1  # samples: error that the deviation of the aligned patches does not include
@@ -62,20 +61,15 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     step_rad = 2 * np.pi / min(load(poses.names[0])[0].shape[1], _MAX_WIDTH)
     sightings = _sightings(poses, step_rad)
     bearings = np.array(poses.track_bearings)
-    chosen = _longest_tracks(poses.track_point_idx, _MAX_PER_IMAGE * len(poses.names))
+    lengths = np.bincount(poses.track_point_idx)
+    order = np.argsort(-lengths, kind="stable")
+    chosen = np.zeros(len(lengths), np.bool_)
+    chosen[order[np.cumsum(lengths[order]) <= _MAX_PER_IMAGE * len(poses.names)]] = True
+    chosen = chosen[poses.track_point_idx]  # observations of the longest tracks
     sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
     for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
         _align_block(poses, sightings, block, load=load, step_rad=step_rad, bearings=bearings, sigmas_rad=sigmas_rad)
     return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))
-
-
-def _longest_tracks(point_idx: NDArray[np.int32], most: int) -> NDArray[np.bool_]:
-    """Return which observations, (T,), belong to the longest tracks, at most `most` observations."""
-    lengths = np.bincount(point_idx)
-    order = np.argsort(-lengths, kind="stable")
-    chosen = np.zeros(len(lengths), np.bool_)
-    chosen[order[np.cumsum(lengths[order]) <= most]] = True
-    return np.asarray(chosen[point_idx])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +93,16 @@ def _sightings(poses: Poses, step_rad: float) -> _Sightings:
     towards = poses.points_in_world[point_idx] - poses.centers[image_idx]
     ranges = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     rays = towards / ranges[:, None]
-    reference_of_point = _references(point_idx, rays, ranges, count=len(poses.points_in_world))
+    count = len(poses.points_in_world)
+    total = np.stack([np.bincount(point_idx, column, count) for column in rays.T], axis=1)
+    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    # The reference of a point is the ray nearest to the mean, the nearer of two.
+    # Two observations are equally near to their mean, except for rounding errors.
+    likeness = np.round(np.sum(rays * mean[point_idx], axis=1), 9)
+    order = np.lexsort((ranges, -likeness, point_idx))
+    first = np.concatenate([[True], np.diff(point_idx[order]) > 0])
+    reference_of_point = np.zeros(count, np.intp)
+    reference_of_point[point_idx[order[first]]] = order[first]
     reference_idx = reference_of_point[point_idx]
     steps = (step_rad * ranges[reference_idx])[:, None, None]
     axes = poses.rotations[image_idx] @ (steps * tangent_basis(rays[reference_idx]))
@@ -110,19 +113,6 @@ def _sightings(poses: Poses, step_rad: float) -> _Sightings:
         second_axes=np.ascontiguousarray(axes[..., 1]),
         zoom=ranges[reference_idx] / ranges,
     )
-
-
-def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArray, *, count: int) -> NDArray[np.intp]:
-    """Return the reference observation of every point, (count,): the ray nearest to the mean, the nearer of two."""
-    total = np.stack([np.bincount(point_idx, column, count) for column in rays.T], axis=1)
-    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-    # Two observations are equally near to their mean, except for rounding errors.
-    likeness = np.round(np.sum(rays * mean[point_idx], axis=1), 9)
-    order = np.lexsort((ranges, -likeness, point_idx))
-    first = np.concatenate([[True], np.diff(point_idx[order]) > 0])
-    references = np.zeros(count, np.intp)
-    references[point_idx[order[first]]] = order[first]
-    return references
 
 
 def _blocks(
@@ -235,7 +225,7 @@ def aligned_shifts(
 
     count = len(target_idx)
     shifts, correlations, deviations = np.empty((count, 2)), np.empty(count), np.empty(count)
-    align_patches(patches, reference_idx, target_idx, window(), _STIFFNESS, shifts, correlations, deviations)
+    align_patches(patches, reference_idx, target_idx, window(), 6.0, shifts, correlations, deviations)
     return shifts, correlations, deviations
 
 

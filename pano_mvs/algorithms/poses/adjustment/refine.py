@@ -1,4 +1,4 @@
-"""Refine the poses of a whole capture by angular bundle adjustment, with rejection of outliers."""
+"""Refine the poses of a whole capture by angular bundle adjustment, with outliers rejected and lengths by floors."""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.elevation_range import ElevationRange, estimate_elevation_range
-from pano_mvs.algorithms.poses.adjustment.floor_lengths import floor_lengths
-from pano_mvs.algorithms.poses.adjustment.offset_scale import OffsetScale, estimate_offset_scale
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.uncertainty import camera_deviations
+from pano_mvs.algorithms.poses.adjustment.uncertainty import (
+    OffsetScale,
+    camera_deviations,
+    estimate_offset_scale,
+    held_cameras,
+    ray_derivatives,
+    unexplained,
+)
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import LensRig
@@ -28,7 +34,6 @@ from pano_mvs.scene.pose_groups import per_group, split_groups
 _ROUNDS = 3
 # The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
-_MIN_USED = 0.5  # share of the observations that fit a solution; a wrong one leaves most of them out
 # Sigma of a key point in a panorama of 1024 columns, a fifth of a pixel, to which the scale of the loss refers.
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
 
@@ -167,12 +172,17 @@ def _refined_with_rigs(
     if poses.metric and measured:
         return in_gauge_of(refined, poses.centers)
     scale = estimate(adjusted)
-    # Offsets that determine the unit of length less well than this are too small to matter.
-    if not scale.relative_std < 0.03 or len(adjusted.bearings) < _MIN_USED * len(bundle.bearings):
+    # Offsets that determine the unit of length less well than this are too small to matter. A wrong solution leaves
+    # out most observations.
+    if not scale.relative_std < 0.03 or len(adjusted.bearings) < 0.5 * len(bundle.bearings):
         return _refined_centrally(poses, settings, load=load)
     if not measured:
         return in_gauge_of(refined, poses.centers)
-    return _in_metres(refined, adjusted, own_rigs, std=scale.relative_std)
+    distance_mm = 2000 * np.median([rig.lens_offset_m for rig in own_rigs if rig is not None])
+    origin = (
+        f"the distance of {distance_mm:.3g} mm between the lens centres, uncertain by {100 * scale.relative_std:.1f} %"
+    )
+    return scaled_poses(refined, 1 / adjusted.units_per_m, origin=origin)
 
 
 def _with_unit(
@@ -194,13 +204,6 @@ def _with_unit(
     return None
 
 
-def _in_metres(poses: Poses, bundle: Bundle, rigs: Sequence[LensRig | None], *, std: float) -> Poses:
-    """Return poses of one group in metres, by the offsets of their lenses."""
-    distance_mm = 2000 * np.median([rig.lens_offset_m for rig in rigs if rig is not None])
-    origin = f"the distance of {distance_mm:.3g} mm between the lens centres, uncertain by {100 * std:.1f} %"
-    return scaled_poses(poses, 1 / bundle.units_per_m, origin=origin)
-
-
 def _offset_scale(bundle: Bundle, *, settings: _Settings, neighbour: int) -> OffsetScale:
     return estimate_offset_scale(
         bundle, loss=settings.loss, scale_rad=float(np.deg2rad(settings.loss_scale_deg)), neighbour=neighbour
@@ -215,7 +218,19 @@ def _adjusted(
     for round_idx in range(rounds):
         # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
         wider = 2 ** (rounds - 1 - round_idx) * widen
-        bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)))
+        world_from_cam = np.swapaxes(bundle.rotations, 1, 2)[bundle.image_idx]
+        starts = bundle.centers[bundle.image_idx]
+        if bundle.offsets_m is not None:
+            starts = starts + np.einsum("tij,tj->ti", world_from_cam, bundle.origins)
+        found = triangulate_observations(
+            starts,
+            np.einsum("tij,tj->ti", world_from_cam, bundle.bearings),
+            bundle.point_idx,
+            count=len(bundle.points),
+            max_error_rad=float(np.deg2rad(settings.max_error_deg * wider)),
+            min_angle_rad=float(np.deg2rad(1.0)),
+        )
+        bundle, colors = _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
         scale_rad = float(np.deg2rad(settings.loss_scale_deg * wider))
         bundle = adjust_bundle(
             replace(bundle, lengths=floor_lengths(bundle, scale_rad=scale_rad)),
@@ -287,23 +302,6 @@ def _stitched_bearings(bundle: Bundle, rigs: Sequence[LensRig | None]) -> FloatA
     return bearings
 
 
-def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Triangulate all points again, and keep the observations and points that fit."""
-    world_from_cam = np.swapaxes(bundle.rotations, 1, 2)[bundle.image_idx]
-    starts = bundle.centers[bundle.image_idx]
-    if bundle.offsets_m is not None:
-        starts = starts + np.einsum("tij,tj->ti", world_from_cam, bundle.origins)
-    found = triangulate_observations(
-        starts,
-        np.einsum("tij,tj->ti", world_from_cam, bundle.bearings),
-        bundle.point_idx,
-        count=len(bundle.points),
-        max_error_rad=max_error_rad,
-        min_angle_rad=float(np.deg2rad(1.0)),
-    )
-    return _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
-
-
 def _selected(
     bundle: Bundle, colors: NDArray[np.uint8], used: NDArray[np.bool_], *, valid: NDArray[np.bool_]
 ) -> tuple[Bundle, NDArray[np.uint8]]:
@@ -337,3 +335,148 @@ def _poses(
         track_bearings=bundle.bearings if rigs is None else _stitched_bearings(bundle, rigs),
         track_sigmas_rad=None if bundle.sigmas is None else (bundle.sigmas * _USUAL_SIGMA_RAD).astype(np.float32),
     )
+
+
+# The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
+# with this many points, and more than twice as many as any other.
+_REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
+# A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of 20
+# panoramas, 28 of 35 are within 1.6 %, the others at 7 to 14 %, all due to wrong lengths.
+_MAX_DIFFERENCE, _MIN_STD, _MIN_PAIRS = 0.25, 0.02, 3
+
+
+def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
+    """Return the lengths of baselines at which all cameras stand equally high above the floor; None if unknown.
+
+    They are uncertain by the spread of the heights that were found, so that they count little where heights differ.
+
+    Args:
+        bundle: its cameras, with y down in the frames of those that stand upright.
+        scale_rad: scale of the loss of the rays.
+    """
+    if not len(bundle.points):
+        return None
+    downs = bundle.rotations[:, 1, :]
+    down = downs.mean(axis=0)
+    down /= max(float(np.linalg.norm(down)), 1e-12)
+    # Of a typical camera against all: others are not known to be upright.
+    if np.median(np.arccos(np.clip(downs @ down, -1, 1))) > float(np.deg2rad(3.0)):
+        return None
+    pairs, heights = _heights(bundle, down)
+    baselines = np.linalg.norm(bundle.centers[pairs[:, 0]] - bundle.centers[pairs[:, 1]], axis=1)
+    # In heights: shorter ones do not determine the height, and would be held at any length.
+    long = baselines > 0.2 * heights
+    pairs, heights, baselines = pairs[long], heights[long], baselines[long]
+    if len(pairs) < _MIN_PAIRS:
+        return None
+    differences = np.log(heights / np.median(heights))
+    same = np.abs(differences) < _MAX_DIFFERENCE
+    # What is known of the spread of heights before any is measured.
+    std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
+    # 1.39 is the squared median of the length of a normal vector of variance 1 in each of two directions.
+    weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / 1.39
+    return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)
+
+
+def _heights(bundle: Bundle, down: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return pairs of cameras (K, 2), ascending, and their heights (K,) above the level of most points they share."""
+    towards = bundle.points[bundle.point_idx] - bundle.centers[bundle.image_idx]
+    below = towards @ down
+    level = np.linalg.norm(towards - below[:, None] * down, axis=1)
+    is_floor = (below > 0) & (level < _REACH * below)
+    # Each observation and the next one of the same point.
+    both = is_floor[:-1] & is_floor[1:] & (bundle.point_idx[:-1] == bundle.point_idx[1:])
+    both &= np.abs(np.log(np.where(both, below[:-1] / below[1:], 1.0))) < _SAME_LEVEL
+    first = np.flatnonzero(both)
+    pairs = np.sort(np.column_stack([bundle.image_idx[first], bundle.image_idx[first + 1]]), axis=1).astype(np.intp)
+    logs = np.log(below[first] * below[first + 1]) / 2
+    order = np.lexsort((logs, pairs[:, 1], pairs[:, 0]))
+    pairs, logs = pairs[order], logs[order]
+    starts = np.flatnonzero(np.diff(pairs, axis=0, prepend=-1).any(axis=1))
+    levels = np.array([_level(part) for part in np.split(logs, starts)[1:]])
+    known = np.isfinite(levels)
+    return pairs[starts[known]], np.exp(levels[known])
+
+
+def _level(logs: FloatArray) -> float:
+    """Return the logarithm of the height that most of some, ascending, have in common; NaN if there is none."""
+    counts = np.searchsorted(logs, logs + _SAME_LEVEL, side="right") - np.arange(len(logs))
+    best = int(counts.argmax())
+    chosen = logs[best : best + counts[best]]
+    rivals = counts[(logs < chosen[0] - _SAME_LEVEL) | (logs > chosen[-1])]
+    is_clear = counts[best] >= _MIN_POINTS and 2 * rivals.max(initial=0) <= counts[best]
+    return float(np.mean(chosen)) if is_clear else np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class ElevationRange:
+    """The elevations of the upper and the lower edge of the panoramas."""
+
+    top_deg: float  # of the upper edge; 90 for a full sphere
+    bottom_deg: float  # of the lower edge; −90 for a full sphere
+    stds_deg: tuple[float, float]  # standard deviations of both from noise in the rays; inf if they cannot be estimated
+
+    @property
+    def is_full(self) -> bool:
+        """Return whether both edges may be the poles, within four standard deviations."""
+        return self.deviations <= 4.0
+
+    @property
+    def deviations(self) -> float:
+        """The larger distance of an edge from its pole, in standard deviations."""
+        off_deg = np.abs([self.top_deg - 90.0, self.bottom_deg + 90.0])
+        # Beyond the noise in the rays: on six captures of full spheres, real and rendered, the edges were at most 0.23°
+        # off.
+        return float((off_deg / np.hypot(self.stds_deg, 0.25)).max())
+
+    def elevations_rad(self, elevations_rad: FloatArray) -> FloatArray:
+        """Return the true elevations of what images that were read as full spheres show at some elevations."""
+        middle, half = 0.5 * (self.top_deg + self.bottom_deg), 0.5 * (self.top_deg - self.bottom_deg)
+        elevations: FloatArray = np.radians(middle) + elevations_rad * half / 90.0
+        return elevations
+
+    def bearings(self, bearings: FloatArray) -> FloatArray:
+        """Return the true rays (T, 3) of images that were read as full spheres."""
+        x, y, z = bearings.T
+        azimuths, elevations = np.arctan2(x, z), self.elevations_rad(np.arcsin(np.clip(-y, -1, 1)))
+        level = np.cos(elevations)
+        return np.stack([level * np.sin(azimuths), -np.sin(elevations), level * np.cos(azimuths)], axis=1)
+
+    def then(self, step: ElevationRange) -> ElevationRange:
+        """Return the range whose true elevations are those of a further step."""
+        edges = np.degrees(step.elevations_rad(np.radians([self.top_deg, self.bottom_deg])))
+        return ElevationRange(float(edges[0]), float(edges[1]), step.stds_deg)
+
+
+def estimate_elevation_range(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> ElevationRange:
+    """Return the elevations of the edges that fit the rays best.
+
+    Args:
+        bundle: an adjusted bundle of panoramas that all cover the same elevations.
+        loss: the loss of the adjustment.
+        scale_rad: the scale of that loss.
+        neighbour: position of the camera whose distance to the first is held.
+    """
+    unknown = ElevationRange(90.0, -90.0, (float("inf"), float("inf")))
+    held = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
+    derivatives = ray_derivatives(held.bundle)
+    x, y, z = held.bundle.bearings.T
+    elevations, level = np.arcsin(np.clip(-y, -1, 1)), np.maximum(np.hypot(x, z), 1e-12)
+    upwards = np.stack([y * x / level, -level, y * z / level], axis=1)
+    by_shift = -np.einsum("tij,tj->ti", np.swapaxes(tangent_basis(held.bundle.bearings), 1, 2), upwards)
+    try:
+        own = np.stack(
+            [unexplained(held, derivatives, by) for by in (elevations[:, None] * by_shift, by_shift)], axis=-1
+        )
+        information = np.einsum("t,tik,til->kl", held.weights, own, own)
+        covariance = held.variance * np.linalg.inv(information)
+    except LinAlgError:
+        return unknown
+    step = -np.linalg.solve(information, np.einsum("t,tik,ti->k", held.weights, own, derivatives.residuals))
+    edges = np.array([[np.pi / 2, 1.0], [-np.pi / 2, 1.0]])
+    variances = np.einsum("ek,kl,el->e", edges, covariance, edges)
+    if not (np.isfinite(variances).all() and (variances > 0).all()):
+        return unknown
+    top, bottom = np.degrees(edges @ (np.array([1.0, 0.0]) + step))
+    stds = np.degrees(np.sqrt(variances))
+    return ElevationRange(float(top), float(bottom), (float(stds[0]), float(stds[1])))

@@ -52,7 +52,10 @@ def build_tracks(features: Mapping[str, Features], two_views: TwoViews) -> Track
     image_of_node = np.repeat(np.arange(len(names)), np.diff(offsets))
     total = int(offsets[-1])
     label = _labels(nodes, total)
-    conflicting = _conflicting(label, image_of_node)
+    order = np.lexsort((image_of_node, label))
+    same = (np.diff(label[order]) == 0) & (np.diff(image_of_node[order]) == 0)
+    conflicting = np.zeros(len(label) + 1, np.bool_)
+    conflicting[label[order[1:][same]]] = True
     inside = conflicting[label[nodes[:, 0]]]
     kept = _without_conflicts(nodes[inside], residuals[inside], image_of_node)
     label = _labels(np.concatenate([nodes[~inside], kept]), total)
@@ -161,15 +164,6 @@ def _match_nodes(
 def _labels(nodes: NDArray[np.int64], total: int) -> NDArray[np.intp]:
     graph = coo_array((np.ones(len(nodes), np.int8), (nodes[:, 0], nodes[:, 1])), shape=(total, total))
     return np.asarray(connected_components(graph, directed=False)[1], np.intp)
-
-
-def _conflicting(label: NDArray[np.intp], image_of_node: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return, for every label, whether it contains two key points of one image."""
-    order = np.lexsort((image_of_node, label))
-    same = (np.diff(label[order]) == 0) & (np.diff(image_of_node[order]) == 0)
-    conflicting = np.zeros(len(label) + 1, np.bool_)
-    conflicting[label[order[1:][same]]] = True
-    return conflicting
 
 
 def _without_conflicts(

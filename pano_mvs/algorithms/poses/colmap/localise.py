@@ -9,13 +9,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.features.photograph import PhotographKeypoints
+from pano_mvs.algorithms.features.tangent import PhotographKeypoints
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_candidates import similar_panoramas
-from pano_mvs.algorithms.poses.photograph_points import KnownPoints
+from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas
+from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
@@ -27,11 +27,7 @@ _EXIF_LOG_STD, _GUESSED_LOG_STD = 0.1, 0.4
 _GUIDED_ROUNDS, _GUIDED, _GUIDED_RATIO, _MAX_DISTANCE = 2, 2.0, 0.9, 300.0
 # The inliers must spread over the picture: the standard deviation of their pixels, as a share of its diagonal.
 _MIN_SPREAD = 0.05
-# A pose that fewer key points suggest is accepted if the patches of the panoramas confirm it: this many, and this share
-# of those that the photograph could show.
 _FEW, _SINGLE_PANORAMAS, _LOOSE_RATIO = 8, 5, 0.9
-_MIN_CONFIRMED, _MIN_CONFIRMED_SHARE = 60, 0.3
-_ALIGNED_PANORAMAS = 8
 # Patches refine a pose if there are at least this many, and if they turn the camera by less than this.
 _MIN_ALIGNED, _MAX_TURN = 40, float(np.radians(2.0))
 
@@ -200,7 +196,8 @@ class _Search:
             aligned = self.patches.aligned(camera, names, prior=self.prior)
             if best is None or aligned.confirmed > best[0].confirmed:
                 best = aligned, agreeing
-        if best is None or best[0].confirmed < _MIN_CONFIRMED or best[0].share < _MIN_CONFIRMED_SHARE:
+        # The patches of the panoramas must confirm it: this many, and this share of those that the photograph shows.
+        if best is None or best[0].confirmed < 60 or best[0].share < 0.3:
             return ""
         aligned, _ = best
         if reason := _cropped(aligned):
@@ -254,7 +251,7 @@ class _Search:
             matches = self.agreeing(matches, camera)
             counts = {name: len(self.agreeing(found, camera).pixels_px) for name, found in each.items()}
             names = sorted((name for name in each if counts[name]), key=lambda name: -counts[name])
-        return matches, names[:_ALIGNED_PANORAMAS], camera
+        return matches, names[:8], camera
 
     def localised(self, camera: PhotographCamera, matches: _Matches) -> Localised:
         """Return the result for a camera and the matches that agree with it."""

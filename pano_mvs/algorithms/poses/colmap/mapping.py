@@ -20,8 +20,6 @@ Mapper = Literal["incremental", "global"]
 THREADS = 1
 """With more, the order of Ceres' sums, and thus the last digits, and the numbers of images depend on the scheduler."""
 
-_WIDTH_OF_LIMITS_PX = 1024
-
 
 def colmap_seed(rng: np.random.Generator) -> int:
     """Return a seed for COLMAP's random numbers, positive."""
@@ -235,7 +233,7 @@ def _incremental_options(*, cameras: Cameras, seed: int, width_px: float) -> Any
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     # COLMAP's limits are pixels of pinhole images. They are kept at their values for a panorama of 1024 columns, where
     # they correspond to angles: 4 px are 1.4°, and would be 4.5° with 320 columns.
-    scale = width_px / _WIDTH_OF_LIMITS_PX
+    scale = width_px / 1024
     options.mapper.filter_max_reproj_error *= scale
     options.mapper.abs_pose_max_error *= scale
     options.mapper.init_max_error *= scale

@@ -40,17 +40,18 @@ def colmap_sift(
     names = _exported(pictures, scratch)
     database_path = scratch / "sift.db"
     with quiet_colmap():
+        reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+        matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+        reading.camera_model, reading.mask_path = "EQUIRECTANGULAR", scratch / "masks"
+        for options in (extraction, matching):
+            options.num_threads, options.use_gpu = THREADS, False
+        extraction.sift.max_num_features = max_keypoints
+        verification.compute_relative_pose = True
+        verification.ransac.random_seed, verification.ransac.num_threads = int(rng.integers(1, 2**31 - 1)), THREADS
         pycolmap.extract_features(
-            database_path,
-            scratch / "images",
-            reader_options=_reader_options(scratch / "masks"),
-            extraction_options=_extraction_options(max_keypoints),
+            database_path, scratch / "images", reader_options=reading, extraction_options=extraction
         )
-        pycolmap.match_exhaustive(
-            database_path,
-            matching_options=_matching_options(),
-            verification_options=_verification_options(int(rng.integers(1, 2**31 - 1))),
-        )
+        pycolmap.match_exhaustive(database_path, matching_options=matching, verification_options=verification)
     return _read(database_path, names, scratch / "images")
 
 
@@ -71,40 +72,6 @@ def _exported(pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.bool_]
 
 def _file_name(number: int) -> str:
     return f"{number:08d}.ppm"
-
-
-def _reader_options(masks: Path) -> Any:
-    import pycolmap
-
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model, options.mask_path = "EQUIRECTANGULAR", masks
-    return options
-
-
-def _extraction_options(max_keypoints: int) -> Any:
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = THREADS, False
-    options.sift.max_num_features = max_keypoints
-    return options
-
-
-def _matching_options() -> Any:
-    import pycolmap
-
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = THREADS, False
-    return options
-
-
-def _verification_options(seed: int) -> Any:
-    import pycolmap
-
-    options = pycolmap.TwoViewGeometryOptions()
-    options.compute_relative_pose = True
-    options.ransac.random_seed, options.ransac.num_threads = seed, THREADS
-    return options
 
 
 def _read(path: Path, names: list[str], folder: Path) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:

@@ -19,7 +19,7 @@ from pano_mvs.algorithms.poses.colmap.mapping import (
     run_mapper,
 )
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses, normalised_poses
-from pano_mvs.algorithms.poses.placement.reasons import best_pair, why_no_pair
+from pano_mvs.algorithms.poses.placement.resection import best_pair, why_no_pair
 from pano_mvs.core.settings import Setting
 from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Features, Poses

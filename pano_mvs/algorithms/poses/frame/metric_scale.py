@@ -1,4 +1,4 @@
-"""Scale poses to metres by a known length."""
+"""Scale poses to metres by a known length, or set the distance of each camera to the first to 1."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pano_mvs.algorithms.points.floor import Floor, floor_below
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Similarity3
+from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import per_group
 
 
 def scaled_poses(poses: Poses, factor: float, *, origin: str) -> Poses:
@@ -80,3 +81,31 @@ def scaled_by_camera_height(poses: Poses, up_in_world: FloatArray, *, metres: fl
         return poses, floor
     origin = f"the cameras' height of {metres:g} m above a floor of {floor.points} sparse points"
     return scaled_poses(poses, metres / floor.depth, origin=origin), floor
+
+
+def unit_translations(poses: Poses) -> Poses:
+    """Return poses in which every camera is at distance 1 from the first camera, in its original direction.
+
+    This is all that the essential matrices of the pairs with the first image determine (Yang, Kim & Lee, "Dense Depth
+    Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.2: the scale factors of all views are set
+    to 1). Sparse points do not fit such cameras and are removed. A camera that coincides with the first camera stays
+    there. Each group has its own first camera.
+    """
+    return per_group(poses, _unit_translations)
+
+
+def _unit_translations(poses: Poses) -> Poses:
+    centers = poses.centers
+    moved: dict[str, Rigid3] = {}
+    for idx, name in enumerate(poses.names):
+        offset = centers[idx] - centers[0]
+        length = float(np.linalg.norm(offset))
+        center = centers[0] + (offset / length if length > 0 else offset)
+        moved[name] = Rigid3.from_center(poses.rotations[idx], center)
+    return Poses.without_points(
+        moved,
+        rejected=poses.rejected,
+        frame=poses.frame,
+        scale="every camera is at distance 1 from the first: no scale factors",
+        metric=False,
+    )

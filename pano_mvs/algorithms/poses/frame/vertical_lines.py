@@ -24,7 +24,6 @@ from pano_mvs.geometry import UP, PinholeView, rotation_from_rotvec, rotation_fr
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
 
-_FOV_DEG = 90.0
 SIDES = 4
 """Views of a panorama around the horizon; the other two look up and down."""
 # Search around the given up direction, as for level surfaces: half width, step and tolerance in degrees.
@@ -160,7 +159,7 @@ def _in_panorama(
     small = reduced_panorama(image, 4 * 512)
     mask = cv2.resize(valid.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
     size = max(16, small.shape[1] // 4)
-    focal = size / 2 / np.tan(np.deg2rad(_FOV_DEG / 2))
+    focal = size / 2 / np.tan(np.deg2rad(45.0))
     views = []
     for side in sides:
         view = PinholeView(side, float(focal), np.array([size / 2, size / 2]), (size, size))

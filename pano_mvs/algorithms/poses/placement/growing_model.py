@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks
-from pano_mvs.algorithms.poses.placement.pair_evidence import MIN_RATIOS, unit_ranges
-from pano_mvs.algorithms.poses.placement.reasons import why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.pair_evidence import MIN_RATIOS, ScaleEstimator, estimate_scale, unit_ranges
 from pano_mvs.algorithms.poses.placement.resection import (
     FIRST_GUESS_RAD,
     MAX_ERROR_RAD,
@@ -20,35 +19,23 @@ from pano_mvs.algorithms.poses.placement.resection import (
     points_needed,
     refined_on_points,
     resection_errors,
+    why_few_known,
+    why_few_seen,
 )
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, relative_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import TwoView
 
-_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-_MAX_PARTNERS = 8
-_ADJUST_STEPS = 20
-# Further steps are not needed: the finished model is refined anyway.
-_ADJUST_TOLERANCE = 1e-3
-
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """The pose of an image relative to the current model; falsy, with the reason, if it is not reliable.
+    """The pose of an image relative to the current model; falsy, with the reason, if it is not reliable."""
 
-    Attributes:
-        cam_from_world: the pose.
-        support: number of known points that it sees where they should be.
-        known: number of known points that its tracks contain.
-        reason: why the pose is not reliable.
-    """
-
-    cam_from_world: Rigid3
-    support: int = 0
-    known: int = 0
-    reason: str = ""
+    cam_from_world: Rigid3  # the pose
+    support: int = 0  # number of known points that it sees where they should be
+    known: int = 0  # number of known points that its tracks contain
+    reason: str = ""  # why the pose is not reliable
 
     def __bool__(self) -> bool:
         """Return whether the image may be added."""
@@ -57,24 +44,16 @@ class Attachment:
 
 @dataclass(eq=False)
 class GrowingModel:
-    """Registered cameras and triangulated tracks; the world frame is the first camera of the seed pair.
+    """Registered cameras and triangulated tracks; the world frame is the first camera of the seed pair."""
 
-    Attributes:
-        tracks: all tracks of the capture.
-        edges: verified pairs by positions of images.
-        estimator: how translation scale factors are estimated from the ratios of single features.
-        kappa: the paper's κ.
-        cameras: image position to cam_from_world.
-    """
-
-    tracks: Tracks
-    edges: Mapping[Edge, TwoView]
-    estimator: ScaleEstimator
-    kappa: float
-    cameras: dict[int, Rigid3] = field(default_factory=dict)
+    tracks: Tracks  # all tracks of the capture
+    edges: Mapping[Edge, TwoView]  # verified pairs by positions of images
+    estimator: ScaleEstimator  # how translation scale factors are estimated from the ratios of single features
+    kappa: float  # the paper's κ
+    cameras: dict[int, Rigid3] = field(default_factory=dict)  # image position to cam_from_world
 
     def __post_init__(self) -> None:
-        self._points = np.full((self.tracks.count, 3), np.nan)
+        self.points_in_world = np.full((self.tracks.count, 3), np.nan)  # of all tracks, NaN where not triangulated
         # Positions of the observations of every image, and its pairs, sorted by number of verified matches.
         by_image = np.argsort(self.tracks.image_idx, kind="stable")
         sizes = np.bincount(self.tracks.image_idx, minlength=len(self.tracks.names))
@@ -85,11 +64,6 @@ class GrowingModel:
             self._pairs[second].append((-len(view), first))
         for pairs in self._pairs:
             pairs.sort()
-
-    @property
-    def points_in_world(self) -> FloatArray:
-        """Points of all tracks, (count, 3), NaN where not triangulated."""
-        return self._points
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image and triangulate the tracks that it sees."""
@@ -118,9 +92,9 @@ class GrowingModel:
             compact[tracks.track_idx[seen]].astype(np.int32),
             count=int(chosen.sum()),
             max_error_rad=MAX_ERROR_RAD,
-            min_angle_rad=_MIN_ANGLE_RAD,
+            min_angle_rad=float(np.deg2rad(1.0)),
         )
-        self._points[chosen] = found.points_in_world
+        self.points_in_world[chosen] = found.points_in_world
         return seen, found
 
     def adjust(self) -> None:
@@ -143,8 +117,8 @@ class GrowingModel:
             bundle,
             loss="cauchy",
             scale_rad=MAX_ERROR_RAD / 4,
-            max_iterations=_ADJUST_STEPS,
-            tolerance=_ADJUST_TOLERANCE,
+            max_iterations=20,
+            tolerance=1e-3,  # the finished model is refined anyway
             fixed_camera=images.index(next(iter(self.cameras))),
         )
         for image, rotation, center in zip(images, bundle.rotations, bundle.centers, strict=True):
@@ -154,7 +128,7 @@ class GrowingModel:
     def known_points(self, image: int) -> tuple[FloatArray, FloatArray]:
         """Return the triangulated points of an image's tracks, (M, 3), and its rays to them, (M, 3)."""
         observations = self._track_of_image[image]
-        points = self._points[self.tracks.track_idx[observations]]
+        points = self.points_in_world[self.tracks.track_idx[observations]]
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
@@ -175,7 +149,7 @@ class GrowingModel:
 
     def known_counts(self) -> NDArray[np.intp]:
         """Return the number of triangulated points in the tracks of each image, (N,)."""
-        known = np.isfinite(self._points[self.tracks.track_idx, 0])
+        known = np.isfinite(self.points_in_world[self.tracks.track_idx, 0])
         return np.bincount(self.tracks.image_idx[known], minlength=len(self.tracks.names))
 
     def attach(self, image: int) -> Attachment:
@@ -198,7 +172,7 @@ class GrowingModel:
 
     def _partners(self, image: int) -> list[int]:
         """Return the registered partners of an image, sorted by number of verified matches."""
-        return [partner for _, partner in self._pairs[image] if partner in self.cameras][:_MAX_PARTNERS]
+        return [partner for _, partner in self._pairs[image] if partner in self.cameras][:8]
 
     def _chained(self, image: int, partner: int) -> Rigid3 | None:
         """Return the pose from one partner: rotation and direction of the pair, and the length from known points.
@@ -216,7 +190,7 @@ class GrowingModel:
         p = self.tracks.bearings[self._track_of_image[partner][theirs]]
         q = self.tracks.bearings[self._track_of_image[image][mine]]
         (unit_range, _), parallax = unit_ranges(image_from_partner, p, q)
-        ratios = np.linalg.norm(self._points[seen] - self.cameras[partner].center, axis=1) / unit_range
+        ratios = np.linalg.norm(self.points_in_world[seen] - self.cameras[partner].center, axis=1) / unit_range
         usable = np.isfinite(ratios)
         if usable.sum() < MIN_RATIOS:
             return None

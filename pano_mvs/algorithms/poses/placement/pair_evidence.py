@@ -5,23 +5,73 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import log10_false_alarms
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
+
+ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
+
+
+def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
+    """Estimate one scale factor from the ratios of single features.
+
+    "kappa" is the paper's estimator: the ratio with most other ratios within κ (absolute). "log_median" is the median
+    of the log-ratios. "cauchy" is their weighted centre under a Cauchy loss, by iterated reweighting from the median.
+
+    Args:
+        ratios: (M,) positive, M ≥ 1.
+        weights: (M,) inverse variances of the log-ratios, up to a factor; only used by "cauchy".
+        estimator: "kappa", "log_median" or "cauchy".
+        kappa: the paper's κ.
+
+    Raises:
+        UsageError: if there is no ratio, or a ratio is not positive.
+    """
+    if len(ratios) == 0 or not np.all(ratios > 0):
+        raise UsageError("a scale factor needs at least one ratio, all positive")
+    if estimator == "kappa":
+        ordered = np.sort(ratios)
+        first, end = np.searchsorted(ordered, ordered - kappa), np.searchsorted(ordered, ordered + kappa, "right")
+        neighbours = end - first
+        # Of several ratios with equally many neighbours take the middle one, so that no end of the range is preferred.
+        best = np.flatnonzero(neighbours == neighbours.max())
+        return float(ordered[best[len(best) // 2]])
+    logs = np.log(ratios)
+    center = float(np.median(logs))
+    return float(np.exp(center if estimator == "log_median" else _cauchy_center(logs, weights, center)))
+
+
+def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> float:
+    spread = np.sqrt(weights / _median(weights))
+    for _ in range(20):
+        deviations = (logs - center) * spread
+        scale = max(1.4826 * _median(np.abs(deviations)), 1e-9)
+        robust = weights / (1 + (deviations / (2 * scale)) ** 2)
+        moved = float(np.sum(robust * logs) / np.sum(robust))
+        if abs(moved - center) < 1e-7:
+            break
+        center = moved
+    return center
+
+
+def _median(values: FloatArray) -> float:
+    """Return the median; for a few hundred values several times as fast as numpy's, and called very often here."""
+    ordered = np.sort(values)
+    return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))
+
 
 MIN_RATIOS = 6
 # Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
 # ratios.
 _AGREEING, MIN_AGREEING = 1.25, 0.4
-_FEW_MATCHES = 15
-_SHUFFLES = 50
 _TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
 
 
@@ -61,7 +111,7 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
         found.append(
             Geometry(
                 view=geometry,
-                weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
+                weight=(1 + np.log10(max(len(geometry), 1) / 15)) * min(1.0, np.sqrt(len(geometry) / most)),
                 direction_std_deg=view.direction_std_deg if rank == 0 else 0.5,
                 unit_ranges=ranges,
                 parallax_rad=parallax,
@@ -212,7 +262,7 @@ def significant_length(
         return np.nan, np.inf
     length = estimate_scale(known / unit, np.sin(parallax) ** 2, estimator="cauchy", kappa=0.0)
     off = np.abs(np.log(known / unit / length))
-    shuffled = np.abs(np.log(rng.permuted(np.tile(known, (_SHUFFLES, 1)), axis=1) / unit / length))
+    shuffled = np.abs(np.log(rng.permuted(np.tile(known, (50, 1)), axis=1) / unit / length))
     alarms = [
         log10_false_alarms(
             int((off < tolerance).sum()),

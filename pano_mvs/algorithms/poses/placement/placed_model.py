@@ -13,13 +13,13 @@ from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
+    ScaleEstimator,
     gather_pair_evidence,
     geometries_of,
     oriented,
 )
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
 from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, refined_on_points
-from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
 from pano_mvs.algorithms.two_view.verification import verify_pose
 from pano_mvs.core.arrays import FloatArray

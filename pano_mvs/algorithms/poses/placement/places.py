@@ -11,9 +11,6 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence, best
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, nearest_rotation
 
-_MAX_LENGTH_FACTOR = 1.25
-_LENGTH_STD = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -85,7 +82,7 @@ def agreement(
     turned = np.arccos(np.clip((traces - 1) / 2, -1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         stretch = np.abs(np.log(distances / evidence.lengths))
-    fits = np.isnan(evidence.lengths) | (stretch < np.log(_MAX_LENGTH_FACTOR))
+    fits = np.isnan(evidence.lengths) | (stretch < np.log(1.25))
     agrees: NDArray[np.bool_] = (
         (angles < evidence.tolerance_rad + loose_rad) & (turned < float(np.deg2rad(2.0))) & fits & (distances > 0)
     )
@@ -137,7 +134,7 @@ def _refined(evidence: PairEvidence, agree: NDArray[np.bool_], center: FloatArra
     for _ in range(2):
         distances = np.maximum(np.linalg.norm(center - origins, axis=1), 1e-12)
         by_angle = weight / (distances * evidence.tolerance_rad[agree]) ** 2
-        by_length = np.where(np.isfinite(lengths), weight / (_LENGTH_STD * distances) ** 2, 0.0)
+        by_length = np.where(np.isfinite(lengths), weight / (0.05 * distances) ** 2, 0.0)
         matrix = np.einsum("w,wij->ij", by_angle, np.eye(3) - outer) + np.einsum("w,wij->ij", by_length, outer)
         towards = origins + np.where(np.isfinite(lengths), lengths, 0.0)[:, None] * directions
         vector = np.einsum("w,wij,wj->i", by_angle, np.eye(3) - outer, origins)

@@ -1,12 +1,16 @@
-"""Estimate the pose of one panorama from points with known positions."""
+"""Estimate the pose of one panorama from points with known positions, or say why it cannot be."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
+from pano_mvs.scene import TwoView
 
 MAX_ERROR_RAD = float(np.deg2rad(0.5))
 """Largest error of a point that an image sees where it should."""
@@ -15,7 +19,6 @@ FIRST_GUESS_RAD = float(np.deg2rad(2.0))
 """The same at a pose that is not yet refined."""
 
 MIN_POINTS = 15
-_MIN_SHARE, _MIN_SHARE_OF_AGREEING = 0.4, 0.2
 
 
 def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:
@@ -39,7 +42,7 @@ def points_needed(known: int, *, agreeing: int = 1) -> int:
         agreeing: number of pairs that agree with its pose. Two or more pairs are independent evidence, so that
             imprecise matches, as in the paper, do not lead to rejection.
     """
-    share = _MIN_SHARE if agreeing < 2 else _MIN_SHARE_OF_AGREEING
+    share = 0.4 if agreeing < 2 else 0.2
     return max(MIN_POINTS, int(np.ceil(share * known)))
 
 
@@ -92,3 +95,38 @@ def _linearised(pose: Rigid3, points: FloatArray, bearings: FloatArray) -> tuple
 def _cost(pose: Rigid3, points: FloatArray, bearings: FloatArray, *, scale_rad: float) -> float:
     errors = resection_errors(pose, points, bearings)
     return float(np.sum(np.log1p((errors / scale_rad) ** 2)))
+
+
+def best_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> tuple[str, str] | None:
+    """Return the best pair of an image, reliable pairs first, then by number of matches; None if it has no pair."""
+    tried = [(bool(view), len(view), view.candidates, pair) for pair, view in two_views.items() if name in pair]
+    return max(tried)[-1] if tried else None
+
+
+def why_no_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> str:
+    """Return why an image has no reliable pair with any other image; "" if it has one."""
+    pair = best_pair(name, two_views)
+    if pair is None:
+        return "it was not compared with any other image"
+    if two_views[pair]:
+        return ""
+    partner = pair[1] if pair[0] == name else pair[0]
+    return f"it has no reliable pair; its best partner is {partner!r}: {two_views[pair].reason}"
+
+
+def why_few_seen(support: int, known: int, *, agreeing: int = 1) -> str:
+    """Return why a camera is not reliable that sees too few known points where they should be."""
+    return (
+        f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
+        f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, moving "
+        "objects, stitching errors, or an image that is not a panorama"
+    )
+
+
+def why_few_known(known: int, *, partner: str, matches: int) -> str:
+    """Return why an image cannot be placed that matches too few known points; its best pair is with `partner`."""
+    return (
+        f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
+        f"needed. Its best partner is {partner!r} with {matches} {plural(matches, 'match', 'matches')}. "
+        "Take panoramas in between"
+    )

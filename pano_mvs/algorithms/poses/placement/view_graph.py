@@ -30,7 +30,10 @@ def consistent_edges(names: tuple[str, ...], two_views: Mapping[tuple[str, str],
     edges = {edge: view for edge, view in views_by_position(names, two_views).items() if view}
     keys = list(edges)
     triangles = _triangles(keys)
-    closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(3.0)
+    rotations = np.array([view.rotation for view in edges.values()]).reshape(-1, 3, 3)
+    # The rotation around a loop should be none.
+    there, on, directly = (rotations[triangles[:, side]] for side in range(3))
+    closes = geodesic_angle(on @ there, directly) < np.deg2rad(3.0)
     sizes = np.array([len(view) for view in edges.values()])
     of_edge = _triangles_of_edges(triangles, len(keys))
     good, bad = (np.bincount(triangles[which].ravel(), minlength=len(keys)) for which in (closes, ~closes))
@@ -109,10 +112,3 @@ def _triangles_of_edges(triangles: NDArray[np.intp], count: int) -> list[NDArray
     edge_of_corner = triangles.ravel()
     by_edge = np.argsort(edge_of_corner, kind="stable") // 3
     return np.split(by_edge, np.cumsum(np.bincount(edge_of_corner, minlength=count))[:-1]) if count else []
-
-
-def _loop_errors_rad(views: list[TwoView], triangles: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the residual rotation around each triangle, (T,)."""
-    rotations = np.array([view.rotation for view in views]).reshape(-1, 3, 3)
-    there, on, directly = (rotations[triangles[:, side]] for side in range(3))
-    return geodesic_angle(on @ there, directly)

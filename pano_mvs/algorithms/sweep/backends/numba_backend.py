@@ -41,7 +41,6 @@ from pano_mvs.algorithms.sweep.winner import Winners
 VOLUME_BYTES = 3
 """Bytes for each pixel and plane: a uint8 cost and a uint16 sum of paths."""
 
-_OVERLAP = 1 / 20
 _BLOCK_ROWS = 32
 _JOB_ROWS = 4
 _STRIP_COLUMNS = 512
@@ -78,7 +77,7 @@ def volume_parts(size_hw: tuple[int, int], settings: SweepSettings) -> list[Volu
     max_rows = int(settings.volume_limit_gb * 1e9) // row_bytes // BAND_ROWS * BAND_ROWS
     if max_rows >= height:
         return [VolumePart(slice(0, height), slice(0, height))]
-    overlap = _whole_bands(ceil(height * _OVERLAP))
+    overlap = _whole_bands(ceil(height * 0.05))
     step = max(BAND_ROWS, max_rows - 2 * overlap)
     step = _whole_bands(ceil(height / ceil(height / step)))
     return [

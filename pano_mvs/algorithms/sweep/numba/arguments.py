@@ -164,8 +164,6 @@ def fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 _TILE_COLUMNS = 64
-# A band of which this share is to be swept is swept as a whole.
-_WHOLE_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -220,10 +218,12 @@ def runs_of(tiles: NDArray[np.bool_], size_hw: tuple[int, int], windows: Windows
     runs = []
     for band, row in enumerate(tiles):
         first, rows = band * BAND_ROWS, min(BAND_ROWS, height - band * BAND_ROWS)
-        if row.mean() > _WHOLE_SHARE:
+        if row.mean() > 0.7:  # a band most of which is to be swept is swept as a whole
             runs.append(TileRun(first, rows, 0, width, 0))
             continue
-        margin = _margin(windows, first, rows)
+        # How far the windows of the band reach, the box's and those that look around within it.
+        around = slice(max(0, first - BAND_ROWS // 2), first + rows + BAND_ROWS // 2)
+        margin = int(windows.offsets[around].max() + windows.reach[around].max()) + 1
         runs += [TileRun(first, rows, start, stop - start, margin) for start, stop in _stretches(row, width)]
     return runs
 
@@ -242,12 +242,6 @@ def run_arguments(sweep: Sweep, run: TileRun) -> Sweep:
         sin_cos_azimuth=np.ascontiguousarray(sweep.sin_cos_azimuth[:, columns % width]),
         combination=combination,
     )
-
-
-def _margin(windows: Windows, first: int, rows: int) -> int:
-    """Return how far the windows of a band reach, the box's and those that look around within it."""
-    around = slice(max(0, first - BAND_ROWS // 2), first + rows + BAND_ROWS // 2)
-    return int(windows.offsets[around].max() + windows.reach[around].max()) + 1
 
 
 def _stretches(tiles: NDArray[np.bool_], width: int) -> Iterator[tuple[int, int]]:

@@ -146,7 +146,6 @@ def sweep_guided_band(first: int, sweep: Sweep, others: bool | None, guide: Guid
 
 
 _H = np.uint16
-_BARRED, _OPEN = np.uint16(65535), np.uint16(0)
 
 PER_PLANE = 4
 """Units of integer guides for each plane."""
@@ -186,7 +185,7 @@ def _link(guides: I16, row: int, column: int, first: int, lines: int, before: I1
         for b in range(_U(layers)):
             for k in range(lines):
                 gap = np.int16(now[a, first + k] - before[b, first + k])
-                barred[a, b, k] = _BARRED if abs(gap) > _ONE_SURFACE else _OPEN
+                barred[a, b, k] = _H(65535) if abs(gap) > _ONE_SURFACE else _H(0)
 
 
 @kernel

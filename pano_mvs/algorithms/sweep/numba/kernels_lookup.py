@@ -129,9 +129,6 @@ EVERY = 8
 """Rows from one exact row to the next."""
 
 _BLOCK = 16
-_MAX_THIRD_PX = _F(1)
-# In a lower picture, eight rows are a large step on the sphere, so all positions are exact.
-_LOWEST_PICTURE = 128
 
 
 @kernel
@@ -162,7 +159,8 @@ def fit_group(knots: F32, first: int, height: int, turn: np.float32, curve: F32,
     x and of y. `rough`: (W,) uint8, written: whether the cubic misses.
     """
     k, one, two, three = _U(first), _U(first + 1), _U(first + 2), _U(first + 3)
-    largest = _MAX_THIRD_PX if height >= _LOWEST_PICTURE else _F(-1)
+    # In a low picture, eight rows are a large step on the sphere, so all positions are exact.
+    largest = _F(1) if height >= 128 else _F(-1)
     for i in range(_U(rough.shape[0])):
         step = _across(knots[0, one, i] - knots[0, k, i], turn)
         after = _across(knots[0, two, i] - knots[0, one, i], turn)

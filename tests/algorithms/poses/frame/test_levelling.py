@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
+from pano_mvs.algorithms.poses.frame.vertical import level_poses
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.frame.test_vertical import UP, room_poses, sensed

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
-from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.upside_down import ups_of_picture
 from pano_mvs.algorithms.poses.frame.vertical import (
     find_vertical,
+    level_poses,
     robust_mean_direction,
+    sharpest_up,
     vertical_from_cameras,
     vertical_from_sensors,
     vertical_from_structure,

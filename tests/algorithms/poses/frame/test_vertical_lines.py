@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.frame.levelling import level_poses
-from pano_mvs.algorithms.poses.frame.vertical import vertical_from_lines
+from pano_mvs.algorithms.poses.frame.vertical import level_poses, vertical_from_lines
 from pano_mvs.algorithms.poses.frame.vertical_lines import Picture, Segments, find_segments, up_from_lines
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid, rotation_from_rotvec
 from pano_mvs.scene import Poses

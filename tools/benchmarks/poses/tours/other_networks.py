@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import spread_keypoints
 from pano_mvs.algorithms.learned import lightglue
-from pano_mvs.algorithms.learned.aliked import extract_aliked
+from pano_mvs.algorithms.learned.aliked import extract_aliked, level_tiles
 from pano_mvs.algorithms.learned.networks import TILE_PX
-from pano_mvs.algorithms.learned.tiles import level_tiles
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_file import decode_image

@@ -92,13 +92,6 @@ class _Paths:
         self.builder.store(kept, self.least, align=1)
 
 
-def _store_some(builder: Any, value: Any, pointer: Any, inside: Any) -> None:
-    """Write nothing outside: another thread may be at work there."""
-    kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, I32, inside.type])
-    store = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LINES}i16.p0")
-    builder.call(store, [value, pointer, ir.Constant(I32, 1), inside])
-
-
 def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
     """Emit the instructions of `step_lines`; see there for the arguments."""
 
@@ -137,8 +130,10 @@ def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
                 pointer = at(10, builder.add(after_at, moved))
                 if within is None:
                     builder.store(added, pointer, align=1)
-                else:
-                    _store_some(builder, added, pointer, within)
+                else:  # another thread may be at work outside
+                    kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, I32, within.type])
+                    store = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LINES}i16.p0")
+                    builder.call(store, [added, pointer, ir.Constant(I32, 1), within])
         for direction in directions:
             direction.finish(within)
 
