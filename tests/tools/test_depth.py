@@ -11,7 +11,7 @@ import pytest
 
 from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
-from pano_mvs.geometry import ray_grid
+from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap, Record
 from tests.synthetic.places import window_room
 from tests.synthetic.scenes import weak_room, white_room, write_scene
@@ -19,9 +19,13 @@ from tools.benchmarks.captures import Capture, read_capture, scene_capture
 from tools.benchmarks.dense_chain import DenseChain
 from tools.benchmarks.depth import ablation
 from tools.benchmarks.depth.ablation import Ablation, gains, place_rows, real_rows, synthetic_rows
+from tools.benchmarks.depth.layouts import OPENING, layout_ranges, view_shares
 from tools.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
 from tools.benchmarks.depth.places import SYNTHETIC, Place, masked, places_of
 from tools.benchmarks.depth.scores import completeness, kept_at_precision, score_place, thicknesses
+from tools.benchmarks.poses.tours.materials import PLASTER
+from tools.benchmarks.poses.tours.plan import level_rotation
+from tools.benchmarks.poses.tours.rendering import Boxes, first_surfaces, unlit
 from tools.benchmarks.tables import reported
 from tools.benchmarks.uncertainty import coverage, halved_truth
 
@@ -247,3 +251,28 @@ def test_half_a_sphere_is_half_complete() -> None:
     upper = points[points[:, 1] > 0]
     assert abs(completeness(points, np.zeros((1, 3))) - 1) < 0.01
     assert abs(completeness(upper, np.zeros((1, 3))) - 0.5) < 0.01
+
+
+def test_the_range_of_a_rendered_wall_is_exact() -> None:
+    wall = Boxes(np.array([[0.0, 2.1, 0.0, 9.0, 0.1, 9.0, 1.0, 0.0]]), np.array([[PLASTER, 0]]), np.ones((1, 3)))
+    pose = Rigid3.from_center(level_rotation(0.0, np.zeros(2)), np.zeros(3))  # towards y
+    ranges, box, face = first_surfaces(unlit(wall, seed=0), pose, (16, 32))
+    ahead = ray_grid((16, 32))[..., 2]
+    seen = ahead > 0.5
+    np.testing.assert_allclose(ranges[seen], 2.0 / ahead[seen])
+    assert (box[seen] == 0).all()
+    assert (face[seen] == 2).all()  # −y
+    assert (box[ahead < 0] == -1).all()
+
+
+def test_a_view_of_a_drawn_room_is_compared_in_both_scales() -> None:
+    """All ranges are half too large, as if the camera were placed wrong."""
+    openings: dict[str, list[list[float]]] = {"doors": [[2, -0.5], [2, 0.5], [-1, 0.2]], "windows": [], "openings": []}
+    layout = {"vertices": [[2, 2], [2, -2], [-2, -2], [-2, 2]], **openings}
+    panorama = {"layout_raw": layout, "ceiling_height": 1.6, "camera_height": 1.0}
+    truth, kind = layout_ranges(panorama, (64, 128))
+    assert (kind == OPENING).any()
+    ranges = np.where(kind == OPENING, 9.0, 1.5 * truth)  # another room behind the door
+    shares = view_shares(panorama, ranges, np.full(truth.shape, 200, np.uint8))
+    assert shares["confirmed, within 5 %"] == (0.0, 1.0)
+    assert shares["walls within 5 %"] == (0.0, 1.0)

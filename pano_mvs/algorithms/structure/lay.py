@@ -28,7 +28,8 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 
-# Weights of the own ranges of precise, confirmed, weak and filled pixels.
+# Weights of the own ranges of precise and other confirmed pixels, of weak ones with texture, and of all others: without
+# texture, weak ranges are right no more often than filled ones.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
 _SOURCES = 4
 
@@ -167,7 +168,7 @@ def _labels(
     """Return the position in `on_planes` of the plane of each pixel of the grid, (h, w), −1 for none."""
     confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
     weak = confidence >= WEAK_CONFIDENCE[0]
-    weight = np.select([confirmed & textured, confirmed, weak], _WEIGHTS[:3], _WEIGHTS[3])
+    weight = np.select([confirmed & textured, confirmed, weak & textured], _WEIGHTS[:3], _WEIGHTS[3])
     # The weight of the outline of the room where nothing is confirmed.
     prior = np.zeros(ranges.shape) if outlined is None else 0.2 * ((outlined >= 0) & ~confirmed)
     area = pixel_solid_angle(confidence.shape[:2])[:, None] / (4 * np.pi)

@@ -14,8 +14,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.creases import placed_by_creases
-from pano_mvs.algorithms.structure.outline import outline_planes, same_wall, supposed_ceiling
+from pano_mvs.algorithms.structure.outline import outline_planes, same_wall
 from pano_mvs.algorithms.structure.view import PLAIN_WEIGHT, PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
@@ -50,6 +51,7 @@ def find_planes(
         for normal in (UP, -UP)
         for plane in _level_planes(points, normal, rng=rng, tolerance=max_relative_error, least=least)
     ]
+    planes = moved_ceilings(views, planes)
     planes += supposed_ceiling(views, planes)
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
     planes += outline_planes(views, planes)

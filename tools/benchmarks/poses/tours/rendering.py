@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, ray_from_pixel
+from pano_mvs.geometry import Rigid3, ray_from_pixel, ray_grid
 from tools.benchmarks.poses.tours.materials import LAMP, MIRROR, PANE, SCREEN, albedo, outdoors
 
 _TEXEL = 0.15
@@ -82,6 +82,22 @@ def lit(boxes: Boxes, *, seed: int) -> Lit:
         _gather(_arrays(house), lamps, seed, np.random.default_rng(seed), new)
         light = _smoothed(new, patches.reshape(-1, 3))
     return Lit(boxes, starts, members, low, patches, light, seed)
+
+
+def unlit(boxes: Boxes, *, seed: int) -> Lit:
+    """Return a house without light, for `first_surfaces`."""
+    starts, members, low = _ground_plan(boxes.frames)
+    return Lit(boxes, starts, members, low, np.zeros((0, 6, 3), np.int64), np.zeros(0), seed)
+
+
+def first_surfaces(
+    house: Lit, cam_from_world: Rigid3, size_hw: tuple[int, int]
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the range at the centre of each pixel (H, W), the box that it shows, −1 outdoors, and the box's face."""
+    rays = (ray_grid(size_hw) @ cam_from_world.rotation).reshape(-1, 3)
+    distance, hit = np.empty(len(rays)), np.empty((len(rays), 2), np.int64)
+    _trace_surfaces(_arrays(house), cam_from_world.center, rays, distance, hit)
+    return distance.reshape(size_hw), hit[:, 0].reshape(size_hw), hit[:, 1].reshape(size_hw)
 
 
 def panorama(
@@ -200,6 +216,12 @@ def _hit(arrays, origin, ray):  # type: ignore[no-untyped-def]
         else:
             j += 1 if ray[1] > 0 else -1
     return best, box, face
+
+
+@njit(nogil=True, error_model="numpy")
+def _trace_surfaces(arrays, origin, rays, distance, hit):  # type: ignore[no-untyped-def]
+    for idx in range(len(rays)):
+        distance[idx], hit[idx, 0], hit[idx, 1] = _hit(arrays, origin, rays[idx])
 
 
 @njit(nogil=True, error_model="numpy")

@@ -1,0 +1,124 @@
+"""Place ceilings at the heights at which the creases of walls with floor and ceiling are clearest.
+
+The elevation of a wall's crease with the floor gives its distance, and that of its crease with the ceiling then gives
+the height of the ceiling, which all views and azimuths have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY
+from pano_mvs.algorithms.structure.skyline import (
+    TURN_VIEWS,
+    clearest_total,
+    clearest_turn,
+    coarsely_around,
+    possible_rooms,
+    room_heights,
+    wall_distances,
+)
+from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_ranges
+from pano_mvs.core.arrays import FloatArray
+
+_FINE_DISTANCES, _CEILING_VIEWS = np.geomspace(0.35, 9.0, 220), 12
+# Heights of a ceiling above the cameras that are tried, in heights of the camera above the floor.
+_CEILINGS = np.geomspace(0.3, 1.6, 36)
+# Heights relative to that of a ceiling in ranges, and to the best of these.
+_MOVED_CEILINGS, _FINE_CEILINGS = np.linspace(0.9, 1.1, 11), np.linspace(0.98, 1.02, 9)
+# A ceiling is moved if less than this share of its support is precise: on rendered houses, ceilings with a share up to
+# 0.05 were 1 to 8 % off, and in rooms with textured ceilings, those with a share above 0.15 at most 0.4 %.
+_LEAST_PRECISE = 1 / 15
+# Views show its height if this solid angle of their ranges is within a relative distance from it.
+_LEAST_AREA, _NEAR, _LEAST_VIEWS = 0.2, 0.1, 3
+_SAME_HEIGHT = 0.02
+
+
+def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
+    """Return a ceiling at the height at which creases of all views are clearest; none if one is known, or no floor is.
+
+    A room and a lower, narrower one look much the same in one view, but not in several. `views`: those with sky above
+    are ignored. `planes`: the level planes of the views.
+    """
+    lowest = max((view.cam_from_world.center[1] for view in views), default=0.0)
+    floors = [plane for plane in planes if plane.normal[1] < 0 and plane.y > lowest]
+    roofed = [view for view in views if _is_roofed(view)]
+    if not floors or not roofed or any(possible_rooms(planes, view.cam_from_world.center) for view in views):
+        return []
+    floor = max(floors, key=lambda plane: plane.support)
+    middle = float(np.mean([view.cam_from_world.center[1] for view in roofed]))
+    y = middle - float(np.median(_CEILINGS)) * (floor.y - middle)
+    plane = ScenePlane(-floor.normal, y, 0.0, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=True)
+    return [_clearest_ceiling(roofed, floor, plane, shares=_CEILINGS / np.median(_CEILINGS))]
+
+
+def moved_ceilings(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
+    """Return level planes, those with most support first; ceilings are at the heights at which creases are clearest.
+
+    Ranges of a ceiling without texture can be wrong in all views by the same few percent; one with precise points
+    stays. Ceilings at nearly one height are joined. `views`: of one group. `planes`: its level planes.
+    """
+    result: list[ScenePlane] = []
+    for plane in sorted(planes, key=lambda plane: -plane.support):
+        below = [view for view in views if plane.normal[1] > 0 and _area_on(view, plane) > _LEAST_AREA]
+        if not below:
+            result.append(plane)
+            continue
+        middle = float(np.mean([view.cam_from_world.center[1] for view in below]))
+        floors = [other for other in planes if other.normal[1] < 0 and other.y > middle]
+        is_plain = plane.precise_support < _LEAST_PRECISE * plane.support
+        if floors and is_plain and len(below) >= _LEAST_VIEWS:
+            floor = max(floors, key=lambda other: sum(_area_on(view, other) for view in below))
+            plane = _clearest_ceiling(below, floor, plane, shares=_MOVED_CEILINGS)
+        if not any(other.normal[1] > 0 and abs(other.y - plane.y) < _SAME_HEIGHT * (middle - plane.y)
+                   for other in result):  # fmt: skip
+            result.append(plane)
+    return result
+
+
+def _clearest_ceiling(
+    views: Sequence[PlaneView], floor: ScenePlane, ceiling: ScenePlane, *, shares: FloatArray
+) -> ScenePlane:
+    """Return a ceiling at the height at which creases of views with a floor are clearest.
+
+    `shares`: heights that are tried above the mean camera, relative to that of the ceiling.
+    """
+    planes = [floor, ceiling]
+    views = [view for view in views if possible_rooms(planes, view.cam_from_world.center)]
+    if not views:
+        return ceiling
+    middle = float(np.mean([view.cam_from_world.center[1] for view in views]))
+    around = coarsely_around(views, planes, _CEILING_VIEWS)
+    turn = clearest_turn(around[:: -(-len(around) // TURN_VIEWS)], planes)
+    seen = []
+    for one in around:
+        down, up = room_heights(one, planes, (0, 1))
+        distance = wall_distances(one.sky, turn, down * _FINE_DISTANCES)
+        seen.append((one.sky, up, distance, one.sky.crease_clarity(distance, -down)))
+    height = middle - ceiling.y
+
+    def total(share: float) -> float:
+        more = (share - 1) * height
+        return sum(
+            clearest_total(on_floor + sky.crease_clarity(distance, up + more)) for sky, up, distance, on_floor in seen
+        )
+
+    best = max(shares, key=total)
+    best = max(best * _FINE_CEILINGS, key=total)
+    return replace(ceiling, offset=float((middle - best * height) * ceiling.normal[1]))
+
+
+def _area_on(view: PlaneView, plane: ScenePlane) -> float:
+    """Return the solid angle of a view whose ranges are near a plane."""
+    ranges = plane_ranges(view.rays, view.cam_from_world.center, normal=plane.normal, offset=plane.offset)
+    with np.errstate(invalid="ignore"):
+        return float(view.area[np.abs(view.ranges / ranges - 1) < _NEAR].sum())
+
+
+def _is_roofed(view: PlaneView) -> bool:
+    """Return whether most of the sphere around the zenith has a range."""
+    above = view.rays[..., 1] < -0.7  # cosine of the angle to the zenith
+    return bool(view.area[above & np.isfinite(view.ranges)].sum() > view.area[above].sum() / 2)
