@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 
+# Two threads of OpenBLAS cost more than twice the time of one on the small arrays in here; it reads this when numpy
+# is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
 import cv2  # noqa: F401
 from hypothesis import HealthCheck, settings
