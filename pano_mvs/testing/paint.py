@@ -115,18 +115,18 @@ def _interpolated(positions: FloatArray) -> FloatArray:
     """Return the periodic volume at positions (N, 3) in cells, by trilinear interpolation."""
     volume = _volume().ravel()
     low = np.floor(positions)
-    weight = positions - low
-    index = low.astype(np.int64)
-    columns = [
-        ((index[:, k] % _CELLS) * step, ((index[:, k] + 1) % _CELLS) * step)
+    after = positions - low
+    before, index = 1 - after, low.astype(np.int64)
+    x, y, z = (
+        (((index[:, k] % _CELLS) * step, before[:, k]), (((index[:, k] + 1) % _CELLS) * step, after[:, k]))
         for k, step in enumerate((_CELLS * _CELLS, _CELLS, 1))
-    ]
+    )
     result = np.zeros(len(positions))
-    for corner in np.ndindex(2, 2, 2):
-        share = np.ones(len(positions))
-        for k in range(3):
-            share *= weight[:, k] if corner[k] else 1 - weight[:, k]
-        result += share * volume[columns[0][corner[0]] + columns[1][corner[1]] + columns[2][corner[2]]]
+    for index_x, share_x in x:
+        for index_y, share_y in y:
+            row, share = index_x + index_y, share_x * share_y
+            for index_z, share_z in z:
+                result += share * share_z * volume[row + index_z]
     return result
 
 
