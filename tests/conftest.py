@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 # Two threads of OpenBLAS cost more than twice the time of one on the small arrays in here; it reads this when numpy
@@ -21,3 +22,10 @@ os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
 os.environ.setdefault("PANO_MVS_RENDERER", "software")
 # What whoever runs the tests has among their own plugins is no part of them.
 os.environ["PANO_MVS_PLUGINS"] = ""
+
+
+def pytest_collection_finish() -> None:
+    """Leave the tests themselves, which stay until the end, out of the garbage collector's work, and let it rest."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
