@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
+
+# Two threads of OpenBLAS cost more than twice the time of one on the small arrays in here; it reads this when numpy
+# is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
 import cv2  # noqa: F401
@@ -17,3 +22,10 @@ os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
 os.environ.setdefault("PANO_MVS_RENDERER", "software")
 # What whoever runs the tests has among their own plugins is no part of them.
 os.environ["PANO_MVS_PLUGINS"] = ""
+
+
+def pytest_collection_finish() -> None:
+    """Leave the tests themselves, which stay until the end, out of the garbage collector's work, and let it rest."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)

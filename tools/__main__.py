@@ -20,6 +20,7 @@ import typer
 HERE = Path(__file__).parent
 
 
+@functools.cache
 def scripts() -> dict[str, str]:
     """Return the names of all scripts, such as "benchmarks depth.thin", each with the first line of its docstring."""
     found = {}

@@ -256,14 +256,20 @@ class _Setting:
 
 def _library_modules() -> dict[str, ModuleType]:
     loaded = dict(sys.modules)
-    if not (_CHOSEN and [*loaded] == [*_CHOSEN[0]] and all(map(is_, loaded.values(), _CHOSEN[0].values()))):
+    if not (_CHOSEN and _same_modules(loaded, _CHOSEN[0])):
         chosen = {
             name: module
             for name, module in loaded.items()
             if name.partition(".")[0] in _LIBRARIES and type(module) is ModuleType and module.__name__ == name
         }
+        if _CHOSEN and _same_modules(chosen, _CHOSEN[1]):
+            chosen = _CHOSEN[1]  # others were loaded, such as a plugin
         _CHOSEN[:] = [loaded, chosen]
     return _CHOSEN[1]
+
+
+def _same_modules(first: dict[str, ModuleType], second: dict[str, ModuleType]) -> bool:
+    return [*first] == [*second] and all(map(is_, first.values(), second.values()))
 
 
 _CHOSEN: list[dict[str, ModuleType]] = []

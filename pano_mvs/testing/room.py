@@ -14,7 +14,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_quat_wxyz, rotation_from_rotvec
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
 
-_RAYS_AT_ONCE = 1 << 17
+_RAYS_AT_ONCE = 1 << 14  # their arrays fit into the cache of a core
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,10 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
         towards = getattr(surface, "towards", None)  # large scenes have surfaces that say which rays come near them
-        rows = np.arange(len(rays)) if towards is None else towards(origin, rays)
-        distance, normal = surface.hit(origin, rays[rows])
-        nearer = distance < best[rows]
-        on = rows[nearer]
+        rows = None if towards is None else towards(origin, rays)
+        distance, normal = surface.hit(origin, rays if rows is None else rays[rows])
+        nearer = distance < (best if rows is None else best[rows])
+        on = nearer if rows is None else rows[nearer]
         best[on], which[on], normals[on] = distance[nearer], idx, normal[nearer]
     return best, which, normals
 

@@ -38,18 +38,19 @@ class Cuboid:
 
     def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
         """Return the distance along each ray (N, 3) from one origin (3,), and the normal there (slab method)."""
+        along = np.ascontiguousarray(rays.T)  # one row for each axis
         with np.errstate(divide="ignore", invalid="ignore"):
-            to_low, to_high = (np.array(self.low) - origin) / rays, (np.array(self.high) - origin) / rays
-        enters = np.nan_to_num(np.minimum(to_low, to_high), nan=-np.inf)
-        leaves = np.nan_to_num(np.maximum(to_low, to_high), nan=np.inf)
-        axis_in, axis_out = enters.argmax(axis=1), leaves.argmin(axis=1)
-        rows = np.arange(len(rays))
-        near, far = enters[rows, axis_in], leaves[rows, axis_out]
-        distance = np.where(near > 0, near, far)
-        axis = np.where(near > 0, axis_in, axis_out)
+            to_low, to_high = ((np.array(corner) - origin)[:, None] / along for corner in (self.low, self.high))
+        enters, leaves = np.minimum(to_low, to_high), np.maximum(to_low, to_high)
+        if np.any(origin == self.low) or np.any(origin == self.high):  # 0 / 0 for rays within that face
+            enters[np.isnan(enters)], leaves[np.isnan(leaves)] = -np.inf, np.inf
+        near, far = enters.max(axis=0), leaves.min(axis=0)
+        outside, met = near > 0, (near <= far) & (far > 0)
+        rows = np.flatnonzero(met)
+        axis = np.where(outside[rows], enters[:, rows].argmax(axis=0), leaves[:, rows].argmin(axis=0))
         normals = np.zeros_like(rays)
         normals[rows, axis] = -np.sign(rays[rows, axis])
-        return np.where((near <= far) & (far > 0), distance, np.inf), normals
+        return np.where(met, np.where(outside, near, far), np.inf), normals
 
 
 @dataclass(frozen=True)

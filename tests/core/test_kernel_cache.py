@@ -56,8 +56,7 @@ KERNELS = {
 }
 
 
-@pytest.mark.parametrize("module", KERNELS)
-@pytest.mark.parametrize("first", ["", "import numba\n"])
+@pytest.mark.parametrize(("first", "module"), [*zip(("", "import numba\n"), KERNELS, strict=True)])
 def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, first: str, module: str) -> None:
     kernel, call = KERNELS[module]
     environment = {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}

@@ -17,9 +17,9 @@ from pano_mvs.algorithms.floor_plan.plan_grid import bar_length, bar_text
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.ranges import write_confidence_png, write_range_tiff
-from pano_mvs.viewer.cloud_colors import drawn_cloud
+from pano_mvs.viewer.cloud_colors import DrawnCloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour, camera_under, pixel_readout, point_under
-from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
+from pano_mvs.viewer.shown_scene import ShownCamera, ShownScene, open_scene
 from pano_mvs.viewer.viewpoint import (
     Viewpoint,
     box_of,
@@ -34,14 +34,26 @@ from tests.viewer.scenes import HALF, turned_poses, write_output
 SIZE = (900, 600)
 
 
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[ShownScene, DrawnCloud | None]:
+    return shown_from(write_output(tmp_path_factory.mktemp("tour"), turned_poses(6), points=150_000))
+
+
 @pytest.fixture
-def tour(tmp_path: Path) -> Tour:
-    return tour_of(write_output(tmp_path, turned_poses(6), points=150_000))
+def tour(shown: tuple[ShownScene, DrawnCloud | None]) -> Tour:
+    return through(*shown)
 
 
 def tour_of(out: Path) -> Tour:
+    return through(*shown_from(out))
+
+
+def shown_from(out: Path) -> tuple[ShownScene, DrawnCloud | None]:
     scene = open_scene(out)
-    cloud = drawn_cloud(scene.cloud) if scene.cloud is not None else None
+    return scene, drawn_cloud(scene.cloud) if scene.cloud is not None else None
+
+
+def through(scene: ShownScene, cloud: DrawnCloud | None) -> Tour:
     points = cloud.points if cloud is not None else np.zeros((0, 3))
     return Tour(scene, cloud, box_of(points, scene.centers))
 
@@ -117,8 +129,8 @@ def test_an_angle_that_rounds_to_zero_has_no_sign(offset: float) -> None:
     assert pixel_readout(camera, np.array([offset, -offset, 1.0]), "m") == "azimuth 0.0°, elevation 0.0°"
 
 
-def test_a_click_inside_reads_the_pixel_for_inspect(tour: Tour, tmp_path: Path) -> None:
-    folder = tmp_path / "out"
+def test_a_click_inside_reads_the_pixel_for_inspect(tmp_path: Path) -> None:
+    folder = write_output(tmp_path, turned_poses(6), points=150_000)
     ranges = np.full((64, 128), 2.5, np.float32)
     ranges[:, 96:] = np.nan
     for kind in ("range", "confidence"):

@@ -6,6 +6,7 @@ import keyword
 import re
 import sys
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         raise UsageError(
             f"a plugin cannot be called {name!r}: use lower-case letters, digits and '_', starting with a letter"
         )
-    if name in sys.stdlib_module_names or name in packages_distributions():
+    if name in sys.stdlib_module_names or name in _installed():
         raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package with that name")
     environment = Environment(
         loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
@@ -87,6 +88,11 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         environment.get_template(f"{kind}.py.jinja").render(values),
         environment.get_template("test.py.jinja").render(values),
     )
+
+
+@cache  # takes a third of a second
+def _installed() -> frozenset[str]:
+    return frozenset(packages_distributions())
 
 
 def write_plugin(kind: str, name: str, folder: Path, *, console: Console) -> None:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
 from pano_mvs.core.digest import digest_from_value
+
+_Import: TypeAlias = tuple[int, str, tuple[str, ...]]  # level, module ("" for `import` and `from .`), and names
 
 
 def code_digest(path: Path) -> str:
@@ -70,23 +75,38 @@ def _collect(path: Path, roots: _Roots, trees: dict[str, str]) -> None:
     name = roots.name_of(path)
     if name in trees:
         return
-    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-    trees[name] = ast.dump(_without_docstrings(tree), include_attributes=False)
-    files: list[Path] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                files.extend(roots.files(alias.name))
-        elif isinstance(node, ast.ImportFrom):
-            module = node.module or ""
-            dotted = [module, *(f"{module}.{alias.name}" if module else alias.name for alias in node.names)]
-            base = path.parent.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else None
-            if base is not None and (base / "__init__.py").is_file():
-                files.append(base / "__init__.py")  # the names may be its own
-            for name in dotted:
-                files.extend(roots.files(name) if base is None else _module_files(base, name))
-    for imported in files:
+    try:
+        trees[name], imports = _parsed(path.read_text(encoding="utf-8"))
+    except SyntaxError as error:
+        error.filename = str(path)
+        raise
+    for imported in _imported_files(imports, path.parent, roots):
         _collect(imported, roots, trees)
+
+
+@lru_cache(maxsize=64)  # a command asks for the digest of a plugin more than once
+def _parsed(text: str) -> tuple[str, tuple[_Import, ...]]:
+    """Return the syntax tree of a module as text, and its imports."""
+    tree = ast.parse(text)
+    imports: list[_Import] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            relative = (node.level, node.module or "") if isinstance(node, ast.ImportFrom) else (0, "")
+            imports.append((*relative, tuple(alias.name for alias in node.names)))
+    return ast.dump(_without_docstrings(tree), include_attributes=False), tuple(imports)
+
+
+def _imported_files(imports: Sequence[_Import], folder: Path, roots: _Roots) -> list[Path]:
+    """Return the local files that a module imports anywhere; absolute names are looked up from the roots."""
+    files: list[Path] = []
+    for level, module, names in imports:
+        dotted = [module, *(f"{module}.{name}" if module else name for name in names)]
+        base = folder.joinpath(*[".."] * (level - 1)).resolve() if level else None
+        if base is not None and (base / "__init__.py").is_file():
+            files.append(base / "__init__.py")  # the names may be its own
+        for name in dotted:
+            files.extend(roots.files(name) if base is None else _module_files(base, name))
+    return files
 
 
 def _module_files(base: Path, dotted: str) -> list[Path]:

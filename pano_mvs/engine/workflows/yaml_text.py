@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -97,9 +98,7 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
         WorkflowError: with every error found, as `name:line:column: message`.
     """
     try:
-        yaml = YAML(typ="safe", pure=True)
-        yaml.Composer = _Composer
-        root = yaml.compose(text)
+        root = _composed(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
@@ -116,6 +115,14 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
     if problems is None:
         builder.problems.raise_if_any()
     return located
+
+
+@lru_cache(maxsize=64)  # a command reads the same workflow more than once, and many of them extend the same one
+def _composed(text: str) -> Node | None:
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _Composer
+    root: Node | None = yaml.compose(text)
+    return root
 
 
 class _Composer(Composer):

@@ -15,10 +15,12 @@ WORKFLOW = """\
 pano_mvs: 1
 stages:
   images:   {use: source.folder, path: capture/images}
+  poses:    {use: poses.from_model, path: poses.json}
+"""
+POINTS = """\
   features: {use: features.orb_tangent, max_keypoints: 400}
   pairs:    {use: pairs.exhaustive}
   matches:  {use: matches.brute_force}
-  poses:    {use: poses.from_model, path: poses.json}
   points:   {use: poses.triangulate}
 """
 
@@ -48,6 +50,7 @@ def test_one_pose_is_not_given_to_several_pictures(pano_mvs: Command, known: Pat
         for name in names:
             (images / name).rename(images / folder / f"{int(name[:3]) % 2:03}.png")
     write(known, capture, ["a/000.png", "a/001.png"])
+    known.write_text(WORKFLOW + POINTS)
     result = pano_mvs("run", known, "--out", "out")
     assert result.code == 3, result.text
     assert run_json(Path("out"))["poses"]["registered"] == ["a/000.png", "a/001.png"]
@@ -75,9 +78,6 @@ def test_names_of_another_capture_are_an_input_error(pano_mvs: Command, known: P
 def test_poses_of_other_pictures_of_the_same_names_are_refused(pano_mvs: Command, known: Path, capture: Path) -> None:
     """The sample's own poses were given to anybody's 000.png to 003.png once."""
     write(known, capture, ["000.png", "001.png", "002.png", "003.png"])
-    known.write_text(
-        known.read_text().partition("  features")[0] + "  poses: {use: poses.from_model, path: poses.json}\n"
-    )
     assert pano_mvs("run", known, "--out", "out").code == 0
     for path in sorted((capture / "images").iterdir()):
         picture = read_picture(path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.blocks import nearest_cameras
+from pano_mvs.algorithms.blocks import MergedBlocks, nearest_cameras
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, similarity_from_points
 from pano_mvs.io.colmap.writer import write_colmap_model
@@ -330,9 +330,15 @@ def bent_blocks(folder: Path, use: str) -> list[Path]:
     return [folder / f"block_{number}" for number in range(len(RANGES))]
 
 
-def test_blocks_that_were_adjusted_are_adjusted_together(tmp_path: Path) -> None:
-    outs = bent_blocks(tmp_path, "poses.refine")
-    found = merge_outputs(outs, tmp_path / "merged").merged
+@pytest.fixture(scope="module")
+def adjusted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MergedBlocks]:
+    """The merge of blocks that were adjusted."""
+    folder = tmp_path_factory.mktemp("adjusted")
+    return folder / "merged", merge_outputs(bent_blocks(folder, "poses.refine"), folder / "merged").merged
+
+
+def test_blocks_that_were_adjusted_are_adjusted_together(adjusted: tuple[Path, MergedBlocks]) -> None:
+    out, found = adjusted
     assert found.before is not None
     truth = np.array([camera.center for camera in walk(30).values()])
 
@@ -342,15 +348,14 @@ def test_blocks_that_were_adjusted_are_adjusted_together(tmp_path: Path) -> None
 
     assert worst(found.poses) < 0.1 * worst(found.before)
     np.testing.assert_allclose(similarity_from_points(found.before.centers, found.poses.centers).scale, 1, atol=1e-6)
-    summary = load(tmp_path / "merged").summary
+    summary = load(out).summary
     assert any("all 30 cameras were adjusted together" in note for note in summary.notes)
-    np.testing.assert_allclose(read_poses(tmp_path / "merged").centers, found.poses.centers, atol=1e-5)
+    np.testing.assert_allclose(read_poses(out).centers, found.poses.centers, atol=1e-5)
 
 
-def test_the_cloud_moves_with_the_cameras(tmp_path: Path) -> None:
+def test_the_cloud_moves_with_the_cameras(tmp_path: Path, adjusted: tuple[Path, MergedBlocks]) -> None:
     """A point stays where its camera sees it: the ranges of the camera do not change."""
-    outs = bent_blocks(tmp_path, "poses.refine")
-    found = merge_outputs(outs, tmp_path / "merged").merged
+    out, found = adjusted
     assert found.before is not None
     rng = np.random.default_rng(3)
     points, normals = rng.normal(0, 5, (40, 3)), rng.normal(size=(40, 3))
@@ -360,7 +365,7 @@ def test_the_cloud_moves_with_the_cameras(tmp_path: Path) -> None:
         before, after = found.before.cam_from_world(camera), found.poses.cam_from_world(camera)
         np.testing.assert_allclose(after.apply(vectors[2]), before.apply(vectors[0]), atol=1e-9)
         np.testing.assert_allclose(after.rotation @ vectors[3], before.rotation @ vectors[1], atol=1e-9)
-    cloud = read_ply(tmp_path / "merged/cloud.ply").points_in_world
+    cloud = read_ply(out / "cloud.ply").points_in_world
     plain = merge_outputs(bent_blocks(tmp_path / "kept", "poses.from_model"), tmp_path / "plain").merged
     still = read_ply(tmp_path / "plain/cloud.ply").points_in_world
     assert plain.before is None, "known poses are kept"
