@@ -22,7 +22,7 @@ from pano_mvs.scene import Features
 
 _UNIT, _MOST_DECADES = 100.0, 400.0  # of false alarms: what counts one, and beyond which no more counts
 CERTAIN = -250.0
-"""Enough whatever the marks: in ten places, no false pair has as few false alarms (10⁻²¹¹); equal offices have some."""
+"""Enough whatever the marks: in ten places, no false pair has as few false alarms (10⁻²³³); equal offices have some."""
 _MOST_TILT_DEG = 4.0  # verticals may be unknown
 _LEAST_PARALLAX_DEG, _LEAST_STD_DEG = 0.5, 0.05
 _BELOW = 0.25  # sine of how far below the horizon a match may lie on a floor
