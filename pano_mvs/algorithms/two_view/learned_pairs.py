@@ -46,7 +46,7 @@ class Marks(NamedTuple):
     open: float
 
 
-WEIGHTS = (-6.222, 1.690, -1.109, 3.212, -1.902, 0.692, -0.939)
+WEIGHTS = (-6.346, 1.724, -1.120, 3.005, -1.796, 0.677, -1.025)
 """Of `terms_of` in the logarithm of the odds that a pose is right, as `poses.tours.pair_evidence` of the tools fits."""
 
 ACCEPTED_ODDS = float(np.log(5.0))

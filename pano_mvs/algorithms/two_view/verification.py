@@ -108,10 +108,10 @@ def verify_pair(
         tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
     if turned.sum() >= max(min_inliers, 0.9 * (tried[0].inliers if tried else 0)):
         return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
+    if refine and learned:
+        return pair.most_probable(tried, most=max_alternatives, reason=pose.reason)
     if not tried:
         return pair.failed(pose.reason)
-    if refine and learned:
-        return pair.most_probable(tried[0], most=max_alternatives)
     best = pair.judged(tried[0])
     if not best:
         hypotheses = [pair.view(one)[0] for one in tried if np.isfinite(one.log10_false_alarms)]
@@ -331,13 +331,14 @@ class _Pair:
     def upright(self) -> list[_Evidence]:
         """Return poses of the pair as of two upright images, for each direction that may be up."""
         found = []
-        for one, other in product(self.first.ups, self.second.ups):
+        assumed = [*product(self.first.ups, self.second.ups)]
+        for one, other in assumed:
             level, other_level = (rotation_from_two_vectors(np.array(up), UP) for up in (one, other))
             for pose in upright_poses(
                 self.p @ level.T, self.q @ other_level.T, rng=self.rng, threshold_rad=self.threshold_rad
             ):
                 turned = Rigid3(other_level.T @ pose.rotation @ level, other_level.T @ pose.translation)
-                found.append(self.evidence(turned, sample=3, models=4))
+                found.append(self.evidence(turned, sample=3, models=4 * len(assumed)))
         return found
 
     def distinct(self, pose: Rigid3, *, most: int) -> list[Rigid3]:
@@ -352,22 +353,24 @@ class _Pair:
             most=most,
         )
 
-    def most_probable(self, best: _Evidence, *, most: int) -> TwoView:
+    def most_probable(self, found: list[_Evidence], *, most: int, reason: str) -> TwoView:
         """Return the most probable geometry of a pair of learned matches, with others that would be accepted as well.
 
         Args:
-            best: the pose with which most matches agree.
-            most: number of others, or of hypotheses if none is accepted.
+            found: the pose with which most matches agree, if any; its runners-up and those as upright images are tried.
+            most: number of others; a pair of which none is accepted keeps as many hypotheses beside the first.
+            reason: why no pose was found.
         """
         minimal = SOLVERS["five_point"]
-        tried = [best, *self.upright()]
-        tried += [
-            self.evidence(pose, sample=minimal.sample, models=minimal.models)
-            for pose in self.distinct(best.pose, most=most)
-        ]
+        tried = [*found, *self.upright()]
+        for best in found:
+            tried += [
+                self.evidence(pose, sample=minimal.sample, models=minimal.models)
+                for pose in self.distinct(best.pose, most=most)
+            ]
         known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not self.why_open(one)]
         if not known:
-            return self.judged(best)
+            return self.judged(found[0]) if found else self.failed(reason)
         ranked: list[_Evidence] = []
         for one in sorted(known, key=lambda one: -one.log_odds):
             if all(are_distinct(one.pose, other.pose) for other in ranked):

@@ -18,8 +18,9 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     marks_of,
     weight_of_learned,
 )
+from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import features_from_bearings
 from tools.benchmarks.poses.tours.pair_evidence import fitted, left_out, prior_odds, read_table
 
@@ -110,3 +111,23 @@ def test_places_that_were_left_out_have_hardly_any_wrong_pair() -> None:
     assert accepted > 0.7 * right
     assert wrong <= 0.05 * accepted
     assert plain_wrong > 0.2 * plain
+
+
+def test_of_two_poses_that_matches_agree_on_the_more_probable_one_counts() -> None:
+    """A hundred matches of a room with its floor, and 160 that look alike as if seen from one place."""
+    rng = np.random.default_rng(3)
+    alike = Rigid3(rotation_from_rotvec((0.03, 2.0, 0.02)), np.array([0.9, 0.1, 0.0]))
+    far = rng.normal(size=(160, 3))
+    far *= rng.uniform(20, 40, (160, 1)) / np.linalg.norm(far, axis=1, keepdims=True)
+    rays = [
+        np.concatenate(both) + rng.normal(0, 3e-4, (260, 3))
+        for both in zip(_rays(_room(below=60, above=40)), _rays(far, alike), strict=True)
+    ]
+    first, second = (features_from_bearings(one / np.linalg.norm(one, axis=1, keepdims=True)) for one in rays)
+    idx = np.stack([np.arange(260)] * 2, axis=1).astype(np.int32)
+    plain = verify_pair(first, second, idx, rng=np.random.default_rng(0))
+    learned = (replace(one, learned=len(one)) for one in (first, second))
+    view = verify_pair(*learned, idx, rng=np.random.default_rng(0))
+    assert geodesic_angle(plain.rotation, alike.rotation) < 0.01
+    assert view
+    assert geodesic_angle(view.rotation, POSE.rotation) < 0.01

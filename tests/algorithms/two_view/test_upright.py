@@ -113,3 +113,14 @@ def test_learned_matches_that_a_rotation_explains_must_be_more_significant(
     assert bool(found) is verified
     assert verified or "two things that look alike" in found.reason
     assert verified or found.alternatives
+
+
+def test_a_refused_learned_pair_keeps_its_most_probable_pose_where_five_matches_find_nothing() -> None:
+    pose, first, second = _pair(true=30, count=290, tilt_deg=0.0)
+    level, other = (replace(one, learned=len(one)) for one in (first, second))
+    for most in (0, 2):
+        view = verify_pair(level, other, _all(290), rng=np.random.default_rng(0), max_alternatives=most)
+        assert not view
+        assert -20 < view.log10_false_alarms < -10
+        assert 1 <= len(view.alternatives) <= 1 + most
+        assert float(geodesic_angle(view.alternatives[0].rotation, pose.rotation)) < np.deg2rad(0.5)

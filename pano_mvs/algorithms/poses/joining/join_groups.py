@@ -267,11 +267,12 @@ def _evidence_of_pairs(
         if geometry is not None and view.log10_false_alarms < 0:
             ordered = features if i < j else features[::-1]
             own = weight_of_pair(*ordered, geometry, log10_false_alarms=view.log10_false_alarms)
-            if not view and own >= 1:
+            if not view and own >= 1 and not all(one.learned for one in features):
                 continue  # it was refused since its direction is open, such as for distant scenery alone
             if _is_same(oriented(geometry, i, j)[0], relative):
-                by_pair[i, j] = own
-                alarms.append(view.log10_false_alarms)
+                if own > 0:
+                    by_pair[i, j] = own
+                    alarms.append(view.log10_false_alarms)
                 has_length |= _has_lengths((first, second), (i, j), geometry, similarity=alignment.first_from_second)
                 continue
         if not all(one.learned for one in features):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,8 @@ def camera_evidence(
         weight of other geometries of the pairs of all cameras, relative to those in use), `joint_contradicting` (solid
         angle in which its part and the larger rest look through one another's surfaces, relative to all that both see),
         `linked` (weight of the learned pairs that agree less that of those that do not, across the weakest cut between
-        the camera and the larger part of the model; see `weight_of_pair`), and `links_contradicting` (share of the
-        weight of all learned pairs of the model that does not agree with its cameras).
+        the camera and the larger part of those with such pairs; see `weight_of_pair`), and `links_contradicting` (share
+        of the weight of all learned pairs of the model that does not agree with its cameras), for cameras with such.
     """
     contradicting, repeats = _contradicting_joints(joints), _repeats(model)
     linked, links_contradicting = _links(model)
@@ -60,7 +60,7 @@ def camera_evidence(
             "repeats": repeats,
             "joint_contradicting": contradicting.get(image, np.nan),
             "linked": linked.get(image, np.nan),
-            "links_contradicting": links_contradicting,
+            "links_contradicting": links_contradicting if image in linked else np.nan,
         }
     return rows
 
@@ -144,46 +144,61 @@ def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
 
 
 def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
-    """Return what learned pairs say for the weakest cut between each camera and the larger part of a model.
+    """Return what learned pairs say for the weakest cut between each camera that has any and the larger part of these.
 
-    Also returned is the share of their weight that does not agree with the cameras; NaN without any.
+    Also returned is the share of their weight that does not agree with the cameras, as if that of one pair more did;
+    NaN without any.
     """
-    images = sorted(model.cameras)
-    number = {image: idx for idx, image in enumerate(images)}
-    features = [model.pairs.features.get(name) for name in model.pairs.names]
-    ends, weights = list[tuple[int, int]](), list[float]()
-    for (i, j), view in (model.pairs.compared or {}).items():
-        one, other = features[i], features[j]
-        geometry = view if view else next(iter(view.alternatives), None)
-        if one and other and one.learned and other.learned and geometry is not None and number.keys() >= {i, j}:
-            own = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
-            ends.append((number[i], number[j]))
-            weights.append(own if agrees_with(model, (i, j), geometry) else -own)
-    weight = np.abs(weights).sum()
-    if not weight:
+    weights = {edge: weight for edge in model.pairs.compared or {} if (weight := _link(model, edge))}
+    if not weights:
         return {}, np.nan
-    both = np.concatenate([np.array(ends), np.array(ends)[:, ::-1]]).T
-    graph = csr_array(coo_array((np.tile(weights, 2), both), (len(images),) * 2))
-    # Strong pairs first: the weakest cuts are among those of the edges of the maximum spanning tree.
+    images = sorted({image for edge in weights for image in edge})
+    number = {image: idx for idx, image in enumerate(images)}
+    ends = np.array([[number[image] for image in edge] for edge in weights]).T
+    values = np.array([*weights.values()])
+    graph = csr_array(coo_array((np.tile(values, 2), np.concatenate([ends, ends[::-1]], axis=1)), (len(images),) * 2))
+    found = np.full(len(images), np.inf)
+    for part in _branches(graph):
+        cut = float((graph @ (1.0 - part))[part].sum())
+        for side in (part, ~part):
+            if 2 * side.sum() <= len(images):
+                found[side] = np.minimum(found[side], cut)
+    against = -np.minimum(values, 0.0).sum()
+    return dict(zip(images, found.tolist(), strict=True)), float(against / (np.abs(values).sum() + 1.0))
+
+
+def _link(model: PlacedModel, edge: Edge) -> float:
+    """Return the weight of a learned pair of two cameras of a model, negative if it does not agree with them.
+
+    It is 0 if the pair says nothing, and where it would also be accepted with a pose that agrees.
+    """
+    view = (model.pairs.compared or {})[edge]
+    geometry = view if view else next(iter(view.alternatives), None)
+    one, other = (model.pairs.features.get(model.pairs.names[image]) for image in edge)
+    if geometry is None or view.geometry == "rotation" or not model.cameras.keys() >= {*edge}:
+        return 0.0
+    if not (one and other and one.learned and other.learned):
+        return 0.0
+    agrees = agrees_with(model, edge, geometry)
+    if not agrees and view and any(agrees_with(model, edge, runner_up) for runner_up in view.alternatives):
+        return 0.0
+    weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
+    return weight if agrees else -weight
+
+
+def _branches(graph: csr_array) -> Iterator[NDArray[np.bool_]]:
+    """Yield parts of a graph that may have a weak cut: each node, and what hangs on an edge of the strongest tree."""
+    count = graph.shape[0]
+    yield from np.eye(count, dtype=np.bool_)
     strong = graph.maximum(0)
     strong.eliminate_zeros()
     strong.data *= -1
     tree = minimum_spanning_tree(strong)
     parts = connected_components(tree, directed=False)[1]
-    found = np.full(len(images), np.inf)
     for part in range(parts.max() + 1):
         order, before = breadth_first_order(tree, int(np.argmax(parts == part)), directed=False)
-        inside = np.eye(len(images), dtype=np.bool_)[order]  # of each camera, the branch that hangs on it
-        place = {image: idx for idx, image in enumerate(order.tolist())}
+        inside = np.eye(count, dtype=np.bool_)[order]  # of each node, the branch that hangs on it
+        place = {node: idx for idx, node in enumerate(order.tolist())}
         for idx in range(len(order) - 1, 0, -1):
             inside[place[before[order[idx]]]] |= inside[idx]
-        for branch in inside:
-            if branch.all():
-                continue
-            cut = float((graph @ (1.0 - branch))[branch].sum())
-            for side in (branch, ~branch):
-                if 2 * side.sum() <= len(images):
-                    found[side] = np.minimum(found[side], cut)
-    # Cameras that are in the larger part beside every cut.
-    found[np.isinf(found)] = found[np.isfinite(found)].max(initial=0.0)
-    return {image: float(found[idx]) for image, idx in number.items()}, float(-np.minimum(weights, 0).sum() / weight)
+        yield from (branch for branch in inside if not branch.all())

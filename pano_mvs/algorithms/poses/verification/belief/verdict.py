@@ -68,8 +68,8 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
     ),
     "linked": (
         lambda row: (
-            f"the pairs that connect it with the others weigh {max(row['linked'], 0.0):.1f} times as much as one pair "
-            "must"
+            f"the learned pairs that connect it with the others weigh only {max(row['linked'], 0.0):.1f} times as much "
+            "as one that is just accepted"
         ),
         "",
         _BETWEEN,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -77,7 +77,9 @@ def test_a_contradicted_joint_counts_for_all_parts_beyond_it() -> None:
     np.testing.assert_array_equal(found, [np.nan] * 3 + [0.4] * 3)
 
 
-def linked(weights: Mapping[Edge, float], monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def linked(
+    weights: Mapping[Edge, float], monkeypatch: pytest.MonkeyPatch, *, plain: Collection[int] = ()
+) -> tuple[list[float], float]:
     """Return what is measured if learned pairs have these weights, negative where they do not agree."""
     matches = np.stack([np.arange(30)] * 2, axis=1).astype(np.int32)
     away = Rigid3(rotation_from_rotvec((0.0, 1.0, 0.0)), np.array([0.0, 1.0, 0.0]))
@@ -87,22 +89,38 @@ def linked(weights: Mapping[Edge, float], monkeypatch: pytest.MonkeyPatch) -> li
         view = view_of(relative if weight > 0 else away @ relative, matches)
         compared[a, b] = replace(view, log10_false_alarms=-abs(weight))
     monkeypatch.setattr(evidence, "weight_of_pair", lambda *_, log10_false_alarms: -log10_false_alarms)
-    learned = replace(features_from_bearings(RAYS), learned=len(RAYS))
-    pairs = Pairs({f"{idx}.png": learned for idx in CAMERAS}, {}, compared=compared)
-    rows = camera_evidence(PlacedModel(pairs, dict(CAMERAS), {}), NOTHING, NOTHING)
-    assert len({str(row["links_contradicting"]) for row in rows.values()}) == 1
-    return [*(rows[idx]["linked"] for idx in CAMERAS), rows[0]["links_contradicting"]]
+    features = features_from_bearings(RAYS)
+    learned = {f"{idx}.png": features if idx in plain else replace(features, learned=len(RAYS)) for idx in CAMERAS}
+    rows = camera_evidence(PlacedModel(Pairs(learned, {}, compared=compared), dict(CAMERAS), {}), NOTHING, NOTHING)
+    shares = {row["links_contradicting"] for row in rows.values() if np.isfinite(row["linked"])}
+    return [rows[idx]["linked"] for idx in CAMERAS], shares.pop() if shares else np.nan
 
 
 def test_a_part_is_linked_by_what_crosses_its_weakest_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     rooms: dict[Edge, float] = {(0, 1): 5, (1, 2): 5, (0, 2): 5, (2, 3): 5, (4, 5): 4, (3, 4): 2}
-    assert linked(rooms, monkeypatch) == [5, 5, 5, 5, 2, 2, 0]
+    assert linked(rooms, monkeypatch) == ([5, 5, 5, 5, 2, 2], 0)
     # What contradicts counts against it; pairs inside of the part do not.
-    assert linked({**rooms, (1, 5): -1.5}, monkeypatch)[4:] == [0.5, 0.5, pytest.approx(1.5 / 27.5)]
-    assert linked({**rooms, (0, 5): 3}, monkeypatch)[4:] == [5, 5, 0]
+    found, share = linked({**rooms, (1, 5): -1.5}, monkeypatch)
+    assert found[4:] == [0.5, 0.5]
+    assert share == pytest.approx(1.5 / 28.5)
+    assert linked({**rooms, (0, 5): 3}, monkeypatch)[0][4:] == [5, 5]
+
+
+def test_a_camera_between_two_rooms_may_be_the_weakest_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms: dict[Edge, float] = {(0, 1): 9, (3, 4): 9, (1, 2): 3, (2, 3): 3, (0, 3): 8, (1, 4): 8}
+    found, _ = linked({**rooms, (0, 2): -4, (2, 4): -4}, monkeypatch)
+    assert found[2] == -2
 
 
 def test_a_camera_without_a_pair_that_agrees_is_not_linked(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = linked({(0, 1): 5, (1, 2): 5, (2, 3): 5, (3, 4): 5, (4, 5): -2}, monkeypatch)
-    assert found[5:] == [-2, pytest.approx(2 / 22)]
-    assert np.isnan(linked({}, monkeypatch)).all()
+    found, share = linked({(0, 1): 5, (1, 2): 5, (2, 3): 5, (3, 4): 5, (4, 5): -2}, monkeypatch)
+    assert found[5] == -2
+    assert share == pytest.approx(2 / 23)
+    assert np.isnan(linked({}, monkeypatch)[0]).all()
+
+
+def test_cameras_without_learned_pairs_have_no_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs: dict[Edge, float] = {(0, 1): 5, (1, 2): 4, (2, 3): 6, (3, 4): 6, (4, 5): 6}
+    found, _ = linked(pairs, monkeypatch, plain={3, 4, 5})
+    assert found[:3] == [5, 9, 4]
+    assert np.isnan(found[3:]).all()
