@@ -30,9 +30,10 @@ class TwoView(Record):
         rotation_std_deg: standard deviation of the rotation about its least certain axis, from the matches.
         direction_std_deg: the same for the direction; both are 0 unless the geometry is general.
         unverified_idx: (U, 2) int32 the other matches, which do not agree with the geometry; None if unknown.
-        alternative_rotations: (K, 3, 3) float64 of second_from_first of the runner-up geometries, best supported first;
-            None, as the next four, without runners-up. Repeated structure often makes a false geometry the best. Those
-            of a pair whose geometry is "none" are hypotheses: each by itself may be chance.
+        alternative_rotations: (K, 3, 3) float64 of second_from_first of the runner-up geometries, best supported first,
+            or most probable first if a network has found the matches; None, as the next four, without runners-up.
+            Repeated structure often makes a false geometry the best. Those of a pair whose geometry is "none" are
+            hypotheses: each by itself may be chance.
         alternative_directions: (K, 3) float64 their unit translations.
         alternative_sizes: (K,) int32 number of matches that support each.
         alternative_matches_idx: (S, 2) int32 these matches, ordered by geometry, S = Σ sizes. A match may
@@ -89,7 +90,7 @@ class TwoView(Record):
 
     @property
     def alternatives(self) -> tuple[TwoView, ...]:
-        """The runner-up geometries, best supported first, each as a two-view geometry of its own."""
+        """The runner-up geometries in their order, each as a two-view geometry of its own."""
         if (
             self.alternative_sizes is None
             or self.alternative_rotations is None

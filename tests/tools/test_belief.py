@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -30,6 +32,7 @@ from tools.benchmarks.belief.fitting import (
 )
 from tools.benchmarks.belief.measuring import evidence_of
 from tools.benchmarks.belief.refit import decidable, doubted, read, source_of
+from tools.benchmarks.belief.tours import measure_tour, verified_again
 
 
 def drawn(count: int, rng: np.random.Generator) -> Cameras:
@@ -148,3 +151,26 @@ def test_every_measurement_of_a_table_is_measured() -> None:
     for row in evidence_of(without).values():
         assert np.isnan([row["agreeing"], row["contradicted"]]).all()
         assert row["ratio"] > 0.7
+
+
+@pytest.mark.slow
+def test_tours_are_measured_with_other_samples(tmp_path: Path) -> None:
+    tiny = tiny_capture(Variant(size_hw=(128, 256)))
+    (tmp_path / "images").mkdir()
+    truth = {}
+    for name, pose, picture in zip(tiny.names, tiny.poses, tiny.pictures, strict=True):
+        cv2.imwrite(str(tmp_path / "images" / name), picture[..., ::-1])
+        truth[name] = {
+            "yaw_deg": 0.0,
+            "camera_from_world": pose.rotation.tolist(),
+            "position_m": pose.center.tolist(),
+        }
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    features, views = tiny.each(Features), tiny.each(TwoView)
+    again = verified_again(features, views, seed=5)
+    assert again.keys() == views.keys()
+    rows = measure_tour(tmp_path, features, again, seed=5)
+    assert {row["name"] for row in rows} <= {*tiny.names}
+    assert all(row["right"] and row["seed"] == 5 for row in rows)
+    assert {*rows[0]["evidence"]} == {*MEASURED}
+    assert rows[0]["evidence"]["linked"] > 1

@@ -111,7 +111,5 @@ def weight_of_learned(log10_false_alarms: float, marks: Marks) -> float:
     It is the logarithm of the odds beyond those of any pair; 0 if they are less, and 1 if the pair is just accepted by
     itself.
     """
-    if log10_false_alarms > WEAKEST:
-        return 0.0
     gained = log_odds_of(log10_false_alarms, marks) - PRIOR_ODDS
     return max(gained / (ACCEPTED_ODDS - PRIOR_ODDS), float(log10_false_alarms <= CERTAIN), 0.0)

@@ -15,6 +15,7 @@ from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
 from pano_mvs.algorithms.two_view.learned_pairs import (
     ACCEPTED_ODDS,
     CERTAIN,
+    WEAKEST,
     Marks,
     log_odds_of,
     marks_of,
@@ -205,6 +206,8 @@ def weight_of_pair(first: Features, second: Features, view: TwoView, *, log10_fa
     """
     if not (first.learned and second.learned):
         return max(0.0, log10_false_alarms / MAX_LOG10_FALSE_ALARMS)
+    if log10_false_alarms > WEAKEST:
+        return 0.0
     return weight_of_learned(log10_false_alarms, pair_marks(first, second, view))
 
 

@@ -94,7 +94,6 @@ def test_what_a_pair_weighs_beside_others() -> None:
     bad = marks._replace(tilt=4.0, floor=0.0, near=1.0)
     assert weight_of_learned(-20.0, bad) == 0  # less probable than any pair
     assert weight_of_learned(CERTAIN, bad) == 1
-    assert weight_of_learned(-1.0, marks) == 0
 
 
 def test_the_weights_are_those_of_the_table() -> None:

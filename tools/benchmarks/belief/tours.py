@@ -1,8 +1,8 @@
 """Collect evidence of tours.
 
 Each DIR is a capture with truth.json that `python -m tools benchmarks poses.tours.measure DIR … --out OUT` has run with
-`quality`. FILE receives a line for each, as `belief.collect` writes them for generated captures; the name of a tour is
-its family.
+`quality`. Its pairs are verified again with other random samples for each of the seeds. FILE receives a line for each
+tour and seed, as `belief.collect` writes them for generated captures; the name of a tour is its family.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verified_group
+from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from tools.benchmarks.belief.families import LEARNED, Capture
@@ -58,14 +59,30 @@ def measure_tour(
     return rows
 
 
+def verified_again(
+    features: Mapping[str, Features], views: Mapping[tuple[str, str], TwoView], *, seed: int
+) -> dict[tuple[str, str], TwoView]:
+    """Return pairs whose matches were verified with other random samples."""
+    rng, found = np.random.default_rng(seed), dict[tuple[str, str], TwoView]()
+    for (first, second), view in views.items():
+        own, matches = np.random.default_rng(rng.integers(2**31)), view.all_matches_idx
+        found[first, second] = (
+            verify_pair(features[first], features[second], matches, rng=own) if len(matches) else view
+        )
+    return found
+
+
 def main() -> None:
     """Measure the tours that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path)
     parser.add_argument("tours", nargs="+", type=Path, metavar="DIR")
     parser.add_argument("--runs", type=Path, required=True, metavar="OUT", help="results of poses.tours.measure")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     given = parser.parse_args()
     for tour in given.tours:
-        rows = measure_tour(tour, *learned_views(given.runs / tour.name, merged=True))
-        with given.file.open("a", encoding="utf-8") as out:
-            out.write(json.dumps({"family": tour.name + LEARNED, "seed": 0, "cameras": rows}) + "\n")
+        features, views = learned_views(given.runs / tour.name, merged=True)
+        for seed in given.seeds:
+            rows = measure_tour(tour, features, verified_again(features, views, seed=seed), seed=seed)
+            with given.file.open("a", encoding="utf-8") as out:
+                out.write(json.dumps({"family": tour.name + LEARNED, "seed": seed, "cameras": rows}) + "\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from pano_mvs.algorithms.poses.placement.pair_evidence import (
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
 from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, refined_on_points
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups, consistent_edges, views_by_position
-from pano_mvs.algorithms.two_view.verification import verify_pose
+from pano_mvs.algorithms.two_view.verification import verify_pose, weight_of_pair
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features, TwoView
@@ -52,6 +53,19 @@ class Pairs:
             by_image[first].append((-most, second))
             by_image[second].append((-most, first))
         object.__setattr__(self, "partners", tuple(tuple(idx for _, idx in sorted(pairs)) for pairs in by_image))
+
+    @cached_property
+    def learned_weights(self) -> dict[Edge, float]:
+        """What the most probable geometry of each pair of learned matches weighs (`weight_of_pair`), if anything."""
+        found = {}
+        for edge, view in (self.compared or {}).items():
+            one, other = (self.features[self.names[image]] for image in edge)
+            geometry = view if view else next(iter(view.alternatives), None)
+            if geometry is not None and view.geometry != "rotation" and one.learned and other.learned:
+                weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
+                if weight:
+                    found[edge] = weight
+        return found
 
     @staticmethod
     def without(names: Sequence[str]) -> Pairs:

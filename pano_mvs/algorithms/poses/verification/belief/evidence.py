@@ -13,7 +13,6 @@ from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.contradictions import agrees_with
 from pano_mvs.algorithms.poses.verification.joints import Joint
-from pano_mvs.algorithms.two_view.verification import weight_of_pair
 from pano_mvs.geometry import geodesic_angle
 
 FloatArray = NDArray[np.float64]
@@ -149,7 +148,11 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
     Also returned is the share of their weight that does not agree with the cameras, as if that of one pair more did;
     NaN without any.
     """
-    weights = {edge: weight for edge in model.pairs.compared or {} if (weight := _link(model, edge))}
+    weights = {}
+    for edge, weight in model.pairs.learned_weights.items():
+        if model.cameras.keys() >= {*edge}:
+            view = (model.pairs.compared or {})[edge]
+            weights[edge] = weight if agrees_with(model, edge, view if view else view.alternatives[0]) else -weight
     if not weights:
         return {}, np.nan
     images = sorted({image for edge in weights for image in edge})
@@ -165,25 +168,6 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
                 found[side] = np.minimum(found[side], cut)
     against = -np.minimum(values, 0.0).sum()
     return dict(zip(images, found.tolist(), strict=True)), float(against / (np.abs(values).sum() + 1.0))
-
-
-def _link(model: PlacedModel, edge: Edge) -> float:
-    """Return the weight of a learned pair of two cameras of a model, negative if it does not agree with them.
-
-    It is 0 if the pair says nothing, and where it would also be accepted with a pose that agrees.
-    """
-    view = (model.pairs.compared or {})[edge]
-    geometry = view if view else next(iter(view.alternatives), None)
-    one, other = (model.pairs.features.get(model.pairs.names[image]) for image in edge)
-    if geometry is None or view.geometry == "rotation" or not model.cameras.keys() >= {*edge}:
-        return 0.0
-    if not (one and other and one.learned and other.learned):
-        return 0.0
-    agrees = agrees_with(model, edge, geometry)
-    if not agrees and view and any(agrees_with(model, edge, runner_up) for runner_up in view.alternatives):
-        return 0.0
-    weight = weight_of_pair(one, other, geometry, log10_false_alarms=view.log10_false_alarms)
-    return weight if agrees else -weight
 
 
 def _branches(graph: csr_array) -> Iterator[NDArray[np.bool_]]:

@@ -111,12 +111,14 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
         lost["ratio"] += lost.pop("share", 0.0)
     worst = sorted(lost, key=lambda name: (lost[name], name))[:2]
     said = [_SAID[name][0](row) if np.isfinite(row.get(name, np.nan)) else _SAID[name][1] for name in worst]
-    advice = dict.fromkeys(_SAID[name][2] for name in worst)
-    why = ", and ".join(dict.fromkeys(filter(None, said)))
+    advice = ", or ".join(dict.fromkeys(_SAID[name][2] for name in worst))
+    why = ", and ".join(dict.fromkeys(filter(None, said))) or "nothing speaks against it, but miss_cost demands more"
     undecided = f"; it cannot be decided from these images: {ambiguity}" if ambiguity else ""
-    return (
-        f"its pose is right with a probability of {_percent(model.probability(row))}: {why}{undecided}; "
-        + ", or ".join(advice)
+    return "; ".join(
+        filter(
+            None,
+            (f"its pose is right with a probability of {_percent(model.probability(row))}: {why}{undecided}", advice),
+        )
     )
 
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.poses.placement import placed_model
 from pano_mvs.algorithms.poses.placement.pair_evidence import geometries_of
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.verification.belief import evidence
 from pano_mvs.algorithms.poses.verification.belief.evidence import camera_evidence
 from pano_mvs.algorithms.poses.verification.joints import Joint
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
@@ -88,7 +88,7 @@ def linked(
         relative = CAMERAS[b] @ CAMERAS[a].inverse()
         view = view_of(relative if weight > 0 else away @ relative, matches)
         compared[a, b] = replace(view, log10_false_alarms=-abs(weight))
-    monkeypatch.setattr(evidence, "weight_of_pair", lambda *_, log10_false_alarms: -log10_false_alarms)
+    monkeypatch.setattr(placed_model, "weight_of_pair", lambda *_, log10_false_alarms: -log10_false_alarms)
     features = features_from_bearings(RAYS)
     learned = {f"{idx}.png": features if idx in plain else replace(features, learned=len(RAYS)) for idx in CAMERAS}
     rows = camera_evidence(PlacedModel(Pairs(learned, {}, compared=compared), dict(CAMERAS), {}), NOTHING, NOTHING)
