@@ -172,6 +172,16 @@ def test_a_plain_ceiling_stays_where_creases_do_not_contradict(grey: bool, noise
     assert (structure.uncertainties[above] < 0.005).all()
 
 
+@pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
+def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, count: int) -> None:
+    box = Box()
+    for name, center in zip(box.maps, CENTERS, strict=True):
+        floor = box_range(SIZE, HALF, center)[1][..., 1] < -0.5
+        box.pictures[name][~floor] = 200 if grey else box.pictures[name][~floor]
+    views, planes = _plain_ceiling(box, 1.0)
+    assert len(supposed_ceiling(views, planes[:1])) == count
+
+
 def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     """Its ranges are 20 % too large, so that creases are clearest at the lowest height that is searched."""
     views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.2)

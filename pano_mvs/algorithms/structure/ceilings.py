@@ -34,8 +34,9 @@ _MOVED_CEILINGS, _FINE_CEILINGS = np.linspace(0.9, 1.1, 11), np.linspace(0.98, 1
 # 0.05 were 1 to 8 % off, and in rooms with textured ceilings, those with a share above 0.15 at most 0.4 %.
 _LEAST_PRECISE = 1 / 15
 # Creases show its height if their mean clarity differs by this much between the heights: in plain boxes without visible
-# creases it differed by at most 0.018, with and without noise, and in rendered houses by 0.25 to 0.5.
-_LEAST_SHOWN = 0.1
+# creases it differed by at most 0.018, with and without noise, in rendered houses by 0.25 to 0.5, and in two groups of a
+# real tour, over all heights, by 0.16 and 0.30.
+_LEAST_SHOWN = 0.05
 # They show that it is wrong if they are clearer at the best height by this share of that difference: at exact heights
 # with clear creases, the share was below 0.002, and where heights were 1.4 % off or more, above 0.03.
 _LEAST_GAIN = 0.01
@@ -47,10 +48,11 @@ _SAME_HEIGHT = 0.02
 
 
 def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
-    """Return a ceiling at the height at which creases of all views are clearest; none if one is known, or no floor is.
+    """Return a ceiling at the height at which creases of all views are clearest.
 
-    A room and a lower, narrower one look much the same in one view, but not in several. `views`: those with sky above
-    are ignored. `planes`: the level planes of the views.
+    None if they show no height, if a ceiling is known, or no floor is. A room and a lower, narrower one look much the
+    same in one view, but not in several. `views`: those with sky above are ignored. `planes`: the level planes of the
+    views.
     """
     lowest = max((view.cam_from_world.center[1] for view in views), default=0.0)
     floors = [plane for plane in planes if plane.normal[1] < 0 and plane.y > lowest]
@@ -63,8 +65,12 @@ def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -
     plane = ScenePlane(-floor.normal, y, 0.0, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=True)
     clarity = _HeightClarity.around(roofed, floor, plane)
     if clarity is None:
-        return [plane]
-    share = clarity.clearest(_CEILINGS / np.median(_CEILINGS))
+        return []
+    shares = _CEILINGS / np.median(_CEILINGS)
+    totals = [clarity.total(share) for share in shares]
+    if np.ptp(totals) < _LEAST_SHOWN:
+        return []
+    share = shares[np.argmax(totals)]
     return [clarity.ceiling_at(clarity.clearest(share * _FINE_CEILINGS))]
 
 
