@@ -34,8 +34,8 @@ _MOVED_CEILINGS, _FINE_CEILINGS = np.linspace(0.9, 1.1, 11), np.linspace(0.98, 1
 # 0.05 were 1 to 8 % off, and in rooms with textured ceilings, those with a share above 0.15 at most 0.4 %.
 _LEAST_PRECISE = 1 / 15
 # Creases show its height if their mean clarity differs by this much between the heights: in plain boxes without visible
-# creases it differed by at most 0.018, with and without noise, in rendered houses by 0.25 to 0.5, and in two groups of a
-# real tour, over all heights, by 0.16 and 0.30.
+# creases it differed by at most 0.018, with and without noise, in rendered houses by 0.25 to 0.5, and in two groups of
+# a real tour, over all heights, by 0.16 and 0.30.
 _LEAST_SHOWN = 0.05
 # They show that it is wrong if they are clearer at the best height by this share of that difference: at exact heights
 # with clear creases, the share was below 0.002, and where heights were 1.4 % off or more, above 0.03.
