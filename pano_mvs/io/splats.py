@@ -49,7 +49,10 @@ class NerfstudioFrame:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> NerfstudioFrame:
         """Return the frame that `to_json` gave."""
-        return TypeAdapter(NerfstudioFrame).validate_python(value)
+        return _FRAME.validate_python(value)
+
+
+_FRAME = TypeAdapter(NerfstudioFrame)
 
 
 @dataclass(frozen=True, eq=False)

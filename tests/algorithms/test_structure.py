@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
-from pano_mvs.algorithms.structure.ceilings import moved_ceilings
+from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_of
 from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.algorithms.structure.skyline import Skyline
-from pano_mvs.algorithms.structure.view import HALF_DIFFERENCE, STEP_RAD, ScenePlane, plane_view
-from pano_mvs.core.arrays import Picture
+from pano_mvs.algorithms.structure.view import HALF_DIFFERENCE, STEP_RAD, PlaneView, ScenePlane, plane_view
+from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import Poses, RangeMap
@@ -28,6 +28,7 @@ from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 SIZE = (128, 256)
 HALF = (3.0, 1.4, 2.5)
 CENTERS = ((0.4, -0.3, 0.2), (-0.6, -0.1, 0.5), (0.1, -0.2, -0.8))
+CREASE_CLARITY = Skyline.crease_clarity
 
 
 class Box:
@@ -122,7 +123,7 @@ def test_walls_without_any_match_stand_where_their_creases_are(turn_deg: float, 
     assert (structure.uncertainties[walls] == OUTLINE_UNCERTAINTY).all()
     result, wall = box.laid(structure), box.walls["0.png"]
     error = np.abs(result.range[wall] / box.truth["0.png"][wall] - 1)
-    assert np.median(error) < 0.015  # creases place the ceiling to 1 % of its height at this size
+    assert np.median(error) < 0.01
     assert np.mean(error < 0.03) > 0.95
     assert (result.confidence[wall] < 128).all()
     confirmed = replace(box.maps["0.png"], confidence=np.full(wall.shape, TRUSTED, np.uint8))
@@ -143,19 +144,77 @@ def test_the_crease_is_below_the_upper_edge_of_a_skirting_board() -> None:
 
 def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     """Its ranges are 6 % too large in all views."""
-    box = Box((256, 512))
+    views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.06)
+    heights = [plane.y for plane in moved_ceilings(views, [floor, ceiling])]
+    assert heights == pytest.approx([HALF[1], -HALF[1]], abs=0.02)
+    assert moved_ceilings(views, [floor, ceiling])[1].uncertainty == 0.02
+    assert moved_ceilings(views, [floor, replace(ceiling, precise_support=1.0)])[1].y == ceiling.y
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+@pytest.mark.parametrize("grey", [True, False], ids=["one grey", "clear creases"])
+def test_a_plain_ceiling_stays_where_creases_do_not_contradict(grey: bool, noise: float) -> None:
+    """Its ranges are exact and weak; no crease shows its height, or all do."""
+    box, random = Box((256, 512)), np.random.default_rng(1)
+    for number, name in enumerate(box.maps):
+        normals = box_range((256, 512), HALF, CENTERS[number])[1]
+        above = normals[..., 1] > 0.5
+        colors = box.pictures[name].astype(np.float64)
+        if grey:
+            colors[above | box.walls[name]] = 200.0
+        colors += random.normal(0.0, noise, colors.shape)
+        box.pictures[name] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+        own = box.maps[name]
+        box.maps[name] = replace(own, confidence=np.where(above, SEEN, own.confidence).astype(np.uint8))
+    structure = box.structure()
+    above = structure.normals_in_world[:, 1] > 0.5
+    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.003)
+    assert (structure.uncertainties[above] < 0.005).all()
+
+
+@pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
+def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, count: int) -> None:
+    box = Box()
+    for name, center in zip(box.maps, CENTERS, strict=True):
+        floor = box_range(SIZE, HALF, center)[1][..., 1] < -0.5
+        box.pictures[name][~floor] = 200 if grey else box.pictures[name][~floor]
+    views, planes = _plain_ceiling(box, 1.0)
+    assert len(supposed_ceiling(views, planes[:1])) == count
+
+
+def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
+    """Its ranges are 20 % too large, so that creases are clearest at the lowest height that is searched."""
+    views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.2)
+    assert moved_ceilings(views, [floor, ceiling])[1] == ceiling
+
+
+def test_a_camera_above_a_tried_ceiling_has_no_creases_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A crease below the camera would be taken for one with the floor."""
+    box, downs = Box(), []
+
+    def crease_clarity(sky: Skyline, distance: FloatArray, height: float) -> FloatArray:
+        downs.extend([height] if height < 0 else [])
+        return CREASE_CLARITY(sky, distance, height)
+
+    monkeypatch.setattr(Skyline, "crease_clarity", crease_clarity)
+    box.cams["0.png"] = Rigid3.from_center(np.eye(3), (0.4, -1.2, 0.2))
+    views, planes = _plain_ceiling(box, 1.0)
+    floors = {round(view.cam_from_world.center[1] - HALF[1], 6) for view in views}
+    supposed_ceiling(views, planes[:1])
+    assert {round(down, 6) for down in downs} == floors
+
+
+def _plain_ceiling(box: Box, share: float) -> tuple[list[PlaneView], list[ScenePlane]]:
+    """Return the views of a box, its precise floor, and a ceiling without precise points at a share of its height."""
     views = [
         plane_view(item, lambda name=name: box.pictures[name], box.cams[name])  # type: ignore[misc]
         for name, item in box.maps.items()
     ]
-    up, uncertainty = -0.2 - 1.06 * (-0.2 + HALF[1]), 0.01
-    floor, ceiling = (
-        ScenePlane(np.array([0.0, sign, 0.0]), sign * y, 5.0, precise, uncertainty=uncertainty, is_level=True)
+    up = -0.2 - share * (-0.2 + HALF[1])
+    return views, [
+        ScenePlane(np.array([0.0, sign, 0.0]), sign * y, 5.0, precise, uncertainty=0.01, is_level=True)
         for sign, y, precise in ((-1.0, HALF[1], 4.0), (1.0, up, 0.1))
-    )
-    heights = [plane.y for plane in moved_ceilings(views, [floor, ceiling])]
-    assert heights == pytest.approx([HALF[1], -HALF[1]], abs=0.02)
-    assert moved_ceilings(views, [floor, replace(ceiling, precise_support=1.0)])[1].y == up
+    ]
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -35,7 +35,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Equivariance]:
     folder, chain = tmp_path_factory.mktemp("turned"), DenseChain("quality", overrides=SMALL)
-    chain.dense.remove("structure")  # it makes no ranges and takes most of the time
+    chain.dense.remove("structure")  # no test here looks at it, and it takes most of the time
     return measure(chain, ScenePlace(scene, folder, SIZE[1]), folder, seed=1)
 
 

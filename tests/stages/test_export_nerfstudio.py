@@ -16,9 +16,10 @@ from scipy.spatial import cKDTree
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.io import splats
 from pano_mvs.io.ply import open_ply_points, read_ply
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.splats import NerfstudioFrames
+from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import NerfstudioFramesParams, NerfstudioParams, nerfstudio, nerfstudio_frames
 from pano_mvs.testing.room import default_room, range_along
@@ -336,3 +337,12 @@ def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:
         params = NerfstudioFramesParams(variants=("equirectangular",))
         made = nerfstudio_frames(given, None, params, Context(np.random.default_rng(0), scratch))
         assert list(made.files) == ["nerfstudio/equirectangular/images/{name}.jpg"]
+
+
+def test_frames_are_read_with_one_schema(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Building a schema takes longer than reading hundreds of frames with it."""
+    turned = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
+    frame = NerfstudioFrame("faces", "a.png", "", "a_depth.png", (64, 64), (32.0, 32.0), turned, radial=0.1)
+    document = json.loads(json.dumps(frame.to_json()))
+    monkeypatch.delattr(splats, "TypeAdapter")
+    assert NerfstudioFrame.from_json(document) == frame
