@@ -179,7 +179,13 @@ def evidence_of(found: VerifiedGroup) -> dict[int, dict[str, float]]:
     pairs count as not measured.
     """
     model, checks = found.model, found.checks
-    rows = camera_evidence(model, checks.shares, checks.expected, joints=measured_joints(model, found.confirmation))
+    rows = camera_evidence(
+        model,
+        checks.shares,
+        checks.expected,
+        joints=measured_joints(model, found.confirmation),
+        contradicting_before=checks.links_contradicting,
+    )
     parts = contradicted_parts(model, checks.shares, more_than=_CONTRADICTED)
     shares = {image: part.share for part in parts for image in part.images}
     return {

@@ -45,6 +45,7 @@ class CameraChecks:
     p_right: dict[int, float] = field(default_factory=dict)  # image position to the probability that its pose is right
     doubts: dict[int, str] = field(default_factory=dict)  # images with a doubtful pose, with the reason
     removed: dict[int, str] = field(default_factory=dict)  # images that were removed from the model, with the reason
+    links_contradicting: float = np.nan  # largest share of the weight of learned pairs that contradicted the cameras
     asked: bool = True  # whether the images were consulted
 
 
@@ -318,7 +319,11 @@ def _believe(
     ambiguity: str = "",
 ) -> None:
     """Find the probability that each camera is right, and the doubts that follow from it."""
-    rows = camera_evidence(model, found.shares, found.expected, joints=joints)
+    rows = camera_evidence(
+        model, found.shares, found.expected, joints=joints, contradicting_before=found.links_contradicting
+    )
+    contradicting = [row["links_contradicting"] for row in rows.values() if np.isfinite(row["links_contradicting"])]
+    found.links_contradicting = max(contradicting, default=found.links_contradicting)
     found.p_right = {image: FITTED.probability(row) for image, row in rows.items()}
     found.doubts = {
         image: reason(FITTED, row, ambiguity=ambiguity)

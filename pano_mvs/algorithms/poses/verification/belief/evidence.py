@@ -25,6 +25,7 @@ def camera_evidence(
     expected: Mapping[int, float],
     *,
     joints: Sequence[Joint] = (),
+    contradicting_before: float = np.nan,
 ) -> dict[int, Row]:
     """Return the evidence for each camera of a model, which is to be measured after all choices were made.
 
@@ -33,6 +34,8 @@ def camera_evidence(
         shares: image position to the share of its texture that other images confirm; NaN where unknown.
         expected: image position to the share that its neighbours suggest.
         joints: of the parts of the model, as far as the images were consulted.
+        contradicting_before: the largest `links_contradicting` of the model with cameras that were left out since then:
+            what contradicted them speaks against those that agree with them, such as copies of a room, as well.
 
     Returns:
         Image position to the name and value of each measurement: `ratio` (share relative to the expected one), `share`,
@@ -46,6 +49,7 @@ def camera_evidence(
     """
     contradicting, repeats = _contradicting_joints(joints), _repeats(model)
     linked, links_contradicting = _links(model)
+    links_contradicting = float(np.fmax(links_contradicting, contradicting_before))
     rows = {}
     for image in sorted(model.cameras):
         share = shares.get(image, np.nan)

@@ -119,6 +119,17 @@ def test_a_camera_without_a_pair_that_agrees_is_not_linked(monkeypatch: pytest.M
     assert np.isnan(linked({}, monkeypatch)[0]).all()
 
 
+def test_what_contradicted_cameras_that_were_left_out_still_speaks_against_the_others() -> None:
+    learned = replace(features_from_bearings(RAYS), learned=len(RAYS))
+    matches = np.stack([np.arange(30)] * 2, axis=1).astype(np.int32)
+    view = replace(view_of(CAMERAS[1] @ CAMERAS[0].inverse(), matches), log10_false_alarms=-300.0)
+    pairs = Pairs({f"{idx}.png": learned for idx in CAMERAS}, {}, compared={(0, 1): view})
+    model = PlacedModel(pairs, {idx: CAMERAS[idx] for idx in (0, 1)}, {})
+    for before in (np.nan, 0.2):
+        rows = camera_evidence(model, NOTHING, NOTHING, contradicting_before=before)
+        assert rows[0]["links_contradicting"] == np.fmax(0.0, before)
+
+
 def test_cameras_without_learned_pairs_have_no_links(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs: dict[Edge, float] = {(0, 1): 5, (1, 2): 4, (2, 3): 6, (3, 4): 6, (4, 5): 6}
     found, _ = linked(pairs, monkeypatch, plain={3, 4, 5})
