@@ -125,8 +125,8 @@ def test_of_two_poses_that_matches_agree_on_the_more_probable_one_counts() -> No
     first, second = (features_from_bearings(one / np.linalg.norm(one, axis=1, keepdims=True)) for one in rays)
     idx = np.stack([np.arange(260)] * 2, axis=1).astype(np.int32)
     plain = verify_pair(first, second, idx, rng=np.random.default_rng(0))
-    learned = (replace(one, learned=len(one)) for one in (first, second))
-    view = verify_pair(*learned, idx, rng=np.random.default_rng(0))
+    one, other = (replace(features, learned=len(features)) for features in (first, second))
+    view = verify_pair(one, other, idx, rng=np.random.default_rng(0))
     assert geodesic_angle(plain.rotation, alike.rotation) < 0.01
     assert view
     assert geodesic_angle(view.rotation, POSE.rotation) < 0.01
