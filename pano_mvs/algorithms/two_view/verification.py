@@ -105,12 +105,12 @@ def verify_pair(
     minimal = SOLVERS[solver]
     tried = [pair.evidence(pose.second_from_first, sample=minimal.sample, models=minimal.models)] if pose else []
     if refine and not learned and not any(tried):
-        tried += pair.upright()
+        tried += _upright(pair)
         tried.sort(key=lambda evidence: (not evidence, evidence.log10_false_alarms))
     if turned.sum() >= max(min_inliers, 0.9 * (tried[0].inliers if tried else 0)):
         return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
     if refine and learned:
-        return pair.most_probable(tried, most=max_alternatives, reason=pose.reason)
+        return _most_probable(pair, tried, most=max_alternatives, reason=pose.reason)
     if not tried:
         return pair.failed(pose.reason)
     best = pair.judged(tried[0])
@@ -120,7 +120,7 @@ def verify_pair(
         return replace(best, log10_false_alarms=alarms).with_alternatives(hypotheses)
     if not (refine and max_alternatives):
         return best
-    poses = pair.distinct(tried[0].pose, most=max_alternatives)
+    poses = _distinct(pair, tried[0].pose, most=max_alternatives)
     costs = facing_costs(poses, p, q, threshold_rad=pair.threshold_rad)
     # Their significance is that of the pair: each was found to be more than chance.
     ranked = [replace(tried[0], pose=poses[idx]) for idx in np.argsort(costs, kind="stable")]
@@ -331,60 +331,6 @@ class _Pair:
         )
         return view, parallax
 
-    def upright(self) -> list[_Evidence]:
-        """Return poses of the pair as of two upright images, for each direction that may be up."""
-        found = []
-        assumed = [*product(self.first.ups, self.second.ups)]
-        for one, other in assumed:
-            level, other_level = (rotation_from_two_vectors(np.array(up), UP) for up in (one, other))
-            for pose in upright_poses(
-                self.p @ level.T, self.q @ other_level.T, rng=self.rng, threshold_rad=self.threshold_rad
-            ):
-                turned = Rigid3(other_level.T @ pose.rotation @ level, other_level.T @ pose.translation)
-                found.append(self.evidence(turned, sample=3, models=4 * len(assumed)))
-        return found
-
-    def distinct(self, pose: Rigid3, *, most: int) -> list[Rigid3]:
-        """Return the pose, or its better twin, and at most `most` others with enough matches of their own."""
-        return distinct_geometries(
-            pose,
-            self.p,
-            self.q,
-            rng=self.rng,
-            threshold_rad=self.threshold_rad,
-            min_inliers=self.min_inliers,
-            most=most,
-        )
-
-    def most_probable(self, found: list[_Evidence], *, most: int, reason: str) -> TwoView:
-        """Return the most probable geometry of a pair of learned matches, with others that would be accepted as well.
-
-        Args:
-            found: the pose with which most matches agree, if any; its runners-up and those as upright images are tried.
-            most: number of others; a pair of which none is accepted keeps as many hypotheses beside the first.
-            reason: why no pose was found.
-        """
-        minimal = SOLVERS["five_point"]
-        tried = [*found, *self.upright()]
-        for best in found:
-            tried += [
-                self.evidence(pose, sample=minimal.sample, models=minimal.models)
-                for pose in self.distinct(best.pose, most=most)
-            ]
-        known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not self.why_open(one)]
-        if not known:
-            return self.judged(found[0]) if found else self.failed(reason)
-        ranked: list[_Evidence] = []
-        for one in sorted(known, key=lambda one: -one.log_odds):
-            if all(are_distinct(one.pose, other.pose) for other in ranked):
-                ranked.append(one)
-        first, *others = [one for one in ranked if one] or ranked
-        views = [self.view(one)[0] for one in others[:most]]
-        if first:
-            return self.view(first)[0].with_alternatives(views)
-        failed = replace(self.judged(first), log10_false_alarms=first.log10_false_alarms)
-        return failed.with_alternatives([self.view(first)[0], *views])
-
     def why_open(self, evidence: _Evidence) -> str:
         """Return a reason if the matches that agree with a pose do not determine it; "" otherwise."""
         view, parallax = self.view(evidence)
@@ -401,6 +347,64 @@ class _Pair:
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
         reason = self.why_open(evidence)
         return self.failed(reason) if reason else self.view(evidence)[0]
+
+
+def _upright(pair: _Pair) -> list[_Evidence]:
+    """Return poses of the pair as of two upright images, for each direction that may be up."""
+    found = []
+    assumed = [*product(pair.first.ups, pair.second.ups)]
+    for one, other in assumed:
+        level, other_level = (rotation_from_two_vectors(np.array(up), UP) for up in (one, other))
+        for pose in upright_poses(
+            pair.p @ level.T, pair.q @ other_level.T, rng=pair.rng, threshold_rad=pair.threshold_rad
+        ):
+            turned = Rigid3(other_level.T @ pose.rotation @ level, other_level.T @ pose.translation)
+            found.append(pair.evidence(turned, sample=3, models=4 * len(assumed)))
+    return found
+
+
+def _distinct(pair: _Pair, pose: Rigid3, *, most: int) -> list[Rigid3]:
+    """Return the pose, or its better twin, and at most `most` others with enough matches of their own."""
+    return distinct_geometries(
+        pose,
+        pair.p,
+        pair.q,
+        rng=pair.rng,
+        threshold_rad=pair.threshold_rad,
+        min_inliers=pair.min_inliers,
+        most=most,
+    )
+
+
+def _most_probable(pair: _Pair, found: list[_Evidence], *, most: int, reason: str) -> TwoView:
+    """Return the most probable geometry of a pair of learned matches, with others that would be accepted as well.
+
+    Args:
+        pair: its matches.
+        found: the pose with which most matches agree, if any; its runners-up and those as upright images are tried.
+        most: number of others; a pair of which none is accepted keeps as many hypotheses beside the first.
+        reason: why no pose was found.
+    """
+    minimal = SOLVERS["five_point"]
+    tried = [*found, *_upright(pair)]
+    for best in found:
+        tried += [
+            pair.evidence(pose, sample=minimal.sample, models=minimal.models)
+            for pose in _distinct(pair, best.pose, most=most)
+        ]
+    known = [one for one in tried if np.isfinite(one.log10_false_alarms) and not pair.why_open(one)]
+    if not known:
+        return pair.judged(found[0]) if found else pair.failed(reason)
+    ranked: list[_Evidence] = []
+    for one in sorted(known, key=lambda one: -one.log_odds):
+        if all(are_distinct(one.pose, other.pose) for other in ranked):
+            ranked.append(one)
+    first, *others = [one for one in ranked if one] or ranked
+    views = [pair.view(one)[0] for one in others[:most]]
+    if first:
+        return pair.view(first)[0].with_alternatives(views)
+    failed = replace(pair.judged(first), log10_false_alarms=first.log10_false_alarms)
+    return failed.with_alternatives([pair.view(first)[0], *views])
 
 
 def _from_one_place(
