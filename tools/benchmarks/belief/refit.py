@@ -4,9 +4,9 @@ Run it with `python -m tools benchmarks belief.refit FIT --fresh FRESH`.
 
 FIT and FRESH are files of `tools.benchmarks.belief.collect` or `belief.tours`, or tables: docs/benchmarks.md is about
 `evidence.csv`, generated captures, and `learned.csv`, tours with learned matches; both are fitted. `--table FILE`
-writes all of FIT into one. The script prints, for all families and for each, how many right cameras
-are doubted and how many wrong ones are not, by `poses.verify` when the captures were measured and by the model, and how
-many captures without a doubt hold a wrong camera.
+writes all of FIT into one. The script prints, for all families and for each, how many right cameras are doubted and how
+many wrong ones are not, by `poses.verify` when the captures were measured and by the model, and how many captures
+without a doubt hold a wrong camera.
 Cameras of FIT are judged by a model without their kind of place, cameras of FRESH by the model of all of FIT. With
 `--coefficients pano_mvs/algorithms/poses/verification/belief/coefficients.py`, the model replaces the one in use;
 `--picture FILE` draws the reliability diagram.

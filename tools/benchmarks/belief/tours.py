@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("tours", nargs="+", type=Path, metavar="DIR")
     parser.add_argument("--runs", type=Path, required=True, metavar="OUT", help="results of poses.tours.measure")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     given = parser.parse_args()
     for tour in given.tours:
         features, views = learned_views(given.runs / tour.name, merged=True)

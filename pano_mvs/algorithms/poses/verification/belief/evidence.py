@@ -149,8 +149,8 @@ def _contradicting_joints(joints: Sequence[Joint]) -> dict[int, float]:
 def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
     """Return what learned pairs say for the weakest cut between each camera that has any and the larger part of these.
 
-    Also returned is the share of their weight that does not agree with the cameras, as if that of one pair more did;
-    NaN without any.
+    Also returned is the share of their weight that does not agree with the cameras, as if one more pair did agree; NaN
+    without any.
     """
     weights = {}
     for edge, weight in model.pairs.learned_weights.items():
@@ -170,7 +170,7 @@ def _links(model: PlacedModel) -> tuple[dict[int, float], float]:
         for side in (part, ~part):
             if 2 * side.sum() <= len(images):
                 found[side] = np.minimum(found[side], cut)
-    against = -np.minimum(values, 0.0).sum()
+    against = np.maximum(-values, 0.0).sum()
     return dict(zip(images, found.tolist(), strict=True)), float(against / (np.abs(values).sum() + 1.0))
 
 

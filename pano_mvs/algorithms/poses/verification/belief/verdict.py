@@ -15,7 +15,7 @@ MISS_COST = 5.0
 _CLOSER, _BETWEEN = "take panoramas closer to one another there", "take panoramas in between"
 _Row = Mapping[str, float]
 
-# For each measurement: what it says, what is said if it is missing ("" if that needs no excuse), and what to do.
+# For each measurement: what it says, what is said if it is missing ("" for nothing), and what to do.
 _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
     "ratio": (
         lambda row: (
@@ -76,7 +76,7 @@ _SAID: dict[str, tuple[Callable[[_Row], str], str, str]] = {
     ),
     "links_contradicting": (
         lambda row: (
-            f"{_percent(row['links_contradicting'])} of the weight of the group's pairs contradicts its cameras"
+            f"{_percent(row['links_contradicting'])} of the weight of the group's learned pairs contradicts its cameras"
         ),
         "",
         _BETWEEN,
