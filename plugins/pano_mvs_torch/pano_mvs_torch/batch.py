@@ -46,4 +46,4 @@ def batch_for(name: str) -> Batch:
     if (device.index or 0) >= count:
         found = f"{count} CUDA devices" if count else "no CUDA device"
         raise UsageError(f"the sweep backend 'torch' found {found}, so not {name!r}: use `device: auto` or `cpu`")
-    return Batch(device, costs=1 << 28, samples=1 << 25)
+    return Batch(device, costs=1 << 28, samples=1 << 23)

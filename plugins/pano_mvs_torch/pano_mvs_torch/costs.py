@@ -49,7 +49,11 @@ class BandCost:
             "sad_gradient": self._sad_gradient,
         }
         self._cost = kinds[settings.cost]
-        self._places = list(self.windows.places())
+        self._places = _places(self.windows, width).to(device)
+        reach = torch.from_numpy(self.boxes.columns[:, -1:]).to(device)
+        columns = torch.arange(self.boxes.margin + 1, self.boxes.margin + 1 + width, device=device)
+        lines = (width + 2 * self.boxes.margin + 2) * torch.arange(last - first, device=device)[:, None]
+        self._ends = (lines + columns - reach - 1).ravel(), (lines + columns + reach).ravel()
         self._signs = list(self._signs_of(self.reference[0])) if settings.cost in ("census", "census_gradient") else []
 
     def of(self, warped: Tensor) -> Tensor:
@@ -85,13 +89,9 @@ class BandCost:
         """Yield for each place of the window where the pixel there is brighter than the centre, (…, rows, W) 0 or 1."""
         bytes_ = pictures.to(torch.uint8)
         centre = self._inner(bytes_)
-        padded = _wrapped(bytes_, self.windows.margin)
-        for place in range((2 * self.compare_radius + 1) ** 2):
-            brighter = torch.empty(centre.shape, dtype=torch.bool, device=pictures.device)
-            for rows, places in self._places:
-                lines, columns = places[place]
-                torch.gt(padded[..., lines, columns], centre[..., rows, :], out=brighter[..., rows, :])
-            yield brighter.view(torch.uint8)
+        padded = _wrapped(bytes_, self.windows.margin).flatten(-2)
+        for place in self._places:
+            yield (padded.index_select(-1, place).view(centre.shape) > centre).view(torch.uint8)
 
     def _sad(self, warped: Tensor) -> Tensor:
         return self._box_mean(self._absolute(warped))
@@ -117,10 +117,9 @@ class BandCost:
             difference = self.reference[color] - warped[..., color]
             above, below = (slice(radius + step, rows_there - radius + step) for step in (-1, 1))
             one = (difference[..., below, :] - difference[..., above, :]).abs_()
-            padded = _wrapped(difference, self.windows.margin)
-            for rows, places in self._places:
-                (lines, left), (_, right) = places[middle - 1], places[middle + 1]
-                one[..., rows, :] += (padded[..., lines, right] - padded[..., lines, left]).abs_()
+            padded = _wrapped(difference, self.windows.margin).flatten(-2)
+            left, right = (padded.index_select(-1, self._places[middle + step]) for step in (-1, 1))
+            one += right.sub_(left).abs_().view(one.shape)
             gradient = one if gradient is None else gradient.add_(one)
         assert gradient is not None
         return gradient
@@ -159,16 +158,22 @@ class BandCost:
         if self.box_radius == 0:
             return summed
         margin = self.boxes.margin + 1
-        running = _wrapped(summed, margin).cumsum(dim=-1, dtype=summed.dtype)
-        width = costs.shape[-1]
-        for lines, reach in self.boxes.reaches():
-            right, left = margin + reach, margin - reach - 1
-            torch.sub(
-                running[..., lines, right : right + width],
-                running[..., lines, left : left + width],
-                out=summed[..., lines, :],
-            )
-        return summed
+        running = _wrapped(summed, margin).cumsum(dim=-1, dtype=summed.dtype).flatten(-2)
+        left, right = (running.index_select(-1, end) for end in self._ends)
+        return right.sub_(left).view(summed.shape)
+
+
+def _places(windows: WindowBands, width: int) -> Tensor:
+    """Return where in padded pictures, each as one row, lies each place of the windows around all pixels, (N, M)."""
+    rows = len(windows.columns)
+    stride = width + 2 * windows.margin
+    corner = stride * np.arange(rows)[:, None] + windows.margin + np.arange(width)
+    places = [
+        (corner + stride * row + column[:, None]).ravel()
+        for row in range(2 * windows.radius + 1)
+        for column in windows.columns.T
+    ]
+    return torch.from_numpy(np.stack(places))
 
 
 def _wrapped(pictures: Tensor, margin: int) -> Tensor:
