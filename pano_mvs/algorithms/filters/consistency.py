@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty
+from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty, probability_within
 from pano_mvs.algorithms.ranges.agreement import Comparison, compare_with_sources
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -95,8 +95,6 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
         yield within[np.argsort(np.linalg.norm(places[within] - place, axis=1), kind="stable")[:count]]
 
 
-# Near a step like this, in ln range, it is uncertain to which side a pixel belongs.
-_DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
 # Of the sources that can compare a pixel, these must contradict it in one direction for it to count as contradicted.
 _ONE_WAY, _MIN_JUDGES = 0.75, 2
 
@@ -156,10 +154,9 @@ def checked_with_agreement(
     the sum S of the supports and M² = Σ support · m², a pixel is consistent if `min_views` sources agree, S ≥
     `min_support`, and a change by `max_relative_error` moves it by at least `min_motion_px`: μ = M max_relative_error.
 
-    Confidence of a pixel that was seen and is consistent: 128 + ⌊127 (1 − 2⁻ˢ) μ² / (μ² + μ₀²) (1 + D₀² / (D² + D₀²)) /
-    2⌋. μ₀ is a fifth of a pixel, about the accuracy of ranges; D is the step ln(largest / smallest range) within two
-    pixels, near which a surface easily gets its neighbour's range in all views alike, and D₀ is a tenth. Otherwise the
-    pixel is weak and its confidence is clipped to 64–127; filled pixels keep theirs.
+    Confidence of a pixel that was seen and is consistent: 128 + ⌊127 p⌋, where p is the probability that its range is
+    right within `max_relative_error` (`probability_within` of its `confirmed_uncertainty`). Otherwise the pixel is weak
+    and its confidence is clipped to 64–127; filled pixels keep theirs.
 
     Args:
         reference: (H, W) range map, full sphere; its normals are kept.
@@ -191,13 +188,11 @@ def checked_with_agreement(
         min_motion_rad=min_motion_px / px_per_rad,
         min_views=min_views,
     )
-    motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
     step = _step_around(reference.range)
-    # Accuracy of range maps, as a fraction of a pixel.
-    grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + 0.2**2)
-    grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
+    uncertainty = confirmed_uncertainty(consistent, reference.range, comparison, step=step)
     low, high = CONSISTENT_CONFIDENCE
-    graded = np.floor(low + (high - low) * grade).astype(np.uint8)
+    probability = probability_within(uncertainty.astype(np.float64), max_relative_error)
+    graded = np.floor(low + (high - low) * probability).astype(np.uint8)
     weak = np.clip(reference.confidence, *WEAK_CONFIDENCE)
     seen = reference.confidence >= WEAK_CONFIDENCE[0]
     confidence = np.where(seen, np.where(consistent, graded, weak), reference.confidence)
@@ -205,14 +200,6 @@ def checked_with_agreement(
     if remove_inconsistent and sources:
         removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
-    uncertainty = confirmed_uncertainty(
-        consistent,
-        ranges,
-        support=comparison.support,
-        squared_error=comparison.squared_error * px_per_rad**2,
-        motion=px_per_rad * np.sqrt(comparison.motion),
-        step=step,
-    )
     confidence[np.isnan(ranges)] = 0
     uncertainty[np.isnan(ranges)] = np.nan
     return RangeMap(ranges, confidence, reference.normals_in_cam, uncertainty, reference.sky), _agreement(
@@ -269,7 +256,7 @@ def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
 
 def _step_around(ranges: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return ln(largest / smallest valid range) within two pixels, (H, W); 0 without valid pixels."""
-    radius = _DOUBTFUL_RADIUS
+    radius = 2
     logs = pad_panorama(np.log(ranges), radius)
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     nearest = cv2.erode(np.where(np.isnan(logs), np.float32(np.inf), logs), window)

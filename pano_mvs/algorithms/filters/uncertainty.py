@@ -1,9 +1,9 @@
 """Standard deviations of ranges, from parallax and from the agreement between views.
 
 A match is precise to some angle, and the parallax in the sources converts that angle into a relative error of the
-range. The angle is not known, but it shows: where matches are poor, ranges of different views disagree, and surfaces
-are rough. The factors were fitted to synthetic places with known ranges, leaving out each place in turn, and checked
-on rendered ones; `tools/benchmarks/uncertainty.py` measures them.
+range. The angle is not known, but it shows: where matches are poor, ranges of different views disagree, surfaces are
+rough, and few pixels around are confirmed. `tools/benchmarks/uncertainty.py` fits the exponents to places with known
+ranges, leaving out each place in turn.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.panoramas import box_sum
+from pano_mvs.algorithms.ranges.agreement import Comparison
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -19,54 +20,70 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 UNCONFIRMED_UNCERTAINTY = 0.15
 """Relative standard deviation of ranges that no other view confirms: weak, moved and filled ones."""
 
-# The one factor that was fitted: errors per rms reprojection error. Views share errors, so it is larger than 1.
-_SCALE = 5.4
-_PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS = 4, 2, 8
-# Smaller reprojection errors, and less roughness, are chance; both in pixels.
-_MIN_ERROR_PX, _MIN_ROUGH_PX = 0.02, 0.01
-# Near steps like this, in ln range, a pixel may have the range of the other surface.
-_STEP, _STEP_WEIGHT, _STEP_POWER = 0.1, 5.0, 1 / 3
 LEAST_UNCERTAINTY, MOST_UNCERTAINTY = 0.0005, 0.5
+
+FACTOR = 1.953
+EXPONENTS = {"motion": -0.85, "error": 0.69, "roughness": 0.3, "steps": 0.65, "confirmed": -1.56, "opposed": 0.45}
+"""Fitted by `python -m tools benchmarks uncertainty`: of what `error_factors` returns."""
+
+
+def probability_within(sigma: FloatArray, error: float) -> FloatArray:
+    """Return the probability that a range with a relative standard deviation is within a relative error.
+
+    Errors have long tails: half of them are below 0.3 σ, 95 % below 2 σ (fitted like σ; errors of 1 to 5 %).
+    """
+    return np.asarray(error / (error + 0.3 * sigma))
 
 
 def confirmed_uncertainty(
-    consistent: Mask,
-    ranges: NDArray[np.float32],
-    *,
-    support: FloatArray,
-    squared_error: FloatArray,
-    motion: FloatArray,
-    step: NDArray[np.float32],
+    consistent: Mask, ranges: NDArray[np.float32], comparison: Comparison, *, step: NDArray[np.float32]
 ) -> NDArray[np.float16]:
     """Return the relative standard deviation of ranges, (H, W); `UNCONFIRMED_UNCERTAINTY` where they are not confirmed.
 
-    σ = 5.4 e (ρ M)^¼ (1 + 5 d)^⅓ / M. M is the parallax: the motion of the pixel in its sources per relative change of
-    its range. e is the rms reprojection error of the confirmed pixels within 4 pixels, weighted by their support. ρ is
-    the roughness of the surface: the rms relative deviation of the confirmed ranges within 2 pixels from their means,
-    so that ρ M is in pixels. d is the share of pixels at steps of the range within 8 pixels.
+    It is half of what 95 % of the errors are below: a product of powers of `error_factors`.
 
-    `consistent`: (H, W) pixels that other views confirm. `ranges`: (H, W), finite where consistent. `support`: (H, W)
-    sum of the supports of the sources. `squared_error`: (H, W) sum of supports times squared reprojection errors, in
-    pixels². `motion`: (H, W) M in pixels. `step`: (H, W) ln(largest / smallest range) around the pixel.
+    `consistent`: (H, W) pixels that other views confirm. `ranges`: (H, W), finite where consistent. `comparison`: of
+    each pixel with its sources. `step`: (H, W) ln(largest / smallest range) around the pixel.
     """
-    near, rough, wide = (
-        max(1, min(radius, len(ranges) // 2 - 1)) for radius in (_PRECISION_RADIUS, _ROUGH_RADIUS, _STEP_RADIUS)
+    factors = error_factors(consistent, ranges, comparison, step=step)
+    sigma = FACTOR * np.prod([factors[name] ** power for name, power in EXPONENTS.items()], axis=0)
+    return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(
+        np.float16
     )
-    sigma = box_sum(np.where(consistent, squared_error, 0), near)
-    sigma /= np.maximum(box_sum(np.where(consistent, support, 0), near), 1e-9)
-    sigma = np.maximum(np.sqrt(np.maximum(sigma, 0)), _MIN_ERROR_PX)
-    motion = np.maximum(motion, 1e-9)
+
+
+def error_factors(
+    consistent: Mask, ranges: NDArray[np.float32], comparison: Comparison, *, step: NDArray[np.float32]
+) -> dict[str, FloatArray]:
+    """Return what errors of confirmed ranges depend on, name to (H, W), all positive.
+
+    `motion`: M, the motion of the pixel in its sources per relative change of its range, in pixels. `error`: the rms
+    reprojection error of the confirmed pixels within 4 pixels, weighted by their support, in pixels. `roughness`: the
+    rms relative deviation of the confirmed ranges within 2 pixels from their means, times M, in pixels. `steps`: 1 + 5
+    times the share of pixels within 8 pixels near which the range steps by a tenth, where a pixel may have the range of
+    the other surface. `confirmed`: the share of pixels within 4 pixels that are confirmed. `opposed`: 1 + the number of
+    sources that see through the pixel, or something before it.
+    """
+    near, rough, wide = (max(1, min(radius, len(ranges) // 2 - 1)) for radius in (4, 2, 8))
+    px_per_rad = ranges.shape[1] / (2 * np.pi)
+    motion = np.maximum(px_per_rad * np.sqrt(comparison.motion), 1e-6)
+    squares, support = (
+        box_sum(np.where(consistent, values, 0), near) for values in (comparison.squared_error, comparison.support)
+    )
     # The rms relative deviation of 1/range from the mean around it, of the consistent pixels of a window.
     inverse = np.where(consistent, 1 / np.where(consistent, ranges, 1).astype(np.float64), 0)
     count = np.maximum(box_sum(consistent.astype(np.float64), rough), 1)
     mean = np.maximum(box_sum(inverse, rough) / count, 1e-12)
     deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), rough) / count
-    sigma *= np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, _MIN_ROUGH_PX) ** 0.25  # errors grow slowly with it
-    sigma *= (1 + _STEP_WEIGHT * _share(step > _STEP, wide)) ** _STEP_POWER
-    sigma *= _SCALE / motion
-    return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(
-        np.float16
-    )
+    # Smaller reprojection errors, and less roughness, are chance.
+    return {
+        "motion": motion,
+        "error": np.maximum(px_per_rad * np.sqrt(np.maximum(squares / np.maximum(support, 1e-9), 0)), 0.02),
+        "roughness": np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, 0.01),
+        "steps": 1 + 5 * _share(step > 0.1, wide),
+        "confirmed": np.maximum(_share(consistent, near), 0.05),
+        "opposed": 1.0 + comparison.contradicting + comparison.hiding,
+    }
 
 
 def _share(part: Mask, radius: int) -> FloatArray:
