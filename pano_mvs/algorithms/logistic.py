@@ -61,3 +61,14 @@ class Model:
     def probability(self, row: Mapping[str, float]) -> float:
         """Return the probability for one row of measurements."""
         return float(1 / (1 + np.exp(-self.intercept - sum(self.contributions(row).values()))))
+
+    def log_odds(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the logarithms of the odds (N,) for columns (N,) of measurements, NaN where missing."""
+        found = np.full(len(next(iter(columns.values()))), self.intercept)
+        for name, term in self.terms.items():
+            found += term.contributions(columns[name])
+        return found
+
+    def probabilities(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the probabilities (N,) for columns (N,) of measurements, NaN where missing."""
+        return np.asarray(1 / (1 + np.exp(-self.log_odds(columns))))

@@ -46,6 +46,7 @@ from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
+from pano_mvs.scene.upright import WORLD_UP, states_y_down
 
 
 def bytes_per_pixel(own: int, *, each_source: int = 0) -> Callable[[Params, Mapping[str, Any]], int]:
@@ -58,7 +59,6 @@ def bytes_per_pixel(own: int, *, each_source: int = 0) -> Callable[[Params, Mapp
     return needed
 
 
-@params_from(sky_pixels, own_last=True)
 class SkyParams(Params):
     """Settings of filters.sky."""
 
@@ -72,10 +72,14 @@ def sky(
     pose: Each[Pose],
     sources: Near[Panorama],
     source_poses: Near[Pose],
+    poses: One[Poses],
     params: SkyParams,
     ctx: Context,
 ) -> RangeMap:
-    """Find the sky and remove its ranges; use it after filters.consistency. No later stage gives the sky a range."""
+    """Find the sky and remove its ranges; use it after filters.consistency. No later stage gives the sky a range.
+
+    Ranges that other views confirm stay where a parallax shows them, and below the horizon after poses.level.
+    """
     require_one_group(pose, source_poses)
     result = range_map
     if params.enabled:
@@ -87,8 +91,7 @@ def sky(
             source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for _, other in used],
             valid=image.load_mask(),
             source_valid=[source.load_mask() for source, _ in used],
-            rng=ctx.rng,
-            **arguments_from(sky_pixels, params),
+            up=pose.cam_from_world.rotation @ WORLD_UP if states_y_down(poses.frame) else None,
         )
         found = found if range_map.sky is None else found | range_map.sky
         result = with_ranges(replace(range_map, sky=found), range_map.range)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.masks import sky
 from pano_mvs.algorithms.masks.areas import area_labels, border_shares, share_of_sphere
-from pano_mvs.algorithms.masks.sky import confirmed_parts, sharpened_sky, sky_colors, sky_pixels
-from pano_mvs.algorithms.masks.sky_comparison import compare_with_source, errors_of_area
+from pano_mvs.algorithms.masks.sky import sharpened_sky, sky_colors, sky_pixels, view_of
+from pano_mvs.algorithms.masks.sky_features import View, area_features
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.testing.room import Room, default_room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
 from tests.synthetic.paints import BRICK, LEAVES, OAK, STONE
@@ -69,7 +71,11 @@ def measured(true_range: NDArray[np.float32], *, confirmed: float = 0.9) -> Rang
 
 
 def found_in(
-    views: Views, *, range_map: RangeMap | None = None, valid: NDArray[np.bool_] | None = None
+    views: Views,
+    *,
+    range_map: RangeMap | None = None,
+    valid: NDArray[np.bool_] | None = None,
+    up: NDArray[np.float64] | None = None,
 ) -> NDArray[np.bool_]:
     pictures, ranges, poses = views
     everything = np.ones(SIZE_HW, np.bool_)
@@ -80,7 +86,7 @@ def found_in(
         source_from_reference=[pose @ poses[0].inverse() for pose in poses[1:]],
         valid=everything if valid is None else valid,
         source_valid=[everything] * 3,
-        rng=np.random.default_rng(0),
+        up=up,
     )
 
 
@@ -121,16 +127,18 @@ def test_rooms_have_no_sky(gain: float) -> None:
     assert not found_in(views, range_map=measured(views[1][0], confirmed=0.33)).any()
 
 
-def test_parts_of_the_sky_that_others_confirm_are_surfaces() -> None:
-    """A floor and a part of it that reaches up to the sky; single confirmed ranges leave the sky as it is."""
-    sky, floor = np.zeros(SIZE_HW, np.bool_), np.zeros(SIZE_HW, np.bool_)
-    sky[10:50] = True
-    floor[90:110, 20:80] = floor[30:60, 100:140] = True
-    share = np.where(floor, 0.9, 0.08)
-    confirmed = np.random.default_rng(0).random(SIZE_HW) < share
-    surface = confirmed_parts(sky | floor, confirmed)
-    assert AREA[surface & floor].sum() > 0.95 * AREA[floor].sum()
-    assert AREA[surface & ~floor].sum() < 0.05 * AREA[sky].sum()  # beside the floor
+def test_ranges_that_others_confirm_stay_whatever_the_model_says(blue: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that the colours show under a parallax, and all of them below the horizon, if it is known."""
+    monkeypatch.setattr(sky, "judged_areas", lambda view, models: (view.valid, []))
+    monkeypatch.setattr(sky, "sharpened_sky", lambda found, colors, picture: found)
+    range_map, ground = measured(blue[1][0]), blue[1][0] < 60
+    confirmed = range_map.confidence >= CONSISTENT_CONFIDENCE[0]
+    up = blue[2][0].rotation @ (0.0, -1.0, 0.0)
+    anywhere, level = found_in(blue, range_map=range_map), found_in(blue, range_map=range_map, up=up)
+    below = ray_grid(SIZE_HW) @ up < 0
+    assert AREA[anywhere & ground & confirmed].sum() < 0.5 * AREA[ground & confirmed].sum()
+    assert not level[below & confirmed].any()
+    np.testing.assert_array_equal(level[~below], anywhere[~below])
 
 
 @pytest.mark.slow
@@ -154,7 +162,6 @@ def test_the_sky_is_found_through_windows_and_walls_stay(shade: tuple[float, flo
         source_from_reference=[scene.poses[idx] @ scene.poses[1].inverse() for idx in (0, 2)],
         valid=everything,
         source_valid=[everything] * 2,
-        rng=np.random.default_rng(0),
     )
     area = np.broadcast_to(pixel_solid_angle(size)[:, None], size)
     if shade[0] < 1:
@@ -184,7 +191,7 @@ def test_the_sky_rolls_with_the_picture(blue: Views) -> None:
 
 def test_sizes_must_agree(blue: Views) -> None:
     pictures, ranges, poses = blue
-    valid, rng = np.ones(SIZE_HW, np.bool_), np.random.default_rng(0)
+    valid = np.ones(SIZE_HW, np.bool_)
     for range_map, source, what in (
         (measured(ranges[0][:64]), pictures[1:2], "its ranges are"),
         (measured(ranges[0]), [], "one or more sources"),
@@ -197,34 +204,43 @@ def test_sizes_must_agree(blue: Views) -> None:
                 source_from_reference=poses[1:2],
                 valid=valid,
                 source_valid=[valid],
-                rng=rng,
             )
 
 
+def seen(views: Views, *, source_valid: NDArray[np.bool_]) -> View:
+    """Return the first view with the second one as its source."""
+    pictures, ranges, poses = views
+    known = RangeMap(ranges[0], np.full(SIZE_HW, 200, np.uint8))
+    source = (pictures[1], source_valid, poses[1] @ poses[0].inverse())
+    return view_of(known, pictures[0], np.ones(SIZE_HW, np.bool_), sources=[source])
+
+
 def test_walls_disagree_at_infinity_and_agree_at_their_range() -> None:
-    pictures, ranges, poses = views_of(default_room(0, "weak"))
-    comparison = compare_with_source(
-        pictures[0],
-        ranges[0],
-        pictures[1],
-        source_valid=np.ones(SIZE_HW, np.bool_),
-        source_from_reference=poses[1] @ poses[0].inverse(),
-    )
-    at_infinity, at_range = errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison])
-    assert at_range < 2
-    assert at_infinity > 3 * at_range
+    view = seen(views_of(default_room(0, "weak")), source_valid=np.ones(SIZE_HW, np.bool_))
+    far, near = (np.nanmedian(each) for each in view.errors)
+    assert near < 2
+    assert far > 3 * near
+    measures = area_features(view, np.zeros(SIZE_HW, np.int64))
+    assert measures["edge_prefers"] < -0.5 or np.isnan(measures["edge_prefers"])
+    assert measures["confirmed"] > 0.9
 
 
 def test_masked_sources_say_nothing(blue: Views) -> None:
-    pictures, ranges, poses = blue
-    comparison = compare_with_source(
-        pictures[0],
-        ranges[0],
-        pictures[1],
-        source_valid=np.zeros(SIZE_HW, np.bool_),
-        source_from_reference=poses[1] @ poses[0].inverse(),
-    )
-    assert errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison]) == (float("inf"), float("inf"))
+    view = seen(blue, source_valid=np.zeros(SIZE_HW, np.bool_))
+    assert np.isnan(view.errors).all()
+    measures = area_features(view, (view.heights > 2).astype(np.int64))
+    for name in ("edge_prefers", "behind"):
+        assert np.isnan(measures[name]).all()
+
+
+def test_measures_of_an_area_do_not_depend_on_the_others(blue: Views) -> None:
+    view = seen(blue, source_valid=np.ones(SIZE_HW, np.bool_))
+    first, second = np.full(SIZE_HW, -1), np.full(SIZE_HW, -1)
+    first[20:40, 30:90] = first[90:110, 100:200] = second[90:110, 100:200] = 0
+    first[90:110, 100:200] = 1
+    both, alone = area_features(view, first), area_features(view, second)
+    for name, values in alone.items():
+        np.testing.assert_allclose(both[name][1], values[0], err_msg=name)
 
 
 def test_colors_of_the_sky_are_known_beyond_the_seeds() -> None:

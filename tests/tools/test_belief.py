@@ -26,7 +26,6 @@ from tools.benchmarks.belief.fitting import (
     calibration_error,
     fit,
     left_out,
-    probabilities,
     read_table,
     write_table,
 )
@@ -74,8 +73,8 @@ def test_a_table_is_the_same_from_its_file(table: Path, tmp_path: Path) -> None:
 
 def test_the_stored_evidence_is_calibrated_and_says_more_than_the_rules() -> None:
     cameras = decidable(read([TABLE, LEARNED]))
-    again = probabilities(fit(cameras), cameras)
-    np.testing.assert_allclose(probabilities(FITTED, cameras), again, atol=0.01)
+    again = fit(cameras).probabilities(cameras.columns)
+    np.testing.assert_allclose(FITTED.probabilities(cameras.columns), again, atol=0.01)
     plain = decidable(read_table(TABLE))
     found = left_out(plain)
     assert calibration_error(found, plain.right) < 0.03
@@ -95,7 +94,7 @@ def test_tours_that_were_left_out_are_judged_better_with_their_links_than_withou
         for some in np.array_split(np.unique(tours.place), 4):
             mine = np.isin(tours.place, some)
             model = fit(cameras[~np.isin(cameras.place, some)], signs=signs)
-            found[mine] = probabilities(model, tours[mine])
+            found[mine] = model.probabilities(tours[mine].columns)
         return Outcome.of(tours.right, doubted(found))
 
     links = {"linked", "links_contradicting"}

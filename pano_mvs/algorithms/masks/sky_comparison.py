@@ -15,10 +15,6 @@ from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, sample_panorama
 
 Colors = NDArray[np.float32]
 
-# Below this parallax, infinity and the range look the same.
-_MIN_PARALLAX_PX = 1.0
-_MIN_PIXELS = 20
-
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
@@ -67,48 +63,6 @@ def _sum(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors[..., 0] + vectors[..., 1] + vectors[..., 2])
 
 
-def errors_of_area(picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison]) -> tuple[float, float]:
-    """Return the median colour differences, in grey levels, of an area at infinity and at its ranges.
-
-    Each is the mean over the better half of the sources, after a factor per channel. Both come from pixels whose
-    ranges have parallax, if there are some; otherwise the second one is infinite. Both are infinite if no source sees
-    the area.
-    """
-    own = mean_around(picture)
-    found: tuple[list[float], list[float]] = ([], [])
-    for source in comparisons:
-        seen = area & np.isfinite(source.at_infinity[..., 0])
-        ranged = seen & (source.parallax_px > _MIN_PARALLAX_PX) & np.isfinite(source.at_range[..., 0])
-        if ranged.sum() >= _MIN_PIXELS:
-            found[0].append(_median_error(own[ranged], source.at_infinity[ranged]))
-            found[1].append(_median_error(own[ranged], source.at_range[ranged]))
-        elif seen.sum() >= _MIN_PIXELS:
-            found[0].append(_median_error(own[seen], source.at_infinity[seen]))
-    return _better_half(found[0]), _better_half(found[1])
-
-
-def pixel_errors(
-    picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison], *, area_at_infinity: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the colour differences, (H, W) in grey levels, at infinity and at the ranges.
-
-    Each is the least of all sources, since others may be occluded. Infinite without a source, or without a range.
-
-    `picture`: (H, W, 3) uint8, the reference. `area`: (H, W), the pixels that give the factor of each channel.
-    `comparisons`: with the sources. `area_at_infinity`: whether these pixels are infinitely far away, or at their
-    ranges.
-    """
-    own = mean_around(picture)
-    errors = []
-    for source in comparisons:
-        known = source.at_infinity if area_at_infinity else source.at_range
-        seen = area & np.isfinite(known[..., 0])
-        gain = _gain(own[seen], known[seen]) if seen.any() else np.ones(3, np.float32)
-        errors.append([largest_channel(np.abs(other / gain - own)) for other in (source.at_infinity, source.at_range)])
-    least = np.nan_to_num(np.array(errors, np.float32), nan=np.inf).min(axis=0)
-    return least[0], least[1]
-
-
 def source_errors(
     picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -127,13 +81,5 @@ def source_errors(
     return found[:, 0], found[:, 1]
 
 
-def _median_error(own: Colors, other: Colors) -> float:
-    return float(np.median(largest_channel(np.abs(other / _gain(own, other) - own))))
-
-
 def _gain(own: Colors, other: Colors) -> NDArray[np.float32]:
     return np.asarray(np.median((other + DARK_LEVEL) / (own + DARK_LEVEL), axis=0), np.float32)
-
-
-def _better_half(errors: list[float]) -> float:
-    return float(np.mean(sorted(errors)[: (len(errors) + 1) // 2])) if errors else float("inf")

@@ -205,20 +205,12 @@ def quantile_knots(
     return tuple(distinct)
 
 
-def probabilities(model: Model, cameras: Cameras) -> FloatArray:
-    """Return the probability of each camera, (N,)."""
-    logit = np.full(len(cameras.right), model.intercept)
-    for name, term in model.terms.items():
-        logit += term.contributions(cameras.columns[name])
-    return np.asarray(1 / (1 + np.exp(-logit)))
-
-
 def left_out(cameras: Cameras, *, penalty: float = PENALTY, signs: Mapping[str, int] = SIGNS) -> FloatArray:
     """Return the probability of each camera by the model that was fitted to all other kinds of places, (N,)."""
     found = np.full(len(cameras.right), np.nan)
     for place in np.unique(cameras.place):
         mine = cameras.place == place
-        found[mine] = probabilities(fit(cameras[~mine], penalty=penalty, signs=signs), cameras[mine])
+        found[mine] = fit(cameras[~mine], penalty=penalty, signs=signs).probabilities(cameras[mine].columns)
     return found
 
 

@@ -35,7 +35,6 @@ from tools.benchmarks.belief.fitting import (
     fit,
     joined,
     left_out,
-    probabilities,
     read_table,
     write_table,
 )
@@ -167,7 +166,7 @@ def main() -> None:
         print(f"  {name:22s} {term.knots} {term.losses} missing {term.missing}")
     if options.fresh:
         fresh = decidable(read(options.fresh))
-        probability = probabilities(model, fresh)
+        probability = model.probabilities(fresh.columns)
         show("Fresh draws", fresh, probability)
         cameras = fresh
     if options.coefficients:
