@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 from xml.sax.saxutils import escape, quoteattr
 
 from pano_mvs.core.arrays import FloatArray
@@ -14,12 +15,30 @@ from pano_mvs.core.errors import UsageError
 DXF_REMEDY = "DXF files need the package ezdxf: pip install 'pano-mvs[dxf]'"
 
 
+COLORS = {"wall": (24, 32, 56), "door": (214, 140, 36), "window": (60, 130, 220), "camera": (214, 72, 36)}
+"""RGB colours of what a plan shows."""
+
+
+class DrawnRoom(Protocol):
+    """A room: its outline (N, 2), its area, and a position in it."""
+
+    @property
+    def outline(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def area(self) -> float: ...  # noqa: D102
+    @property
+    def label_xy(self) -> FloatArray: ...  # noqa: D102
+
+
 @dataclass(frozen=True, eq=False)
 class PlanDrawing:
     """A plan of one storey, in its own coordinates: x right, y up."""
 
     title: str
     walls: FloatArray  # (N, 2, 2) ends of the wall lines
+    solids: Sequence[FloatArray]  # (4, 2) each, outlines of walls of which both sides were seen
+    openings: Sequence[tuple[str, FloatArray]]  # "door" or "window", and the ends (2, 2)
+    rooms: Sequence[DrawnRoom]
     cameras: Mapping[str, tuple[float, float]]  # name to (x, y)
     box: tuple[tuple[float, float], tuple[float, float]]  # ((left, bottom), (right, top))
     bar: float  # length of the scale bar
@@ -32,16 +51,28 @@ def world_file_text(pixel: float, left: float, top: float) -> str:
     return "".join(f"{value:.12g}\n" for value in (pixel, 0, 0, -pixel, left + pixel / 2, top - pixel / 2))
 
 
+def area_text(area: float, *, superscript: str = "²") -> str:
+    """Return an area in square metres as text."""
+    return f"{area:.1f} m{superscript}"
+
+
 def svg_text(plan: PlanDrawing) -> str:
-    """Return a plan as SVG; the lines of the group `walls` have the coordinates of the plan."""
+    """Return a plan as SVG; the lines of `walls`, `doors` and `windows` have the coordinates of the plan."""
     (left, bottom), (right, top) = plan.box
     width, height = right - left, top - bottom
     strip = 0.08 * max(width, height)
     size = strip / 3
     numbers = " ".join(f"{value:.6g}" for value in (left, -top, width, height + strip))
     base, start = -bottom + strip / 2, left + strip / 3
-    lines = [
-        f'<line x1="{x1:.5f}" y1="{y1:.5f}" x2="{x2:.5f}" y2="{y2:.5f}"/>' for (x1, y1), (x2, y2) in plan.walls.tolist()
+    solids = [f'<polygon points="{" ".join(f"{x:.5f},{y:.5f}" for x, y in one.tolist())}"/>' for one in plan.solids]
+    openings = [
+        f'<g id="{kind}s" stroke="#{bytes(COLORS[kind]).hex()}">\n{_lines(which)}\n</g>'
+        for kind in ("door", "window")
+        for which in ([ends for other, ends in plan.openings if other == kind],)
+    ]
+    areas = [
+        f'<text x="{room.label_xy[0]:.5f}" y="{-room.label_xy[1] - size / 2:.5f}">{area_text(room.area)}</text>'
+        for room in (plan.rooms if plan.is_metric else ())
     ]
     dots = [
         f'<circle cx="{x:.5f}" cy="{y:.5f}" r="{size / 4:.4g}"><title>{escape(name)}</title></circle>'
@@ -53,12 +84,19 @@ def svg_text(plan: PlanDrawing) -> str:
             f'height="{1000 * (height + strip) / width:.0f}" data-unit={quoteattr(plan.unit)}>',
             f"<title>{escape(plan.title)}</title>",
             '<g transform="scale(1,-1)" fill="none" stroke="#182038" stroke-linecap="round">',
-            f'<g id="walls" stroke-width="{size / 6:.4g}">',
-            *lines,
+            '<g id="solids" fill="#182038" stroke="none">',
+            *solids,
+            "</g>",
+            f'<g stroke-width="{size / 6:.4g}">',
+            f'<g id="walls">\n{_lines(plan.walls)}\n</g>',
+            *openings,
             "</g>",
             '<g id="cameras" fill="#d64824" stroke="none">',
             *dots,
             "</g>",
+            "</g>",
+            f'<g id="areas" font-size="{size / 2:.4g}" font-family="sans-serif" fill="#182038" text-anchor="middle">',
+            *areas,
             "</g>",
             f'<g id="scale" stroke="#182038" stroke-width="{size / 8:.4g}">',
             f'<path fill="none" d="M{start:.6g} {base - size / 3:.6g}v{2 * size / 3:.6g}m0 {-size / 3:.6g}'
@@ -72,15 +110,23 @@ def svg_text(plan: PlanDrawing) -> str:
     )
 
 
+def _lines(segments: Sequence[FloatArray] | FloatArray) -> str:
+    return "\n".join(
+        f'<line x1="{x1:.5f}" y1="{y1:.5f}" x2="{x2:.5f}" y2="{y2:.5f}"/>'
+        for (x1, y1), (x2, y2) in (segment.tolist() for segment in segments)
+    )
+
+
 def has_ezdxf() -> bool:
     """Return whether DXF files can be written."""
     return importlib.util.find_spec("ezdxf") is not None
 
 
 def write_dxf(path: Path, plan: PlanDrawing) -> None:
-    """Write a plan as DXF (AutoCAD 2010): lines in the layer WALLS, circles and names in CAMERAS.
+    """Write a plan as DXF (AutoCAD 2010).
 
-    The same plan gives the same bytes: no date is written.
+    Lines are in the layers WALLS, DOORS and WINDOWS, outlines of rooms with their areas in ROOMS, circles and names in
+    CAMERAS. The same plan gives the same bytes: no date is written.
 
     Raises:
         UsageError: if ezdxf is not installed.
@@ -94,12 +140,19 @@ def write_dxf(path: Path, plan: PlanDrawing) -> None:
     options.write_fixed_meta_data_for_testing = True  # no dates and no random identifiers
     try:
         document = new("R2010", units=6 if plan.is_metric else 0)  # metres, or none
-        document.layers.add("WALLS", color=7)
-        document.layers.add("CAMERAS", color=1)
+        for layer, color in (("WALLS", 7), ("DOORS", 30), ("WINDOWS", 5), ("ROOMS", 8), ("CAMERAS", 1)):
+            document.layers.add(layer, color=color)
         space = document.modelspace()
-        for start, end in plan.walls.tolist():
-            space.add_line(start, end, dxfattribs={"layer": "WALLS"})
+        for kind, ends in [*(("wall", ends) for ends in plan.walls), *plan.openings]:
+            start, end = ends.tolist()
+            space.add_line(start, end, dxfattribs={"layer": f"{kind}s".upper()})
         (left, bottom), (right, top) = plan.box
+        for room in plan.rooms:
+            space.add_lwpolyline(room.outline.tolist(), close=True, dxfattribs={"layer": "ROOMS"})
+            if plan.is_metric:
+                height = 0.01 * max(right - left, top - bottom)
+                text = space.add_text(area_text(room.area), height=height, dxfattribs={"layer": "ROOMS"})
+                text.set_placement(room.label_xy.tolist())
         radius = 0.006 * max(right - left, top - bottom)
         for name, place in plan.cameras.items():
             space.add_circle(place, radius, dxfattribs={"layer": "CAMERAS"})

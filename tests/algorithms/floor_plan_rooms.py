@@ -1,4 +1,4 @@
-"""Clouds of rooms with known walls."""
+"""Clouds and ranges of rooms with known walls."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.scene import RangeMap
 
 HEIGHT = 2.6
 
@@ -29,6 +31,19 @@ def walls_of(corners: Sequence[tuple[float, float]]) -> FloatArray:
     """Return the ends of the walls, (N, 2, 2), with the inside on the left."""
     ends = np.array(corners)
     return np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
+
+
+def distance_to(walls: FloatArray, xy: FloatArray) -> FloatArray:
+    """Return the distance of each position (N, 2) from the nearest of the walls (M, 2, 2)."""
+    start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
+    share = np.einsum("nmk,mk->nm", xy[:, None] - start, along) / (along**2).sum(axis=1)
+    nearest = start + np.clip(share, 0, 1)[..., None] * along
+    return np.asarray(np.linalg.norm(xy[:, None] - nearest, axis=-1).min(axis=1))
+
+
+def samples(walls: FloatArray) -> FloatArray:
+    """Return 50 positions on each wall."""
+    return np.concatenate([start + np.linspace(0, 1, 50)[:, None] * (end - start) for start, end in walls])
 
 
 def room_cloud(
@@ -88,3 +103,57 @@ def _inside(corners: Sequence[tuple[float, float]], rng: np.random.Generator, de
         crosses = (xy[:, 1] < y0) != (xy[:, 1] < y1)
         odd ^= crosses & (xy[:, 0] < x0 + (xy[:, 1] - y0) * (x1 - x0) / (y1 - y0))
     return xy[odd]
+
+
+FLAT = (
+    ((0.0, 0.0), (4.0, 3.0)),
+    ((4.2, 0.0), (7.2, 3.0)),
+)
+"""Two rooms beside each other, lower left and upper right corners, with a wall of 0.2 between them."""
+
+DOOR = (1.8, 2.7)
+"""Where the wall between the two rooms has a door of 2 m."""
+
+WINDOW = (1.0, 2.5)
+"""Where the lower wall of the first room has a window, from 1 m to 2 m, with a wall of a house 3 m behind it."""
+
+
+def flat_ranges(cam_from_world: Rigid3, *, turn: FloatArray, size_hw: tuple[int, int] = (128, 256)) -> RangeMap:
+    """Return the exact range map of a camera in the two rooms, turned by `turn`, (2, 2), about the origin; z up."""
+    (west, east), height = FLAT, HEIGHT
+    panels = [(start, end, 0.0, height) for low, high in FLAT for start, end in walls_of(_rectangle(low, high))]
+    keep = [one for one in panels if not _crosses(one)]
+    for x in (west[1][0], east[0][0]):
+        keep += [(np.array([x, 0.0]), np.array([x, DOOR[0]]), 0.0, height)]
+        keep += [(np.array([x, DOOR[1]]), np.array([x, 3.0]), 0.0, height)]
+        keep += [(np.array([x, DOOR[0]]), np.array([x, DOOR[1]]), 2.0, height)]
+    for y in DOOR:
+        keep += [(np.array([west[1][0], y]), np.array([east[0][0], y]), 0.0, height)]
+    start, end = np.array([WINDOW[0], 0.0]), np.array([WINDOW[1], 0.0])
+    keep += [(np.zeros(2), start, 0.0, height), (end, np.array([4.0, 0.0]), 0.0, height)]
+    keep += [(start, end, 0.0, 1.0), (start, end, 2.0, height)]
+    keep += [(np.array([-9.0, -3.0]), np.array([9.0, -3.0]), 0.0, height)]
+    rays, center = ray_grid(size_hw) @ cam_from_world.rotation, cam_from_world.center
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges = np.where(rays[..., 2] < 0, -center[2] / rays[..., 2], (height - center[2]) / rays[..., 2])
+        for first, last, low, high in keep:
+            (x, y), edge = turn @ first - center[:2], turn @ (last - first)
+            slope = rays[..., 0] * edge[1] - rays[..., 1] * edge[0]
+            distance = (x * edge[1] - y * edge[0]) / slope
+            share = (x * rays[..., 1] - y * rays[..., 0]) / slope
+            level = center[2] + distance * rays[..., 2]
+            hit = (distance > 0) & (share >= 0) & (share <= 1) & (level >= low) & (level <= high)
+            ranges = np.where(hit & (distance < ranges), distance, ranges)
+    return RangeMap(
+        ranges.astype(np.float32), np.full(size_hw, 200, np.uint8), uncertainty=np.full(size_hw, 0.003, np.float16)
+    )
+
+
+def _rectangle(low: tuple[float, float], high: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    return (low, (high[0], low[1]), high, (low[0], high[1]))
+
+
+def _crosses(panel: tuple[FloatArray, FloatArray, float, float]) -> bool:
+    """Return whether a wall has the door or the window."""
+    x, y = (panel[0] + panel[1]) / 2
+    return x in (4.0, 4.2) or (y == 0.0 and x < 4.0)

@@ -1,117 +1,166 @@
-"""Wall lines, storeys and the orthophoto of rooms whose walls are known."""
+"""Rooms, walls, openings, storeys and the orthophoto of places whose walls are known."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.floor_plan.plan_grid import (
-    Extent,
-    PlanGrid,
-    Storey,
-    WallCells,
-    bar_length,
-    draw_plan,
-    find_storeys,
-)
-from pano_mvs.algorithms.floor_plan.wall_lines import Walls, wall_lines
+from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, range_view
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
+from pano_mvs.algorithms.floor_plan.storey_plan import StoreyPlan, plan_storey
 from pano_mvs.core.arrays import FloatArray
-from tests.algorithms.floor_plan_rooms import HEIGHT, L_SHAPE, RoomCloud, room_cloud, walls_of
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from tests.algorithms.floor_plan_rooms import (
+    DOOR,
+    HEIGHT,
+    L_SHAPE,
+    WINDOW,
+    RoomCloud,
+    distance_to,
+    flat_ranges,
+    room_cloud,
+    samples,
+    walls_of,
+)
 
 ROOM = Storey(0.0, HEIGHT, (0,))
 EXTENT = Extent(-0.2, 5.2, 0.01, (540, 640))
+CAM_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def grid_of(cloud: RoomCloud, *, parts: int = 1, storey: Storey = ROOM, extent: Extent = EXTENT) -> PlanGrid:
-    grid = PlanGrid(storey, extent, cut=storey.floor + 1.4, cell_px=4)
+def camera(center: FloatArray, turn_deg: float = 0.0) -> Rigid3:
+    return Rigid3.from_center(rotation_from_rotvec([0, np.deg2rad(turn_deg), 0]) @ CAM_FROM_Z_UP, center)
+
+
+def orthophoto(cloud: RoomCloud, *, parts: int = 1) -> Orthophoto:
+    photo = Orthophoto(ROOM, EXTENT, cut=1.4)
     for chosen in np.array_split(np.arange(len(cloud.points)), parts):
-        grid.add(cloud.points[chosen], cloud.normals[chosen], cloud.colors[chosen])
-    return grid
+        photo.add(cloud.points[chosen], cloud.colors[chosen])
+    return photo
 
 
-def walls_found(cells: WallCells) -> Walls:
-    return wall_lines(cells, min_share=0.4, min_length=0.4, max_gap=0.3, snap=0.2)
-
-
-def distance_to(walls: FloatArray, xy: FloatArray) -> FloatArray:
-    """The distance of each position (N, 2) from the nearest of the walls (M, 2, 2)."""
-    start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
-    share = np.einsum("nmk,mk->nm", xy[:, None] - start, along) / (along**2).sum(axis=1)
-    nearest = start + np.clip(share, 0, 1)[..., None] * along
-    return np.asarray(np.linalg.norm(xy[:, None] - nearest, axis=-1).min(axis=1))
-
-
-def samples(walls: FloatArray) -> FloatArray:
-    return np.concatenate([start + np.linspace(0, 1, 50)[:, None] * (end - start) for start, end in walls])
-
-
-def turned(cloud: RoomCloud, angle_deg: float) -> tuple[RoomCloud, FloatArray]:
+def rotation(angle_deg: float) -> FloatArray:
     turn = np.deg2rad(angle_deg)
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    return RoomCloud(cloud.points @ rotation.T, cloud.normals @ rotation.T, cloud.colors), rotation[:2, :2]
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+
+def turned(cloud: RoomCloud, turn: FloatArray) -> RoomCloud:
+    def apply(vectors: FloatArray) -> FloatArray:
+        return np.column_stack([vectors[:, :2] @ turn.T, vectors[:, 2]])
+
+    return RoomCloud(apply(cloud.points), apply(cloud.normals), cloud.colors)
+
+
+def evidence_around(xy: FloatArray) -> Evidence:
+    low, high = xy.min(axis=0) - 0.3, xy.max(axis=0) + 0.3
+    columns, rows = np.ceil((high - low) / 0.03).astype(int).tolist()
+    return Evidence(ROOM, Extent(float(low[0]), float(high[1]), 0.03, (rows, columns)))
+
+
+def plan_of_cloud(cloud: RoomCloud, *places: FloatArray) -> StoreyPlan:
+    cameras = np.array([(*place, 1.5) for place in places])
+    views = CloudViews([camera(center) for center in cameras])
+    views.add(cloud.points, cloud.normals)
+    evidence = evidence_around(cloud.points[:, :2])
+    for number in range(len(cameras)):
+        evidence.add(views.view(number))
+    return plan_storey(evidence, [], cameras=cameras[:, :2], min_share=0.4)
+
+
+def plan_of_flat(angle_deg: float, cameras: FloatArray | None = None) -> tuple[StoreyPlan, FloatArray]:
+    turn = rotation(angle_deg)
+    places = np.array([(1.0, 1.5), (3.0, 2.2), (5.5, 1.0)]) @ turn.T
+    evidence = evidence_around(np.array([(0.0, -1.0), (7.2, 3), (0, 3), (7.2, -1)]) @ turn.T)
+    for number, place in enumerate(places):
+        cam = camera(np.array([*place, 1.5]), 70.0 * number)
+        evidence.add(range_view(flat_ranges(cam, turn=turn), cam))
+    return plan_storey(evidence, [], cameras=places if cameras is None else cameras, min_share=0.4), turn
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 31.0])
-def test_the_walls_of_an_l_shaped_room_are_found_at_any_angle(angle_deg: float) -> None:
-    cloud, rotation = turned(room_cloud(), angle_deg)
-    low, high = cloud.points[:, :2].min(axis=0) - 0.2, cloud.points[:, :2].max(axis=0) + 0.2
-    columns, rows = np.ceil((high - low) / 0.01).astype(int).tolist()
-    walls = walls_found(grid_of(cloud, extent=Extent(low[0], high[1], 0.01, (rows, columns))).wall_cells())
-    true = walls_of(L_SHAPE) @ rotation.T
-    assert len(walls.ends_xy) == 6
-    assert distance_to(true, samples(walls.ends_xy)).max() < 0.04
-    assert distance_to(walls.ends_xy, samples(true)).max() < 0.04
-    assert np.sort(walls.lengths) == pytest.approx(np.sort([6, 3, 2.5, 2, 3.5, 5]), abs=0.05)
+def test_the_outline_of_an_l_shaped_room_is_closed_at_any_angle(angle_deg: float) -> None:
+    turn = rotation(angle_deg)
+    plan = plan_of_cloud(turned(room_cloud(), turn), turn @ (2, 2), turn @ (5, 1))
+    true = walls_of(L_SHAPE) @ turn.T
+    (room,) = plan.rooms
+    assert room.area == pytest.approx(25, rel=0.01)
+    assert len(room.outline) == 6
+    np.testing.assert_allclose(room.outline, np.array([wall.ends[0] for wall in plan.walls]), atol=1e-9)
+    walls = np.array([wall.ends for wall in plan.walls])
+    assert distance_to(true, samples(walls)).max() < 0.02
+    assert distance_to(walls, samples(true)).max() < 0.02
+    assert [wall.thickness for wall in plan.walls] == [None] * 6
+    assert not plan.openings
 
 
 def test_the_side_that_was_seen_is_on_the_left() -> None:
-    walls = walls_found(grid_of(room_cloud()).wall_cells())
-    for start, end in walls.ends_xy:
-        along = (end - start) / np.linalg.norm(end - start)
-        inside = (start + end) / 2 + 0.1 * np.array([-along[1], along[0]])
-        outside = (start + end) / 2 - 0.1 * np.array([-along[1], along[0]])
-        assert distance_to(walls_of(L_SHAPE), np.stack([inside, outside])).min() > 0.05
-        assert 0 < inside[0] < 6
-        assert 0 < inside[1] < 5
+    for wall in plan_of_cloud(room_cloud(), np.array([2, 2]), np.array([5, 1])).walls:
+        along = wall.ends[1] - wall.ends[0]
+        x, y = wall.ends.mean(axis=0) + 0.1 * np.array([-along[1], along[0]]) / np.linalg.norm(along)
+        assert 0 < x < 6
+        assert 0 < y < (5 if x < 3.5 else 3)
 
 
-def test_a_door_is_a_gap() -> None:
-    walls = walls_found(grid_of(room_cloud(door=(0, 2.0, 2.9))).wall_cells())
-    lower = walls.ends_xy[np.abs(walls.ends_xy[:, :, 1]).max(axis=1) < 0.05]
-    assert len(lower) == 2
-    assert np.sort(lower[:, :, 0].ravel()) == pytest.approx([0, 2.0, 2.9, 6], abs=0.06)
+@pytest.mark.parametrize("angle_deg", [0.0, 31.0])
+def test_a_wall_between_two_rooms_has_its_thickness_and_its_door(angle_deg: float) -> None:
+    plan, turn = plan_of_flat(angle_deg)
+    assert sorted(room.area for room in plan.rooms) == pytest.approx([9, 12], rel=0.02)
+    between = [wall for wall in plan.walls if wall.thickness is not None]
+    assert [wall.thickness for wall in between] == pytest.approx([0.2] * 4, abs=0.02)
+    assert len(plan.solids) == 4
+    (door,) = [one for one in plan.openings if one.kind == "door"]
+    ends = door.ends @ turn
+    assert ends[:, 0] == pytest.approx([4.1, 4.1], abs=0.02)
+    assert np.sort(ends[:, 1]) == pytest.approx(DOOR, abs=0.1)
 
 
-def test_low_furniture_is_not_a_wall() -> None:
-    """A sideboard of half the height of the walls that are counted."""
+def test_a_window_does_not_reach_the_floor() -> None:
+    plan, _ = plan_of_flat(0.0)
+    (window,) = [one for one in plan.openings if one.kind == "window"]
+    assert window.ends[:, 1] == pytest.approx([0, 0], abs=0.02)
+    assert np.sort(window.ends[:, 0]) == pytest.approx(WINDOW, abs=0.15)
+
+
+def test_furniture_is_not_a_wall() -> None:
+    """A cupboard that ends below the ceiling."""
     cloud = room_cloud()
     rng = np.random.default_rng(1)
-    side = np.column_stack([rng.uniform(1, 3, 3000), np.full(3000, 2.0), rng.uniform(0, 0.9, 3000)])
-    with_side = RoomCloud(
-        np.concatenate([cloud.points, side]),
+    front = np.column_stack([rng.uniform(1, 3, 3000), np.full(3000, 2.0), rng.uniform(0, 2.0, 3000)])
+    furnished = RoomCloud(
+        np.concatenate([cloud.points, front]),
         np.concatenate([cloud.normals, np.tile([0.0, -1, 0], (3000, 1))]),
         np.concatenate([cloud.colors, np.zeros((3000, 3), np.uint8)]),
     )
-    assert len(walls_found(grid_of(with_side).wall_cells()).ends_xy) == 6
+    plan = plan_of_cloud(furnished, np.array([2, 1]), np.array([5, 1]), np.array([1, 4]))
+    assert len(plan.walls) == 6
 
 
-def test_no_cells_have_no_walls() -> None:
-    empty = PlanGrid(ROOM, EXTENT, cut=1.0, cell_px=4)
-    assert walls_found(empty.wall_cells()).ends_xy.shape == (0, 2, 2)
-    assert not empty.photo()[1].any()
+def test_what_no_camera_stands_in_is_no_room() -> None:
+    assert len(plan_of_flat(0.0, cameras=np.array([[1.0, 1.5]]))[0].rooms) == 1
+
+
+def test_without_views_there_is_no_plan() -> None:
+    plan = plan_storey(evidence_around(np.array([(0.0, 0), (1, 1)])), [], cameras=np.zeros((1, 2)), min_share=0.4)
+    assert not any((plan.rooms, plan.walls, plan.openings, plan.solids))
 
 
 def test_the_order_and_the_parts_of_the_cloud_do_not_matter() -> None:
     cloud = room_cloud(density=200)
     order = np.random.default_rng(0).permutation(len(cloud.points))
     mixed = RoomCloud(cloud.points[order], cloud.normals[order], cloud.colors[order])
-    first, second = grid_of(cloud), grid_of(mixed, parts=7)
-    np.testing.assert_array_equal(first.photo()[0], second.photo()[0])
-    np.testing.assert_allclose(first.wall_cells().xy, second.wall_cells().xy, atol=1e-9)
+    np.testing.assert_array_equal(orthophoto(cloud).picture()[0], orthophoto(mixed, parts=7).picture()[0])
+    cams = [camera(np.array([2.0, 2, 1.5])), camera(np.array([5.0, 1, 1.5]))]
+    seen = []
+    for one, parts in ((cloud, 1), (mixed, 7)):
+        views = CloudViews(cams)
+        for chosen in np.array_split(np.arange(len(one.points)), parts):
+            views.add(one.points[chosen], one.normals[chosen])
+        seen.append([views.view(number).free for number in range(2)])
+    np.testing.assert_array_equal(seen[0], seen[1])
 
 
 def test_the_orthophoto_shows_what_is_highest_below_the_cut() -> None:
-    photo, known = grid_of(room_cloud(density=3000)).photo()
+    photo, known = orthophoto(room_cloud(density=3000)).picture()
     column, row = (EXTENT.pixels_from_xy(np.array([1.6, 1.4]))).astype(int)
     assert photo[row, column].tolist() == [30, 30, 220]  # the table
     column, row = (EXTENT.pixels_from_xy(np.array([5.0, 1.5]))).astype(int)
@@ -140,6 +189,25 @@ def test_two_storeys_are_told_apart() -> None:
     assert [storey.ceiling for storey in storeys] == pytest.approx([HEIGHT, 2.9 + HEIGHT], abs=0.03)
 
 
+def test_a_camera_on_the_stairs_is_no_storey() -> None:
+    """Half-way up, a camera is above the ceiling of the lower storey, and nearly as high as the upper floor."""
+    clouds = [room_cloud(), room_cloud(floor=2.9, seed=1)]
+    heights = np.concatenate([cloud.points[:, 2] for cloud in clouds])
+    ups = np.concatenate([cloud.normals[:, 2] for cloud in clouds])
+    storeys = find_storeys(heights, ups, np.array([1.5, 1.5, 1.6, 2.95, 4.4, 4.5]))
+    assert [storey.cameras for storey in storeys] == [(0, 1, 2, 3), (4, 5)]
+    assert [storey.floor for storey in storeys] == pytest.approx([0, 2.9], abs=0.03)
+    assert [storey.ceiling for storey in storeys] == pytest.approx([HEIGHT, 2.9 + HEIGHT], abs=0.03)
+
+
+def test_a_storey_has_a_floor() -> None:
+    """A camera on a tripod of twice the height stands on the same floor."""
+    cloud = room_cloud()
+    (storey,) = find_storeys(cloud.points[:, 2], cloud.normals[:, 2], np.array([1.2, 1.3, 2.45]))
+    assert storey.cameras == (0, 1, 2)
+    assert storey.ceiling == pytest.approx(HEIGHT, abs=0.03)
+
+
 def test_without_level_surfaces_the_storey_is_a_guess() -> None:
     heights = np.random.default_rng(0).uniform(0, 3, 500)
     (storey,) = find_storeys(heights, np.zeros(500), np.array([1.5]))
@@ -155,18 +223,3 @@ def test_without_level_surfaces_the_storey_is_a_guess() -> None:
 @pytest.mark.parametrize(("width", "length"), [(10, 2), (7.9, 1), (8, 2), (0.9, 0.2), (1234, 200)])
 def test_the_scale_bar_has_a_round_length(width: float, length: float) -> None:
     assert bar_length(width) == pytest.approx(length)
-
-
-def test_the_picture_has_walls_where_they_are_and_a_bar_of_its_length() -> None:
-    extent = Extent(0.0, 2.0, 0.01, (200, 400))
-    walls = np.array([[[0.5, 0.5], [3.5, 0.5]]])
-    blank = np.zeros((200, 400, 3), np.uint8), np.zeros((200, 400), np.bool_)
-    picture = draw_plan(*blank, extent, walls=walls, cameras=np.array([[2.0, 1.5]]), unit="m")
-    assert picture.shape == (236, 400, 3)
-    dark = picture.max(axis=-1) < 100
-    assert dark[149:151, 60:340].all(axis=1).any()
-    assert not dark[:140].any()
-    assert picture[50, 200].tolist() == [214, 72, 36]
-    bar = np.flatnonzero(dark[200 + 18])
-    longest = max(np.split(bar, np.flatnonzero(np.diff(bar) > 1) + 1), key=len)
-    assert len(longest) == pytest.approx(100, abs=3)  # 1 m

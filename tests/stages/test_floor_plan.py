@@ -13,12 +13,11 @@ import pytest
 import trimesh
 from ezdxf.filemanagement import readfile
 
-from pano_mvs.api import Context, Files, PointCloud, Poses
+from pano_mvs.api import Context, Files, PointCloud, Poses, RangeMap
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.stages.exports.floor_plan import FloorPlanParams, floor_plan
-from tests.algorithms.floor_plan_rooms import RoomCloud, room_cloud, walls_of
-from tests.algorithms.test_floor_plan import distance_to, samples
+from tests.algorithms.floor_plan_rooms import RoomCloud, distance_to, flat_ranges, room_cloud, samples, walls_of
 from tests.stored import read_picture
 
 WORLD_FROM_Z_UP = z_up_from_world().T
@@ -47,10 +46,14 @@ def the_poses(*centers: tuple[float, float, float], metric: bool = True) -> Pose
     return Poses.without_points(cameras, frame=LEVEL, scale="", metric=metric)
 
 
-def planned(folder: Path, cloud: PointCloud, poses: Poses, **settings: Any) -> tuple[Files, Context]:
+def planned(
+    folder: Path, cloud: PointCloud, poses: Poses, ranges: dict[str, RangeMap] | None = None, **settings: Any
+) -> tuple[Files, Context]:
     folder.mkdir(exist_ok=True)
     ctx = Context(np.random.default_rng(0), folder)
-    return floor_plan(cloud, poses, FloorPlanParams.model_validate({"width_px": 600} | settings), ctx), ctx
+    return floor_plan(
+        cloud, poses, ranges, None, FloorPlanParams.model_validate({"width_px": 600} | settings), ctx
+    ), ctx
 
 
 def stated(files: Files, folder: str = "floor_plan") -> dict[str, Any]:
@@ -59,7 +62,7 @@ def stated(files: Files, folder: str = "floor_plan") -> dict[str, Any]:
 
 
 def svg_walls(files: Files, name: str = "floor_plan/storey_0.svg") -> np.ndarray:
-    found = SVG_LINE.findall(files.files[name].read_text())
+    found = SVG_LINE.findall(files.files[name].read_text().split('<g id="walls">')[1].split("</g>")[0])
     return np.array(found, np.float64).reshape(-1, 2, 2)
 
 
@@ -81,8 +84,32 @@ def test_the_drawings_have_the_walls_of_the_room(tmp_path: Path) -> None:
         plan = trimesh.load_path(stream, file_type="dxf")  # by a reader of its own
     found = np.array([plan.vertices[line.points] for line in plan.entities if line.layer == "WALLS"])
     np.testing.assert_allclose(sorted(found.reshape(-1, 4).tolist()), sorted(ends.reshape(-1, 4).tolist()), atol=1e-5)
-    assert ctx.metrics == {"storeys": 1, "walls": 6}
+    assert ctx.metrics == {"storeys": 1, "rooms": 1, "walls": 6}
+    (room,) = stated(files)["storeys"][0]["rooms"]
+    assert room["area"] == pytest.approx(25, rel=0.01)
+    assert sorted(room["lengths"]) == pytest.approx([2, 2.5, 3, 3.5, 5, 6], abs=0.03)
     assert not ctx.notes
+
+
+def test_rooms_doors_and_thickness_are_stated(tmp_path: Path) -> None:
+    """Two rooms of which there are range maps, but hardly a cloud."""
+    poses = the_poses((1.0, 1.5, 1.5), (3.0, 2.2, 1.5), (5.5, 1.0, 1.5))
+    plan_from_world = Rigid3(WORLD_FROM_Z_UP.T, np.zeros(3))
+    ranges = {
+        name: flat_ranges(poses.cam_from_world(idx) @ plan_from_world.inverse(), turn=np.eye(2))
+        for idx, name in enumerate(poses.names)
+    }
+    files, _ = planned(tmp_path, the_cloud(room_cloud(density=1)), poses, ranges, formats=("png", "svg", "dxf"))
+    (storey,) = stated(files)["storeys"]
+    assert sorted(room["area"] for room in storey["rooms"]) == pytest.approx([9, 12], rel=0.02)
+    assert {wall["thickness"] and round(wall["thickness"], 1) for wall in storey["walls"]} == {None, 0.2}
+    assert sorted(one["kind"] for one in storey["openings"]) == ["door", "window"]
+    drawing = readfile(files.files["floor_plan/storey_0.dxf"]).modelspace()
+    assert [len(drawing.query(f'LINE[layer=="{layer}"]')) for layer in ("DOORS", "WINDOWS")] == [1, 1]
+    assert len(drawing.query('LWPOLYLINE[layer=="ROOMS"]')) == 2
+    text = files.files["floor_plan/storey_0.svg"].read_text()
+    assert len(re.findall(r">\d+\.\d m²<", text)) == 2
+    assert text.count("<polygon") == 4
 
 
 def test_the_world_file_places_the_picture(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from tools.benchmarks.depth.ablation import Ablation, gains, place_rows, real_ro
 from tools.benchmarks.depth.layouts import OPENING, layout_ranges, view_shares
 from tools.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
 from tools.benchmarks.depth.places import SYNTHETIC, Place, masked, places_of
+from tools.benchmarks.depth.plans import Samples, compared, figures, true_storeys
 from tools.benchmarks.depth.scores import completeness, kept_at_precision, score_place, thicknesses
 from tools.benchmarks.poses.tours.materials import PLASTER
 from tools.benchmarks.poses.tours.plan import level_rotation
@@ -276,3 +277,25 @@ def test_a_view_of_a_drawn_room_is_compared_in_both_scales() -> None:
     shares = view_shares(panorama, ranges, np.full(truth.shape, 200, np.uint8))
     assert shares["confirmed, within 5 %"] == (0.0, 1.0)
     assert shares["walls within 5 %"] == (0.0, 1.0)
+
+
+def test_the_true_plan_of_a_house_has_no_errors() -> None:
+    lower, upper = true_storeys("house_08")
+    assert upper.floor > lower.floor + 2
+    for storey in (lower, upper):
+        rooms = [{"outline": [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]} for x0, y0, x1, y1 in storey.rooms]
+        drawn = {"rooms": rooms, "openings": [{"kind": "door", "ends": door} for door in storey.doors]}
+        count, doors = len(rooms), len(storey.doors)
+        assert count > 3
+        assert figures(compared(storey, storey.walls, drawn)) == (
+            *("100.0 %", "0.0 cm", "0.0 cm", "0.0 %"),
+            *(f"{count} of {count}", "0.0 %", f"{doors} of {doors}, 0 wrong"),
+        )
+
+
+def test_a_plan_that_is_moved_has_its_errors() -> None:
+    (storey,) = true_storeys("house_11")
+    moved = Samples(storey.walls.xy + np.array([0.03, 0.03]), storey.walls.along)
+    assert figures(compared(storey, moved, {}))[:4] == ("100.0 %", "3.0 cm", "3.0 cm", "0.0 %")
+    beside = Samples(storey.walls.xy + np.array([20.0, 0.0]), storey.walls.along)
+    assert figures(compared(storey, beside, {}))[0] == "0.0 %"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -63,8 +64,11 @@ def find_storeys(heights: FloatArray, normal_heights: FloatArray, camera_heights
         floor = found[0] if found else max(low, below) if low < lowest else lowest - (high - low) / 2
         limit = floor + _SAME_STOREY * (lowest - floor)
         here = order[camera_heights[order] <= limit]
-        floors.append((floor, bool(found), sorted(int(idx) for idx in here)))
-        below = float(camera_heights[here].max())
+        if found or not floors:
+            floors.append((floor, bool(found), sorted(int(idx) for idx in here)))
+            below = float(np.median(camera_heights[here]))  # one may stand on stairs
+        else:  # higher than others on one floor
+            floors[-1] = (*floors[-1][:2], sorted([*floors[-1][2], *(int(idx) for idx in here)]))
         order = order[camera_heights[order] > limit]
     return [
         _with_ceiling(number, floors, camera_heights, facing_down=facing_down, step=step, top=high)
@@ -82,11 +86,10 @@ def _with_ceiling(
     top: float,
 ) -> Storey:
     floor, has_floor, cameras = floors[number]
-    highest = float(camera_heights[cameras].max())
+    middle = float(np.median(camera_heights[cameras]))
     limit = floors[number + 1][0] if number + 1 < len(floors) else np.inf
-    found = _levels(facing_down[(facing_down > highest) & (facing_down < limit)], step)
-    usual = floor + _SAME_STOREY * (highest - floor)
-    ceiling = found[-1] if found else min(limit, max(usual, highest), max(top, highest))
+    found = _levels(facing_down[(facing_down > middle) & (facing_down < limit)], step)
+    ceiling = found[-1] if found else min(limit, floor + _SAME_STOREY * (middle - floor), max(top, middle))
     return Storey(floor, float(ceiling), tuple(cameras), has_floor, bool(found))
 
 
@@ -104,10 +107,6 @@ def _levels(heights: FloatArray, step: float) -> list[float]:
     return [float(np.median(heights[np.abs(heights - middle) < 3 * step])) for middle in middles]
 
 
-LAYERS = 32
-"""Number of layers between floor and ceiling in which walls are looked for."""
-
-_WALL_FROM, _WALL_TO = 0.08, 0.95
 _HEIGHT_BITS = 20
 
 
@@ -124,10 +123,10 @@ class Extent:
     pixel: float
     size_hw: tuple[int, int]
 
-    def coarser(self, factor: int) -> Extent:
-        """Return a grid of larger pixels that covers at least the same area."""
-        rows, columns = (-(-size // factor) for size in self.size_hw)
-        return Extent(self.left, self.top, self.pixel * factor, (rows, columns))
+    def with_pixel(self, pixel: float) -> Extent:
+        """Return a grid of other pixels that covers at least the same area."""
+        rows, columns = (math.ceil(size * self.pixel / pixel) for size in self.size_hw)
+        return Extent(self.left, self.top, pixel, (rows, columns))
 
     def cells(self, xy: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the flat index (N,) of the pixel of each point (N, 2), and whether it is inside."""
@@ -137,63 +136,47 @@ class Extent:
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         return np.where(inside, row * columns + column, 0), inside
 
+    def centers(self) -> FloatArray:
+        """Return the positions (N, 2) of the centres of all pixels, row by row."""
+        rows, columns = self.size_hw
+        x, y = self.left + (np.arange(columns) + 0.5) * self.pixel, self.top - (np.arange(rows) + 0.5) * self.pixel
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
     def pixels_from_xy(self, xy: FloatArray) -> FloatArray:
         """Return positions (..., 2) as column and row; (0, 0) is the upper left corner of the grid."""
         return np.stack([xy[..., 0] - self.left, self.top - xy[..., 1]], axis=-1) / self.pixel
 
 
-@dataclass(frozen=True, eq=False)
-class WallCells:
-    """Cells of a plan with vertical surfaces.
+class Orthophoto:
+    """The highest point below a cut in each pixel of one storey.
 
-    `xy`: (N, 2) mean position of the points in each cell. `normals_xy`: (N, 2) unit normals, on the side that was seen.
-    `shares`: (N,) share of the layers between floor and ceiling with such points in the cell or beside it. `weights`:
-    (N,) number of layers with such points in the cell. `cell`: edge of a cell.
+    The result does not depend on the order of the points. Memory: 8 bytes a pixel.
     """
 
-    xy: FloatArray
-    normals_xy: FloatArray
-    shares: FloatArray
-    weights: FloatArray
-    cell: float
-
-    def only(self, chosen: NDArray[np.bool_]) -> WallCells:
-        """Return some of the cells."""
-        return WallCells(self.xy[chosen], self.normals_xy[chosen], self.shares[chosen], self.weights[chosen], self.cell)
-
-
-class PlanGrid:
-    """The orthophoto and the walls of one storey.
-
-    The orthophoto shows the highest point below a cut, in each pixel. The result does not depend on the order of the
-    points. Memory: 8 bytes a pixel, and 44 bytes a cell of the walls.
-    """
-
-    def __init__(self, storey: Storey, extent: Extent, *, cut: float, cell_px: int) -> None:
-        """Start with empty grids.
+    def __init__(self, storey: Storey, extent: Extent, *, cut: float) -> None:
+        """Start with an empty picture.
 
         Args:
-            storey: whose floor and ceiling bound the points.
-            extent: of the orthophoto.
-            cut: height of the cut; points above are not in the orthophoto.
-            cell_px: edge of a cell of the walls in pixels.
+            storey: whose floor bounds the points.
+            extent: of the picture.
+            cut: height of the cut; points above are left out.
         """
-        self.storey = storey
         self.extent = extent
-        self.walls = extent.coarser(cell_px)
+        self._low = storey.floor - 0.05 * storey.height
         self._cut = cut
         self._photo = np.zeros(extent.size_hw[0] * extent.size_hw[1], np.int64)
-        cells = self.walls.size_hw[0] * self.walls.size_hw[1]
-        self._layers = np.zeros(cells, np.uint32)
-        self._sums = np.zeros((cells, 5))  # x, y, their normal's, number
 
-    def add(self, points: FloatArray, normals: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
-        """Add points (N, 3) with z up, their unit normals (N, 3) and colours (N, 3)."""
-        self._add_photo(points, colors_rgb)
-        self._add_walls(points, normals)
+    def add(self, points: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
+        """Add points (N, 3) with z up and their colours (N, 3)."""
+        index, inside = self.extent.cells(points[:, :2])
+        inside &= (points[:, 2] >= self._low) & (points[:, 2] <= self._cut)
+        share = (points[inside, 2] - self._low) / max(self._cut - self._low, 1e-12)
+        level = 1 + (share * ((1 << _HEIGHT_BITS) - 2)).astype(np.int64)
+        red, green, blue = colors_rgb[inside].astype(np.int64).T
+        np.maximum.at(self._photo, index[inside], (level << 24) | (red << 16) | (green << 8) | blue)
 
-    def photo(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return the orthophoto (H, W, 3) RGB, with small gaps filled, and the pixels (H, W) that show something."""
+    def picture(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Return the picture (H, W, 3) RGB, with small gaps filled, and the pixels (H, W) that show something."""
         packed = self._photo.reshape(self.extent.size_hw)
         known = packed > 0
         image = np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
@@ -206,58 +189,6 @@ class PlanGrid:
         colors = np.zeros((int(labels.max()) + 1, 3), np.uint8)
         colors[labels[known]] = image[known]
         return np.where(near[..., None], colors[labels], np.uint8(0)), near
-
-    def wall_cells(self) -> WallCells:
-        """Return the cells with vertical surfaces."""
-        rows, columns = self.walls.size_hw
-        beside = self._layers.reshape(rows, columns).copy()
-        for axis in (0, 1):
-            padded = np.pad(beside, [(1, 1) if number == axis else (0, 0) for number in (0, 1)])
-            size = beside.shape[axis]
-            parts = [np.take(padded, range(start, start + size), axis=axis) for start in range(3)]
-            beside = parts[0] | parts[1] | parts[2]
-        used = np.flatnonzero(self._layers)
-        sums = self._sums[used]
-        lengths = np.linalg.norm(sums[:, 2:4], axis=1)
-        sure = lengths > 0.3 * sums[:, 4]  # points whose normals agree
-        used, sums, lengths = used[sure], sums[sure], lengths[sure]
-        return WallCells(
-            xy=sums[:, :2] / sums[:, 4:],
-            normals_xy=sums[:, 2:4] / lengths[:, None],
-            shares=_bits(beside.reshape(-1)[used]) / LAYERS,
-            weights=_bits(self._layers[used]).astype(np.float64),
-            cell=self.walls.pixel,
-        )
-
-    def _add_photo(self, points: FloatArray, colors_rgb: NDArray[np.uint8]) -> None:
-        low = self.storey.floor - 0.05 * self.storey.height
-        index, inside = self.extent.cells(points[:, :2])
-        inside &= (points[:, 2] >= low) & (points[:, 2] <= self._cut)
-        share = (points[inside, 2] - low) / max(self._cut - low, 1e-12)
-        level = 1 + (share * ((1 << _HEIGHT_BITS) - 2)).astype(np.int64)
-        red, green, blue = colors_rgb[inside].astype(np.int64).T
-        np.maximum.at(self._photo, index[inside], (level << 24) | (red << 16) | (green << 8) | blue)
-
-    def _add_walls(self, points: FloatArray, normals: FloatArray) -> None:
-        share = (points[:, 2] - self.storey.floor) / max(self.storey.height, 1e-12)
-        index, inside = self.walls.cells(points[:, :2])
-        inside &= (share > _WALL_FROM) & (share < _WALL_TO) & (np.abs(normals[:, 2]) < 0.35)
-        layer = ((share[inside] - _WALL_FROM) / (_WALL_TO - _WALL_FROM) * LAYERS).astype(np.uint32)
-        chosen = index[inside]
-        np.bitwise_or.at(self._layers, chosen, np.uint32(1) << np.minimum(layer, LAYERS - 1))
-        values = np.column_stack([points[inside, :2], normals[inside, :2], np.ones(len(chosen))])
-        for column in range(5):
-            self._sums[:, column] += np.bincount(chosen, values[:, column], len(self._sums))
-
-
-def _bits(masks: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Return the number of bits that are set in each mask."""
-    bits = np.unpackbits(masks.astype("<u4").view(np.uint8).reshape(-1, 4), axis=1)
-    return np.asarray(bits.sum(axis=1), np.int64)
-
-
-_PAPER, _INK, _CAMERA = (255, 255, 255), (24, 32, 56), (214, 72, 36)
-_SUBPIXEL_BITS = 4
 
 
 def bar_length(width: float) -> float:
@@ -273,60 +204,3 @@ def bar_length(width: float) -> float:
 def bar_text(length: float, unit: str) -> str:
     """Return a round length with its unit, as text."""
     return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
-
-
-def strip_px(size_hw: tuple[int, int]) -> int:
-    """Return the rows of the strip for the scale bar below a plan of a size."""
-    return max(36, round(0.06 * max(size_hw)))
-
-
-def draw_plan(
-    photo: NDArray[np.uint8],
-    known: NDArray[np.bool_],
-    extent: Extent,
-    *,
-    walls: FloatArray,
-    cameras: FloatArray,
-    unit: str,
-) -> NDArray[np.uint8]:
-    """Return the picture of a plan (H + strip, W, 3) RGB: the strip below the plan has the scale bar.
-
-    `photo`: (H, W, 3) RGB orthophoto. `known`: (H, W) pixels that show something; others are white. `extent`: of the
-    orthophoto. `walls`: (N, 2, 2) ends of wall lines. `cameras`: (M, 2) positions of cameras. `unit`: of lengths,
-    beside the scale bar.
-    """
-    height, width = extent.size_hw
-    image = np.full((height + strip_px(extent.size_hw), width, 3), _PAPER, np.uint8)
-    image[:height][known] = photo[known]
-    thickness = max(2, round(width / 350))
-    for x1, y1, x2, y2 in _subpixels(extent.pixels_from_xy(walls)).reshape(-1, 4).tolist():
-        cv2.line(image, (x1, y1), (x2, y2), _INK, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
-    radius = max(3, width // 150) << _SUBPIXEL_BITS
-    for x, y in _subpixels(extent.pixels_from_xy(cameras)).reshape(-1, 2).tolist():
-        cv2.circle(image, (x, y), radius, _PAPER, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-        cv2.circle(image, (x, y), int(0.7 * radius), _CAMERA, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-    image[height:] = _PAPER
-    _draw_bar(image[height:], extent.pixel, unit)
-    return image
-
-
-def _draw_bar(strip: NDArray[np.uint8], pixel: float, unit: str) -> None:
-    rows, columns = strip.shape[:2]
-    length = bar_length(columns * pixel)
-    left, right, middle = rows // 3, rows // 3 + round(length / pixel), rows // 2
-    tick = max(3, rows // 8)
-    thickness = max(1, rows // 24)
-    for start, end in (
-        ((left, middle), (right, middle)),
-        ((left, middle - tick), (left, middle + tick)),
-        ((right, middle - tick), (right, middle + tick)),
-    ):
-        cv2.line(strip, start, end, _INK, thickness)
-    size = rows / 60
-    place = (right + rows // 4, middle + round(8 * size))
-    cv2.putText(strip, f"{length:g} {unit}", place, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, thickness, cv2.LINE_AA)
-
-
-def _subpixels(xy: FloatArray) -> NDArray[np.int64]:
-    """Return positions as OpenCV's fixed-point numbers, whose pixels have their centres at whole numbers."""
-    return np.rint((xy - 0.5) * (1 << _SUBPIXEL_BITS)).astype(np.int64)

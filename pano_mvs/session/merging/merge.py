@@ -379,17 +379,16 @@ def _repeat_exports(files: MergeFiles, block: RunSummary, *, has_cloud: bool) ->
 
 
 def _is_repeated(spec: StageSpec) -> bool:
-    """Return whether an export is one of this package and reads nothing but the cloud and the poses."""
+    """Return whether an export is one of this package and needs nothing but the cloud and the poses."""
     is_own = spec.function.__module__.startswith("pano_mvs.stages.")
-    return is_own and all(
-        port.cardinality is Cardinality.ONE and port.kind in (PointCloud, Poses) for port in spec.ports
-    )
+    needed = [port for port in spec.ports if not port.optional or port.kind in (PointCloud, Poses)]
+    return is_own and all(port.cardinality is Cardinality.ONE and port.kind in (PointCloud, Poses) for port in needed)
 
 
 def _export(spec: StageSpec, params: Mapping[str, object], merged: tuple[PointCloud, Poses], *, ctx: Context) -> Files:
     extras = {"params": spec.params_type.model_validate(params), "ctx": ctx}
     cloud, poses = merged
-    inputs: dict[str, object] = {port.name: cloud if port.kind is PointCloud else poses for port in spec.ports}
+    inputs = {port.name: {PointCloud: cloud, Poses: poses}.get(port.kind) for port in spec.ports}
     made = spec.function(**inputs, **{name: extras[role] for name, role in spec.extras.items()})
     assert isinstance(made, Files)
     made.check()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,25 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from pano_mvs.algorithms.floor_plan.plan_grid import (
-    Extent,
-    PlanGrid,
-    Storey,
-    bar_length,
-    draw_plan,
-    find_storeys,
-    strip_px,
+from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
+from pano_mvs.algorithms.floor_plan.storey_plan import plan_storey
+from pano_mvs.algorithms.floor_plan.wall_lines import Line
+from pano_mvs.api import (
+    All,
+    Context,
+    Files,
+    One,
+    Params,
+    PointCloud,
+    Poses,
+    RangeMap,
+    chunks,
+    split_groups,
+    stage,
+    write_png,
 )
-from pano_mvs.algorithms.floor_plan.wall_lines import wall_lines
-from pano_mvs.api import Context, Files, One, Params, PointCloud, Poses, chunks, split_groups, stage, write_png
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.paths import children
+from pano_mvs.geometry import Rigid3
 from pano_mvs.io.plan_drawings import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
+from pano_mvs.io.plan_picture import draw_plan, strip_px
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import world_up, z_up_from_world
 
 Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 
-_EDGE_QUANTILE = 0.003
+_EDGE_QUANTILE = 0.02
 _MARGIN = 0.03
 _MAX_SIDE_PX = 4096
 
@@ -60,36 +70,48 @@ class FloorPlanParams(Params):
 
 def plan_memory_bytes(params: FloorPlanParams, _: Mapping[str, Any]) -> int:
     """Return the memory for the grids of one storey, 40 bytes a pixel, and for parts of the cloud."""
-    return 250_000_000 + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+    return 500_000_000 + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
 
 
 @stage("export.floor_plan", memory=plan_memory_bytes)
-def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParams, ctx: Context) -> Files:
+def floor_plan(
+    cloud: One[PointCloud],
+    poses: One[Poses],
+    ranges: All[RangeMap] | None,
+    planes: One[Structure] | None,
+    params: FloorPlanParams,
+    ctx: Context,
+) -> Files:
     """Write plans of all storeys: floor_plan/storey_0.png with .pgw, storey_0.svg …, and floor_plan.json about them.
 
-    The PNG shows the floor from above, cut below the cameras, with wall lines, cameras and a scale bar. The coordinates
-    are those of cloud.ply: z up. The cloud is read in chunks: memory does not grow with its size. Further groups of
-    poses, each in its own frame, are in floor_plan_1/, floor_plan_2/ …
+    Rooms are those in which a camera stands; their outlines are closed, and lie on lines of walls. The PNG shows the
+    floor from above, cut below the cameras, with the walls, doors and windows, cameras and a scale bar. The coordinates
+    are those of cloud.ply: z up. Without range maps, the cloud alone shows the walls. The cloud is read in chunks:
+    memory does not grow with its size. Further groups of poses, each in its own frame, are in floor_plan_1/,
+    floor_plan_2/ …
     """
     files: dict[str, Path] = {}
-    walls = storeys = 0
+    walls = rooms = storeys = 0
     for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
         which = f"group {number}: " if poses.other_worlds else ""
         kept = int((group.view_counts >= params.min_views).sum())
-        if kept < 100:
+        known = ranges if ranges and any(name in ranges for name in own.names) else {}
+        if kept < 100 and not known:
             ctx.note(f"{which}no floor plan: {kept} points of the cloud are seen from {params.min_views} views")
             continue
         folder = f"floor_plan_{number}" if number else "floor_plan"
         (ctx.scratch / folder).mkdir()
-        plan = _GroupPlan(group, own, params, folder=ctx.scratch / folder)
+        plan = _GroupPlan(group, own, params, ranges=known, planes=planes, number=number, folder=ctx.scratch / folder)
         about = plan.write()
         (ctx.scratch / folder / "floor_plan.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
         files |= {f"{folder}/{path.name}": path for path in children(ctx.scratch / folder)}
         for note in plan.notes:
             ctx.note(f"{which}{note}")
         storeys += len(about["storeys"])
-        walls += sum(entry["walls"] for entry in about["storeys"])
+        walls += sum(len(entry["walls"]) for entry in about["storeys"])
+        rooms += sum(len(entry["rooms"]) for entry in about["storeys"])
     ctx.metric("storeys", storeys)
+    ctx.metric("rooms", rooms)
     ctx.metric("walls", walls)
     return Files(files)
 
@@ -97,7 +119,17 @@ def floor_plan(cloud: One[PointCloud], poses: One[Poses], params: FloorPlanParam
 class _GroupPlan:
     """The plans of one group."""
 
-    def __init__(self, cloud: PointCloud, poses: Poses, params: FloorPlanParams, *, folder: Path) -> None:
+    def __init__(
+        self,
+        cloud: PointCloud,
+        poses: Poses,
+        params: FloorPlanParams,
+        *,
+        ranges: All[RangeMap],
+        planes: Structure | None,
+        number: int,
+        folder: Path,
+    ) -> None:
         self.cloud = cloud
         self.poses = poses
         self.params = params
@@ -105,12 +137,15 @@ class _GroupPlan:
         self.turn = z_up_from_world(world_up(poses))
         self.centers = poses.centers @ self.turn.T
         self.notes: list[str] = []
+        self.known = _lines(planes, number, self.turn)
+        self.view = self._views(ranges)
 
     def write(self) -> dict[str, Any]:
         """Write the files of all storeys, and return what floor_plan.json states."""
-        sampled, normals = self._sample()
-        storeys = find_storeys(sampled[:, 2], normals[:, 2], self.centers[:, 2])
-        extent = self._extent(sampled[:, :2])
+        sampled = [(one.points[::16], one.normals[::16]) for one in map(self.view, range(len(self.poses.names)))]
+        points, normals = (np.concatenate(parts) for parts in zip(*sampled, strict=True))
+        storeys = find_storeys(points[:, 2], normals[:, 2], self.centers[:, 2])
+        extent = self._extent([points[:, :2] for points, _ in sampled if len(points)])
         entries = [self._storey(number, storey, extent) for number, storey in enumerate(storeys)]
         if not all(storey.has_floor for storey in storeys):
             self.notes.append("no level surface was found below some cameras: the floor of the plan is a guess")
@@ -121,6 +156,19 @@ class _GroupPlan:
             "storeys": entries,
         }
 
+    def _views(self, ranges: All[RangeMap]) -> Callable[[int], PlanView]:
+        """Return a function that loads what a camera sees: its range map, or without any, what the cloud shows."""
+        plan_from_world = Rigid3(self.turn, np.zeros(3))
+        cams = [self.poses.cam_from_world(idx) @ plan_from_world.inverse() for idx in range(len(self.poses.names))]
+        if ranges:
+            empty = PlanView(np.zeros(3), np.eye(3), np.full((1, 2), np.nan), np.zeros((0, 3)), np.zeros((0, 3)))
+            names = self.poses.names
+            return lambda idx: range_view(ranges[names[idx]], cams[idx]) if names[idx] in ranges else empty
+        views = CloudViews(cams)
+        for points, normals, _ in self._chunks():
+            views.add(points, normals)
+        return views.view
+
     def _chunks(self) -> Iterator[Points]:
         for chunk in chunks(len(self.cloud)):
             kept = self.cloud.view_counts[chunk] >= self.params.min_views
@@ -128,16 +176,11 @@ class _GroupPlan:
             normals = self.cloud.normals_in_world[chunk][kept].astype(np.float64) @ self.turn.T
             yield points, normals, self.cloud.colors_rgb[chunk][kept]
 
-    def _sample(self) -> tuple[FloatArray, FloatArray]:
-        """Return points and normals of an even sample of the cloud."""
-        step = max(1, len(self.cloud) // 500_000)
-        parts = [(points[::step], normals[::step]) for points, normals, _ in self._chunks()]
-        return np.concatenate([points for points, _ in parts]), np.concatenate([normals for _, normals in parts])
-
-    def _extent(self, xy: FloatArray) -> Extent:
-        low, high = np.quantile(xy, [_EDGE_QUANTILE, 1 - _EDGE_QUANTILE], axis=0)
-        seen_from = self.centers[:, :2]
-        low, high = np.minimum(low, seen_from.min(axis=0)), np.maximum(high, seen_from.max(axis=0))
+    def _extent(self, seen_xy: Sequence[FloatArray]) -> Extent:
+        """Return an extent with the cameras and most of what each of them sees, (N, 2) each."""
+        corners = [np.quantile(xy, [_EDGE_QUANTILE, 1 - _EDGE_QUANTILE], axis=0) for xy in seen_xy]
+        places = np.concatenate([self.centers[:, :2], *corners])
+        low, high = places.min(axis=0), places.max(axis=0)
         side = max(float((high - low).max()), 1e-6)
         low, high = low - _MARGIN * side, high + _MARGIN * side
         side *= 1 + 2 * _MARGIN
@@ -152,24 +195,34 @@ class _GroupPlan:
         """Write the files of one storey, and return its entry in floor_plan.json."""
         heights = self.centers[list(storey.cameras), 2]
         eyes = float(np.median(heights)) if len(heights) else storey.ceiling
-        grid = PlanGrid(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor), cell_px=4)
-        for points, normals, colors in self._chunks():
-            grid.add(points, normals, colors)
-        walls = wall_lines(
-            grid.wall_cells(),
-            min_share=self.params.min_wall_share,
-            min_length=0.15 * storey.height,
-            max_gap=0.12 * storey.height,
-            snap=0.08 * storey.height,
-        )
+        photo = Orthophoto(storey, extent, cut=storey.floor + self.params.cut * (eyes - storey.floor))
+        for points, _, colors in self._chunks():
+            photo.add(points, colors)
+        side = extent.pixel * max(extent.size_hw)
+        evidence = Evidence(storey, extent.with_pixel(max(storey.height / 80, side / 1500)))
+        for idx in storey.cameras:
+            evidence.add(self.view(idx))
+        cameras = self.centers[list(storey.cameras), :2]
+        plan = plan_storey(evidence, self.known, cameras=cameras, min_share=self.params.min_wall_share)
         places = self.centers[:, :2].tolist()
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
         rows, columns = extent.size_hw
         width, height = columns * extent.pixel, rows * extent.pixel
         unit = "m" if self.poses.metric else "scene units"
         box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
-        drawing = PlanDrawing(f"storey {number}", walls.ends_xy, names, box, bar_length(width), unit, self.poses.metric)
-        files = self._write_files(f"storey_{number}", grid, drawing)
+        drawing = PlanDrawing(
+            f"storey {number}",
+            np.array([wall.ends for wall in plan.walls]).reshape(-1, 2, 2),
+            plan.solids,
+            [(opening.kind, opening.ends) for opening in plan.openings],
+            plan.rooms,
+            names,
+            box,
+            bar_length(width),
+            unit,
+            self.poses.metric,
+        )
+        files = self._write_files(f"storey_{number}", photo, drawing)
         return {
             **files,
             "z_range": [storey.floor, storey.ceiling],
@@ -180,20 +233,29 @@ class _GroupPlan:
             "origin_xy": [extent.left, extent.top],
             "size_px": [extent.size_hw[1], extent.size_hw[0] + strip_px(extent.size_hw)],
             "plan_size_px": [extent.size_hw[1], extent.size_hw[0]],
-            "walls": len(walls.ends_xy),
+            "rooms": [
+                {
+                    "outline": room.outline.tolist(),
+                    "holes": [hole.tolist() for hole in room.holes],
+                    "area": room.area,
+                    "lengths": np.linalg.norm(np.roll(room.outline, -1, axis=0) - room.outline, axis=1).tolist(),
+                }
+                for room in plan.rooms
+            ],
+            "walls": [
+                {"ends": wall.ends.tolist(), "room": wall.room, "thickness": wall.thickness} for wall in plan.walls
+            ],
+            "openings": [{"kind": opening.kind, "ends": opening.ends.tolist()} for opening in plan.openings],
             "cameras": {name: list(place) for name, place in names.items()},
         }
 
-    def _write_files(self, stem: str, grid: PlanGrid, drawing: PlanDrawing) -> dict[str, str]:
+    def _write_files(self, stem: str, photo: Orthophoto, drawing: PlanDrawing) -> dict[str, str]:
         """Write the files of a storey in all formats, and return their names."""
         files: dict[str, str] = {}
-        extent = grid.extent
+        extent = photo.extent
         if "png" in self.params.formats:
             files |= {"png": f"{stem}.png", "world_file": f"{stem}.pgw"}
-            photo, known = grid.photo()
-            cameras = np.array(list(drawing.cameras.values())).reshape(-1, 2)
-            picture = draw_plan(photo, known, extent, walls=drawing.walls, cameras=cameras, unit=drawing.unit)
-            write_png(self.folder / files["png"], picture)
+            write_png(self.folder / files["png"], draw_plan(*photo.picture(), drawing))
             text = world_file_text(extent.pixel, extent.left, extent.top)
             (self.folder / files["world_file"]).write_text(text, encoding="ascii")
         if "svg" in self.params.formats:
@@ -203,3 +265,16 @@ class _GroupPlan:
             files["dxf"] = f"{stem}.dxf"
             write_dxf(self.folder / files["dxf"], drawing)
         return files
+
+
+def _lines(planes: Structure | None, group: int, turn: FloatArray) -> list[Line]:
+    """Return the lines of the upright planes of a group, in the plan."""
+    if planes is None:
+        return []
+    upright = (planes.group_idx == group) & (np.abs(planes.normals_in_world[:, 1]) < 0.5)
+    normals = (planes.normals_in_world[upright] @ turn.T)[:, :2]
+    lengths = np.linalg.norm(normals, axis=1)
+    return [
+        Line(normal / length, float(offset / length))
+        for normal, length, offset in zip(normals, lengths, planes.offsets[upright], strict=True)
+    ]

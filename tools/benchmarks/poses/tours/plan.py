@@ -23,7 +23,9 @@ from tools.benchmarks.poses.tours.materials import (
 )
 from tools.benchmarks.poses.tours.rendering import Boxes
 
-_WALL = 0.12
+WALL = 0.12
+"""Thickness of a wall in metres."""
+
 _SLAB = 0.25
 _DOOR = (0.85, 2.05)
 _STAIR = 1.0
@@ -69,6 +71,18 @@ class Room:
     floor: float
 
 
+@dataclass(frozen=True)
+class Opening:
+    """A door, window, balcony or opening in a wall along x (axis 0) or y, from start to end, on a floor."""
+
+    axis: int
+    line: float
+    start: float
+    end: float
+    kind: str
+    floor: float
+
+
 @dataclass
 class _Builder:
     """Collects boxes, the ground that furniture covers, and the doors."""
@@ -80,6 +94,7 @@ class _Builder:
     # Rectangles (x0, y0, x1, y1, floor) where no camera and no furniture can stand.
     taken: list[tuple[float, float, float, float, float]] = field(default_factory=list)
     doors: list[tuple[float, float, float]] = field(default_factory=list)
+    openings: list[Opening] = field(default_factory=list)
 
     def box(self, low: tuple[float, float, float], high: tuple[float, float, float], material: int, color: Color,
             *, seed: int | None = None, turn_deg: float = 0.0) -> None:  # fmt: skip
@@ -96,6 +111,18 @@ class _Builder:
 
 def build(style: Style, *, seed: int) -> tuple[Boxes, list[Camera]]:
     """Return the surfaces of a house and its cameras in the order of a visit."""
+    builder, cameras, _ = _built(style, seed)
+    return Boxes(np.array(builder.frames), np.array(builder.kinds, np.int64), np.array(builder.colors)), cameras
+
+
+def rooms_of(style: Style, *, seed: int) -> tuple[list[Room], list[Opening]]:
+    """Return the rooms of a house that have a camera, up to the middle of their walls, and all openings of walls."""
+    builder, cameras, rooms = _built(style, seed)
+    seen = {camera.room for camera in cameras}
+    return [room for room in rooms if room.name in seen], builder.openings
+
+
+def _built(style: Style, seed: int) -> tuple[_Builder, list[Camera], list[Room]]:
     rng = np.random.default_rng([seed, 0x70])
     builder = _Builder(rng)
     wide, south, north = rng.uniform(1.5, 2.0), rng.uniform(3.4, 4.8), rng.uniform(4.9, 5.4)
@@ -104,8 +131,7 @@ def build(style: Style, *, seed: int) -> tuple[Boxes, list[Camera]]:
         floor = storey * (height + _SLAB)
         found = _storey(builder, style, floor=floor, sizes=(wide, south, north), height=height, storey=storey)
         rooms += found
-    cameras = _cameras(builder, style, rooms)
-    return Boxes(np.array(builder.frames), np.array(builder.kinds, np.int64), np.array(builder.colors)), cameras
+    return builder, _cameras(builder, style, rooms), rooms
 
 
 def _storey(
@@ -212,7 +238,7 @@ def _wall(
     axis, line, start, end = place
     z, height = level
 
-    def add(a: float, b: float, low: float, high: float, material: int, color: Color, half: float = _WALL / 2) -> None:
+    def add(a: float, b: float, low: float, high: float, material: int, color: Color, half: float = WALL / 2) -> None:
         across, along = (line - half, line + half), (a, b)
         x, y = (along, across) if axis == 0 else (across, along)
         if b - a > 1e-6:
@@ -221,6 +247,7 @@ def _wall(
     trim: Color = WHITE if builder.rng.random() < 0.5 else WOODS[int(builder.rng.integers(len(WOODS)))]
     at = start
     for a, b, kind in sorted(openings):
+        builder.openings.append(Opening(axis, line, a, b, kind, z))
         bottom, top = {"window": (0.9, 2.1), "balcony": (0.05, 2.15), "opening": (0.0, 2.3)}.get(kind, (0.0, _DOOR[1]))
         add(at, a, 0.0, height, PLASTER, WHITE)
         add(a, b, top, height, PLASTER, WHITE)
@@ -236,10 +263,10 @@ def _wall(
                     add(float(fin), float(fin) + 0.045, 0.15, 0.7, PLAIN, WHITE, half=0.17)
         else:
             for left in (a, b - 0.05):
-                add(left, left + 0.05, 0.0, top, WOOD, trim, half=_WALL / 2 + 0.015)
-            add(a, b, top - 0.05, top, WOOD, trim, half=_WALL / 2 + 0.015)
+                add(left, left + 0.05, 0.0, top, WOOD, trim, half=WALL / 2 + 0.015)
+            add(a, b, top - 0.05, top, WOOD, trim, half=WALL / 2 + 0.015)
             for low in (0.28, 1.08):  # a socket and a switch
-                add(b + 0.12, b + 0.2, low, low + 0.08, PLAIN, (0.6, 0.6, 0.58), half=_WALL / 2 + 0.008)
+                add(b + 0.12, b + 0.2, low, low + 0.08, PLAIN, (0.6, 0.6, 0.58), half=WALL / 2 + 0.008)
             middle = (0.5 * (a + b), line) if axis == 0 else (line, 0.5 * (a + b))
             builder.doors.append((*middle, z))
             clear = 0.9 if kind == "door" else 0.5
@@ -271,7 +298,7 @@ def _stairs(builder: _Builder, hall: Room, rise: float) -> None:
     color = WOODS[int(builder.rng.integers(len(WOODS)))]
     for step in range(steps):
         y, top = y0 + 0.6 + 3.3 * step / steps, hall.floor + rise * (step + 1) / steps
-        builder.box((x1 - _STAIR, y, top - 0.2), (x1 - _WALL / 2, y + 3.3 / steps, top), WOOD, color)
+        builder.box((x1 - _STAIR, y, top - 0.2), (x1 - WALL / 2, y + 3.3 / steps, top), WOOD, color)
     builder.taken.append((x1 - _STAIR - 0.2, y0, x1, y0 + 4.2, hall.floor))
 
 

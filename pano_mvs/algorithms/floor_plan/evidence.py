@@ -1,0 +1,163 @@
+"""What the views of one storey show of it, in layers of a grid seen from above: surfaces, and what they see through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Storey
+from pano_mvs.algorithms.fusion.view import normals_from_range
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
+from pano_mvs.algorithms.structure.view import on_grid, stride_of
+from pano_mvs.core.arrays import FloatArray
+from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+_CLOUD_SIZE = 90, 180
+LAYERS = 16
+"""Number of layers between floor and ceiling."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanView:
+    """The ranges of a view with z up.
+
+    `center`: (3,). `cam_from_plan`: (3, 3). `free`: (h, w) ranges up to which nothing is in the way, NaN where unknown.
+    `points`: (N, 3) places on surfaces. `normals`: (N, 3) of the surfaces, NaN where unknown.
+    """
+
+    center: FloatArray
+    cam_from_plan: FloatArray
+    free: FloatArray
+    points: FloatArray
+    normals: FloatArray
+
+
+def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
+    """Return the view of a range map, on about 256 rows; ranges that nothing confirms count as unknown."""
+    height, width = range_map.range.shape
+    stride = stride_of((height, width))
+    given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
+    ranges, confidence = on_grid(range_map.range, stride).astype(np.float64), on_grid(range_map.confidence, stride)
+    error = np.where(confidence >= CONSISTENT_CONFIDENCE[0], 0.0, UNCONFIRMED_UNCERTAINTY)
+    if range_map.uncertainty is not None:
+        known = on_grid(range_map.uncertainty, stride).astype(np.float64)
+        error = np.where(np.isnan(known), UNCONFIRMED_UNCERTAINTY, known)
+    ranges[error > UNCONFIRMED_UNCERTAINTY / 3] = np.nan  # confirmed neither by views nor by planes
+    normals = on_grid(normals_from_range(range_map, given=given), stride)
+    seen = np.isfinite(ranges)
+    rays = on_grid(ray_grid((height, width)), stride)
+    return PlanView(
+        cam_from_plan.center,
+        cam_from_plan.rotation,
+        ranges * (1 - 2 * error),
+        cam_from_plan.inverse().apply(rays[seen] * ranges[seen][:, None]),
+        normals[seen] @ cam_from_plan.rotation,
+    )
+
+
+class CloudViews:
+    """The views of a cloud whose range maps are not known: each point is seen from the nearest camera before it."""
+
+    def __init__(self, cams_from_plan: Sequence[Rigid3]) -> None:
+        self._cams = cams_from_plan
+        self._tree = cKDTree([cam.center for cam in cams_from_plan])
+        # x, y, z, their normal's and the range of the nearest point in each pixel
+        self._seen = np.full((len(cams_from_plan), *_CLOUD_SIZE, 7), np.inf, np.float32)
+
+    def add(self, points: FloatArray, normals: FloatArray) -> None:
+        """Add points (N, 3) with z up, and their unit normals (N, 3)."""
+        near = np.asarray(self._tree.query(points, k=np.arange(1, 1 + min(4, len(self._cams))))[1])
+        way = self._tree.data[near] - points[:, None]
+        before = (way * normals[:, None]).sum(axis=-1) > 0
+        camera = np.where(before.any(axis=1), near[np.arange(len(near)), before.argmax(axis=1)], -1)
+        for number in np.unique(camera[camera >= 0]):
+            own = camera == number
+            in_cam = self._cams[number].apply(points[own])
+            distance = np.linalg.norm(in_cam, axis=1)
+            far_first = np.argsort(-distance, kind="stable")
+            row, column = (index[far_first] for index in pixels_containing(in_cam, _CLOUD_SIZE))
+            found = np.column_stack([points[own], normals[own], distance])[far_first]
+            nearer = found[:, 6] < self._seen[number, row, column, 6]
+            self._seen[number, row[nearer], column[nearer]] = found[nearer]
+
+    def view(self, number: int) -> PlanView:
+        """Return the view of a camera."""
+        seen = self._seen[number].astype(np.float64)
+        ranges = np.where(np.isinf(seen[..., 6]), np.nan, seen[..., 6])
+        known = seen[np.isfinite(ranges)]
+        return PlanView(self._cams[number].center, self._cams[number].rotation, ranges, known[:, :3], known[:, 3:6])
+
+
+@dataclass(frozen=True, eq=False)
+class WallCells:
+    """Cells of a plan with vertical surfaces.
+
+    `xy`: (N, 2) mean position of the points in each cell. `normals_xy`: (N, 2) unit normals, on the side that was seen.
+    `layers`: (N, LAYERS) whether such points are in a layer. `cell`: edge of a cell.
+    """
+
+    xy: FloatArray
+    normals_xy: FloatArray
+    layers: NDArray[np.bool_]
+    cell: float
+
+    def only(self, chosen: NDArray[np.bool_]) -> WallCells:
+        """Return some of the cells."""
+        return WallCells(self.xy[chosen], self.normals_xy[chosen], self.layers[chosen], self.cell)
+
+
+class Evidence:
+    """How many views see through each cell of each layer, and how many see a vertical surface there."""
+
+    def __init__(self, storey: Storey, extent: Extent) -> None:
+        self.storey, self.extent = storey, extent
+        count = extent.size_hw[0] * extent.size_hw[1]
+        self.free, self.hits = (np.zeros((count, LAYERS), np.uint16) for _ in range(2))
+        self._sums = np.zeros((count, 5))  # x, y, their normal's, number
+
+    def add(self, view: PlanView) -> None:
+        """Add a view."""
+        if not len(view.points):
+            return
+        index, inside = self.extent.cells(view.points[:, :2])
+        layer = np.floor((view.points[:, 2] - self.storey.floor) / self._layer).astype(np.int64)
+        with np.errstate(invalid="ignore"):
+            inside &= (layer >= 0) & (layer < LAYERS) & (np.abs(view.normals[:, 2]) < 0.35)
+        chosen = index[inside]
+        self.hits.reshape(-1)[np.unique(chosen * LAYERS + layer[inside])] += 1
+        values = np.column_stack([view.points[inside, :2], view.normals[inside, :2], np.ones(len(chosen))])
+        for column in range(5):
+            self._sums[:, column] += np.bincount(chosen, values[:, column], len(self._sums))
+        self._add_free(view)
+
+    def _add_free(self, view: PlanView) -> None:
+        centers = self.extent.centers()
+        low, high = np.quantile(view.points[:, :2], [0.01, 0.99], axis=0)
+        near = np.flatnonzero(((centers >= low) & (centers <= high)).all(axis=1))
+        for layer in range(LAYERS):
+            height = self.storey.floor + (layer + 0.5) * self._layer
+            way = np.column_stack([centers[near], np.full(len(near), height)]) - view.center
+            row, column = pixels_containing(way @ view.cam_from_plan.T, view.free.shape)
+            beyond = view.free[row, column] - np.linalg.norm(way, axis=1)
+            with np.errstate(invalid="ignore"):
+                self.free[near[beyond > 1.5 * self.extent.pixel], layer] += 1
+
+    @property
+    def _layer(self) -> float:
+        return max(self.storey.height, 1e-12) / LAYERS
+
+    def wall_cells(self) -> WallCells:
+        """Return the cells with vertical surfaces."""
+        lengths = np.linalg.norm(self._sums[:, 2:4], axis=1)
+        used = np.flatnonzero(lengths > 0.3 * self._sums[:, 4])  # points whose normals agree
+        sums, lengths = self._sums[used], lengths[used]
+        return WallCells(
+            sums[:, :2] / sums[:, 4:], sums[:, 2:4] / lengths[:, None], self.hits[used] > 0, self.extent.pixel
+        )
