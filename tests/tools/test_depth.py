@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.scales import sharp_halvings
+from pano_mvs.algorithms.filters.uncertainty import EXPONENTS, FACTOR, probability_within
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap, Record
@@ -28,7 +29,7 @@ from tools.benchmarks.poses.tours.materials import PLASTER
 from tools.benchmarks.poses.tours.plan import level_rotation
 from tools.benchmarks.poses.tours.rendering import Boxes, first_surfaces, unlit
 from tools.benchmarks.tables import reported
-from tools.benchmarks.uncertainty import coverage, halved_truth
+from tools.benchmarks.uncertainty import deviations, fit, halved_truth, left_out, read_errors
 
 ROOM = Place("weak_room", 64, 2, arguments=(("seed", 1),))
 SMALL = "depth.planes=16 depth.near=1.0 depth.far=6.0"
@@ -225,11 +226,31 @@ def test_ranges_in_the_sky_are_wrong() -> None:
     assert (scores["confirmed"], scores["confirmed_delta"]) == pytest.approx((200, 50))
 
 
-def test_errors_of_a_normal_distribution_are_covered_as_expected() -> None:
-    rng = np.random.default_rng(0)
-    sigma = rng.uniform(0.01, 0.1, 20_000)
-    shares = coverage(np.abs(rng.normal(0, sigma)), sigma, np.ones(20_000))
-    np.testing.assert_allclose(shares, [0.683, 0.954, 0.997], atol=0.01)
+def test_the_exponents_of_uncertainty_are_those_of_the_stored_errors() -> None:
+    errors = read_errors()
+    factor, exponents = fit(errors)
+    assert factor == pytest.approx(FACTOR, abs=0.02)
+    assert exponents == pytest.approx(EXPONENTS, abs=0.02)
+
+
+def test_errors_are_within_two_standard_deviations_in_places_that_were_left_out() -> None:
+    errors = read_errors()
+    within = left_out(errors)
+    shares = {name: within[errors.place == name].mean() for name in np.unique(errors.place)}
+    assert min(shares.values()) > 0.8
+    assert np.mean(list(shares.values())) > 0.93
+    walls = np.char.startswith(errors.surface.astype(str), "walls")
+    assert 0.92 < within[walls].mean() < 0.98
+
+
+def test_confidence_is_right_as_often_as_it_says() -> None:
+    """The share within 2 % in each quarter of the probability; below a half, it says too little."""
+    errors = read_errors()
+    probability = probability_within(deviations(errors, FACTOR, EXPONENTS), 0.02)
+    for least in (0.25, 0.5, 0.75):
+        here = (probability >= least) & (probability < least + 0.25)
+        excess = (errors.error[here] < 0.02).mean() - probability[here].mean()
+        assert -0.05 < excess < (0.2 if least < 0.5 else 0.05)
 
 
 def test_a_halved_plane_is_the_plane_and_edges_do_not_mix() -> None:

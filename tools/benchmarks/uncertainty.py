@@ -23,7 +23,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pano_mvs.algorithms.filters import consistency
-from pano_mvs.algorithms.filters.uncertainty import EXPONENTS, FACTOR, confirmed_uncertainty, error_factors
+from pano_mvs.algorithms.filters.uncertainty import (
+    EXPONENTS,
+    FACTOR,
+    MOST_UNCERTAINTY,
+    confirmed_uncertainty,
+    error_factors,
+)
 from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_solid_angle
@@ -93,10 +99,15 @@ def fit(errors: Errors) -> tuple[float, dict[str, float]]:
     return round(float(np.exp(found[0]) / 2), 3), dict(zip(names, np.round(found[1:], 2).tolist(), strict=True))
 
 
+def deviations(errors: Errors, factor: float, exponents: Mapping[str, float]) -> FloatArray:
+    """Return the standard deviations (N,)."""
+    logs = np.log(factor) + sum(power * errors.logs[name] for name, power in exponents.items())
+    return np.exp(np.minimum(logs, np.log(MOST_UNCERTAINTY)))
+
+
 def covered(errors: Errors, factor: float, exponents: Mapping[str, float]) -> NDArray[np.bool_]:
     """Return which errors (N,) are within two standard deviations."""
-    logs = np.log(factor) + sum(power * errors.logs[name] for name, power in exponents.items())
-    return np.asarray(errors.error < 2 * np.exp(logs))
+    return np.asarray(errors.error < 2 * deviations(errors, factor, exponents))
 
 
 def left_out(errors: Errors) -> NDArray[np.bool_]:

@@ -17,7 +17,15 @@ from pano_mvs.algorithms.filters.consistency import (
     nearest_views,
     view_doubts,
 )
-from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY, confirmed_uncertainty, with_ranges
+from pano_mvs.algorithms.filters.uncertainty import (
+    EXPONENTS,
+    FACTOR,
+    UNCONFIRMED_UNCERTAINTY,
+    confirmed_uncertainty,
+    probability_within,
+    with_ranges,
+)
+from pano_mvs.algorithms.ranges.agreement import Comparison
 from pano_mvs.algorithms.ranges.agreement import agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows, count_agreeing
 from pano_mvs.core.errors import ContractError, UsageError
@@ -376,11 +384,12 @@ def test_every_range_has_one_and_unconfirmed_ones_have_the_same(noisy_checked: R
     assert np.median(sigma[confirmed]) < 0.03
 
 
-def test_it_is_the_formula() -> None:
-    """σ = 5.4 e (ρ M)^¼ (1 + 5 d)^⅓ / M, each factor on its own."""
+def test_it_is_a_product_of_powers() -> None:
+    """Each factor on its own."""
     size = (64, 128)
     whole, flat, steep = np.ones(size, np.bool_), np.zeros(size, np.float32), np.full(size, 0.2, np.float32)
     checks = np.where(np.add.outer(np.arange(64), np.arange(128)) % 2 == 0, 1.0, -1.0)
+    pixel = 2 * np.pi / size[1]
 
     def middle(
         *,
@@ -389,26 +398,37 @@ def test_it_is_the_formula() -> None:
         step: np.ndarray = flat,
         error_px: float = 0.1,
         motion: float = 20,
+        opposed: int = 0,
     ) -> float:
+        counts = (np.full(size, count, np.uint16) for count in (2, opposed, 0))
         support = np.full(size, 2.0)
-        found = confirmed_uncertainty(
-            consistent,
-            (2 / (1 + rough * checks)).astype(np.float32),
-            support=support,
-            squared_error=support * error_px**2,
-            motion=support * motion / 2,
-            step=step,
-        )
-        return float(found[32, 64])
+        comparison = Comparison(*counts, support, (motion * pixel) ** 2 * whole, support * (error_px * pixel) ** 2)
+        ranges = (2 / (1 + rough * checks)).astype(np.float32)
+        return float(confirmed_uncertainty(consistent, ranges, comparison, step=step)[32, 64])
 
-    assert middle() == pytest.approx(5.4 * 0.1 * (0.01 * 20) ** 0.25 / 20, rel=0.02)
-    assert middle(motion=40) == pytest.approx(middle() / 2**0.75, rel=2e-3)
-    assert middle(error_px=0.2) == pytest.approx(2 * middle(), rel=2e-3)
-    assert middle(step=steep) == pytest.approx(6 ** (1 / 3) * middle(), rel=2e-3)
-    assert middle(rough=0.04) == pytest.approx(4**0.25 * middle(), rel=0.02)
-    assert middle(rough=0) == pytest.approx((0.01 / 0.2) ** 0.25 * middle(), rel=0.02)
-    # Ranges that no other view confirms say nothing about the surface.
-    assert middle(consistent=checks > 0) == pytest.approx(middle(rough=0), rel=0.02)
+    def ratio(name: str, factor: float) -> object:
+        return pytest.approx(factor ** EXPONENTS[name], rel=0.02)
+
+    expected = {"motion": 20, "error": 0.1, "roughness": 0.01 * 20}
+    assert middle() == pytest.approx(
+        FACTOR * np.prod([value ** EXPONENTS[name] for name, value in expected.items()]), rel=0.02
+    )
+    assert middle(motion=40, rough=0.005) / middle() == ratio("motion", 2)
+    assert middle(error_px=0.2) / middle() == ratio("error", 2)
+    assert middle(step=steep) / middle() == ratio("steps", 6)
+    assert middle(rough=0.04) / middle() == ratio("roughness", 4)
+    assert middle(rough=0) / middle() == ratio("roughness", 0.01 / 0.2)
+    assert middle(opposed=2) / middle() == ratio("opposed", 3)
+    # Ranges that no other view confirms say nothing about the surface, but their number counts.
+    assert middle(consistent=checks > 0) / middle(rough=0) == ratio("confirmed", 0.5)
+
+
+def test_confidence_is_the_probability_that_a_range_is_right(noisy_checked: RangeMap) -> None:
+    sigma, confirmed = uncertainty_of(noisy_checked), noisy_checked.confidence >= 128
+    probability = probability_within(sigma[confirmed], 0.02)
+    np.testing.assert_array_equal(noisy_checked.confidence[confirmed], np.floor(128 + 127 * probability))
+    assert probability_within(np.array([0.0]), 0.02) == 1
+    assert probability_within(np.array([0.02 / 0.3]), 0.02) == pytest.approx(0.5)
 
 
 def test_changes_add_to_it(noisy_checked: RangeMap) -> None:
