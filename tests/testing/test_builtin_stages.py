@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from _pytest.mark.structures import ParameterSet
 
+from pano_mvs.algorithms.learned import aliked
+from pano_mvs.algorithms.learned.aliked import level_tiles
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames, SplatFrames
 from pano_mvs.scene.files import LevelPanorama
@@ -56,6 +59,14 @@ def contract_tests() -> list[ParameterSet]:
             stages[name], settings=SETTINGS.get(name), inputs=INPUTS.get(name), size_hw=SIZES_HW.get(name, (32, 64))
         )
     ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_views() -> Iterator[None]:
+    """Let the network of key points look at two of its views: each takes a quarter of a second."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(aliked, "level_tiles", lambda up: level_tiles(up)[:2])
+        yield
 
 
 @pytest.mark.parametrize("contract_test", contract_tests())
