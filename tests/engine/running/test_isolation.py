@@ -18,19 +18,15 @@ from pano_mvs.core.process_state import has_plugins, loading_plugin
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import execute
 from pano_mvs.engine.executors.choose import SerialExecutor
-from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
+from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages import registry
 from tests.engine.conftest import Toy, ran, start
-from tests.engine.running.test_executors import Make, files_below, run_with, told, two_processes
+from tests.engine.running.test_executors import Make, files_below, one_process, run_with, told, two_processes
 from tests.engine.running.test_run import ALL_UNITS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-
-
-def one_process(store: Store) -> ProcessExecutor:
-    return ProcessExecutor(store, workers=1, threads=1)
 
 
 def edit(toy: Toy, code: str) -> None:
