@@ -35,7 +35,7 @@ from tests.engine.running.test_run import ALL_UNITS
 Make = Callable[[Store], Executor]
 
 
-def one_process(store: Store) -> ProcessExecutor:
+def one_process(store: Store) -> Executor:
     return ProcessExecutor(store, workers=1, threads=1)
 
 
