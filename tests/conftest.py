@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
+import tempfile
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
 
 # Two threads of OpenBLAS cost more than twice the time of one on the small arrays in here; it reads this when numpy
 # is imported.
@@ -11,6 +16,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
 import cv2  # noqa: F401
+import pytest
+import typer.main
 from hypothesis import HealthCheck, settings
 
 # How long it takes to draw an example depends on what else the machine does.
@@ -20,8 +27,18 @@ settings.load_profile("untimed")
 os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
 # PyVista takes seconds to start; the tests of its pictures name it.
 os.environ.setdefault("PANO_MVS_RENDERER", "software")
+# The tests write 100,000 small files. Some disks need a millisecond to delete one, and memory does not.
+MEMORY = Path("/dev/shm")
+if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4 << 30:
+    os.environ.setdefault("TMPDIR", str(MEMORY))
+    tempfile.tempdir = None  # pytest has asked for the folder already
 # What whoever runs the tests has among their own plugins is no part of them.
 os.environ["PANO_MVS_PLUGINS"] = ""
+
+# Neither the commands nor what is installed changes during the tests. It takes 15 ms to make the commands, which each
+# `CliRunner` would do anew, and 5 ms to look for plugins among 160 installed packages, as each session does.
+pytest.MonkeyPatch().setattr("typer.testing._get_command", cache(typer.main.get_command))
+pytest.MonkeyPatch().setattr("pano_mvs.engine.stages.registry.entry_points", cache(entry_points))
 
 
 def pytest_collection_finish() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Literal, Protocol
 
 import numpy as np
@@ -286,19 +287,18 @@ def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int
 def _interpolated(positions: FloatArray) -> FloatArray:
     """Return the periodic volume at positions (N, 3) in cells, by trilinear interpolation."""
     volume = _volume().ravel()
-    low = np.floor(positions)
-    weight = positions - low
-    index = low.astype(np.int64)
-    columns = [
-        ((index[:, k] % _CELLS) * step, ((index[:, k] + 1) % _CELLS) * step)
-        for k, step in enumerate((_CELLS * _CELLS, _CELLS, 1))
+    low = np.floor(positions.T)
+    weights, index = positions.T - low, low.astype(np.int64)
+    steps = (_CELLS * _CELLS, _CELLS, 1)
+    sides = [
+        ((1 - weight, (cell & (_CELLS - 1)) * step), (weight, ((cell + 1) & (_CELLS - 1)) * step))
+        for weight, cell, step in zip(weights, index, steps, strict=True)
     ]
     result = np.zeros(len(positions))
-    for corner in np.ndindex(2, 2, 2):
-        share = np.ones(len(positions))
-        for k in range(3):
-            share *= weight[:, k] if corner[k] else 1 - weight[:, k]
-        result += share * volume[columns[0][corner[0]] + columns[1][corner[1]] + columns[2][corner[2]]]
+    for (x_share, x_idx), (y_share, y_idx) in product(sides[0], sides[1]):
+        share, idx = x_share * y_share, x_idx + y_idx
+        for z_share, z_idx in sides[2]:
+            result += share * z_share * volume[idx + z_idx]
     return result
 
 

@@ -35,6 +35,10 @@ from tests.engine.running.test_run import ALL_UNITS
 Make = Callable[[Store], Executor]
 
 
+def one_process(store: Store) -> Executor:
+    return ProcessExecutor(store, workers=1, threads=1)
+
+
 def two_processes(store: Store) -> Executor:
     return ProcessExecutor(store, workers=2, threads=1)
 
@@ -144,7 +148,7 @@ def kill_once(
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_killed_worker_costs_one_try(toy: Toy) -> None:
     kill_once(toy)
-    result = run_with(toy, two_processes)
+    result = run_with(toy, one_process)
     assert result.exit_code == 0
     assert ran(result) == ALL_UNITS
 
@@ -268,7 +272,7 @@ def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -
         run_with(toy, two_processes)
 
 
-@pytest.mark.parametrize("make", [SerialExecutor, two_processes])
+@pytest.mark.parametrize("make", [SerialExecutor, one_process])
 def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make) -> None:
     toy.edit(
         "plug.py",
@@ -465,7 +469,7 @@ def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
     ctypes.CDLL(None).puts(b"from C")''',
         ),
     )
-    for name, make in {"serial": SerialExecutor, "processes": two_processes}.items():
+    for name, make in {"serial": SerialExecutor, "processes": one_process}.items():
         assert run_with(toy, make, name=name).exit_code == 0
         text = (toy.folder / f"out-{name}" / "logs" / "scaled" / "3.txt.log").read_text()
         assert sorted(text.splitlines()) == sorted(

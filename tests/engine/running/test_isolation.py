@@ -14,22 +14,19 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.process_state import has_plugins
+from pano_mvs.core.process_state import has_plugins, loading_plugin
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import execute
 from pano_mvs.engine.executors.choose import SerialExecutor
-from pano_mvs.engine.executors.processes import ProcessExecutor, WorkerProcess
+from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.stages import registry
 from tests.engine.conftest import Toy, ran, start
-from tests.engine.running.test_executors import Make, files_below, run_with, told, two_processes
+from tests.engine.running.test_executors import Make, files_below, one_process, run_with, told, two_processes
 from tests.engine.running.test_run import ALL_UNITS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-
-
-def one_process(store: Store) -> ProcessExecutor:
-    return ProcessExecutor(store, workers=1, threads=1)
 
 
 def edit(toy: Toy, code: str) -> None:
@@ -57,6 +54,7 @@ def test_changed_libraries_do_not_reach_other_units(
 ) -> None:
     """A plugin that switched OpenCV's optimisation off changed 12 of 12 files of built-in stages, with exit 0."""
     monkeypatch.setattr(execute, "has_plugins", has_plugins)
+    monkeypatch.setattr(registry, "loading_plugin", loading_plugin)
     clean = run_with(toy, SerialExecutor, name="clean")
     edit(
         toy,
