@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.filters.uncertainty import EXPONENTS, FACTOR, probability_within
+from pano_mvs.algorithms.scales import sharp_halvings
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap, Record

@@ -102,7 +102,7 @@ def fit(errors: Errors) -> tuple[float, dict[str, float]]:
 def deviations(errors: Errors, factor: float, exponents: Mapping[str, float]) -> FloatArray:
     """Return the standard deviations (N,)."""
     logs = np.log(factor) + sum(power * errors.logs[name] for name, power in exponents.items())
-    return np.exp(np.minimum(logs, np.log(MOST_UNCERTAINTY)))
+    return np.asarray(np.exp(np.minimum(logs, np.log(MOST_UNCERTAINTY))))
 
 
 def covered(errors: Errors, factor: float, exponents: Mapping[str, float]) -> NDArray[np.bool_]:

@@ -25,8 +25,7 @@ from pano_mvs.algorithms.filters.uncertainty import (
     probability_within,
     with_ranges,
 )
-from pano_mvs.algorithms.ranges.agreement import Comparison
-from pano_mvs.algorithms.ranges.agreement import agreeing_sources, compare_with_sources, seen_ranges
+from pano_mvs.algorithms.ranges.agreement import Comparison, agreeing_sources, compare_with_sources, seen_ranges
 from pano_mvs.algorithms.ranges.kernels_agreement import compare_rows, count_agreeing
 from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama, sines_of_grid
@@ -400,9 +399,10 @@ def test_it_is_a_product_of_powers() -> None:
         motion: float = 20,
         opposed: int = 0,
     ) -> float:
-        counts = (np.full(size, count, np.uint16) for count in (2, opposed, 0))
-        support = np.full(size, 2.0)
-        comparison = Comparison(*counts, support, (motion * pixel) ** 2 * whole, support * (error_px * pixel) ** 2)
+        agreeing, contradicting, hiding = (np.full(size, count, np.uint16) for count in (2, opposed, 0))
+        support, moved = np.full(size, 2.0), np.full(size, (motion * pixel) ** 2)
+        squares = support * (error_px * pixel) ** 2
+        comparison = Comparison(agreeing, contradicting, hiding, support, moved, squares)
         ranges = (2 / (1 + rough * checks)).astype(np.float32)
         return float(confirmed_uncertainty(consistent, ranges, comparison, step=step)[32, 64])
 
