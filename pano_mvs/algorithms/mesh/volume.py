@@ -19,6 +19,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array, csr_array
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.algorithms.mesh.view_quality import face_normals
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
@@ -136,14 +137,14 @@ class Volume:
             axis = int(np.argmax(np.abs(normal)))
             first, second = (other for other in range(3) if other != axis)
             distances, measured, target = (np.moveaxis(array, axis, 2) for array in (self.distances, known, filled))
-            rows, columns = np.indices(distances.shape[:2])
-            depth = distances.shape[2]
+            grid, depth = np.indices(distances.shape[:2]), distances.shape[2]
+            rows, columns = grid[0], grid[1]
             # Position of the plane along the axis, in cells.
             level = (offset - normal @ self.origin) / self.cell - normal[first] * rows - normal[second] * columns
             level /= normal[axis]
             nearest = np.rint(level).astype(np.int64)
             inside = (nearest >= 0) & (nearest < depth)
-            at: NDArray[np.int64] = np.clip(nearest, 0, depth - 1)
+            at = np.clip(nearest, 0, depth - 1)
             error = distances[rows, columns, at] - (at - level) * self.cell * normal[axis]
             seen = inside & measured[rows, columns, at] & (np.abs(error) < 0.7 * self.cell)
             closed = _closed(seen, radius) & inside
@@ -256,6 +257,15 @@ def on_planes(surface: Surface, planes: Planes, *, reach: float) -> tuple[NDArra
     moved = system.any(axis=(1, 2))
     vertices[moved] += np.einsum("vir,vr->vi", np.linalg.pinv(system[moved], rcond=1e-3), wanted[moved])
     return vertices.astype(np.float32), np.asarray(moved)
+
+
+def plane_of_faces(surface: Surface, planes: Planes, *, tolerance: float) -> NDArray[np.int64]:
+    """Return the number of the plane on which all corners of each triangle lie, (F,), −1 for none."""
+    off = (np.abs(surface[0].astype(np.float64) @ planes[0].T - planes[1]) > tolerance)[surface[1]].any(axis=1)
+    off |= face_normals(*surface) @ planes[0].T < 0.9
+    alone = np.concatenate([off, np.zeros((len(off), 1), np.bool_)], axis=1)
+    nearest = np.argmin(alone, axis=1)
+    return np.where(nearest < len(planes[1]), nearest, -1)
 
 
 def adjacency(faces: NDArray[np.int32], count: int) -> csr_array:

@@ -31,6 +31,7 @@ from pano_mvs.algorithms.mesh.volume import (
     empty_volume,
     most_certain,
     on_planes,
+    plane_of_faces,
 )
 from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.core.text import plural
@@ -272,7 +273,9 @@ def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedPar
     balance = balanced_views(vertices, faces, load, views=len(views), threads=ctx.threads)
     if not balance.density > 0:
         raise InputError("no panorama sees the mesh, so it has no texture. Check the masks and the poses")
-    atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
+    region = plane_of_faces((vertices, faces), planes, tolerance=0.05 * volume.cell)
+    density = balance.density * params.detail
+    atlas = unwrapped(vertices, faces, texels_per_unit=density, max_px=params.texture_px, region=region)
     return textured(vertices, faces, atlas, load=load, balance=balance, threads=ctx.threads)
 
 
