@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array, csr_array
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.algorithms.mesh.view_quality import face_normals
+from pano_mvs.algorithms.mesh.view_quality import face_normals, surface_view
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
@@ -42,7 +42,7 @@ MAX_CELLS = 1 << 23
 _PLANE_UNCERTAINTY = 0.01
 _GAPS = 3, 5, 9, 17
 # Distances are cut off this many cells from the surface.
-_LIMIT_CELLS = 2.0
+_LIMIT_CELLS = 3.0
 
 
 def most_certain(range_map: RangeMap, measured: RangeMap) -> RangeMap:
@@ -73,7 +73,7 @@ class Volume:
     """Signed distances in a grid of cubic cells.
 
     `origin`: (3,) centre of the first cell. `cell`: width of a cell. `distances`: (X, Y, Z) float32, positive in front
-    of the surface, cut off two cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `middle`:
+    of the surface, cut off three cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `middle`:
     median range of what was measured.
     """
 
@@ -157,6 +157,13 @@ class Volume:
         gaps = ~known & (np.abs(filled) <= _LIMIT_CELLS * self.cell)
         self.distances[gaps] = filled[gaps]
         self.weights[gaps] = np.finfo(np.float32).tiny
+
+    def smooth(self) -> None:
+        """Replace each distance by the mean of the known ones around it: single pixels leave no crumbs."""
+        known = (self.weights > 0).astype(np.float32)
+        around = ndimage.uniform_filter(known, 3, mode="constant")
+        means = ndimage.uniform_filter(self.distances * known, 3, mode="constant")
+        np.divide(means, around, out=self.distances, where=known > 0)
 
     def surface(self) -> Surface:
         """Return the surface where all eight cells around a vertex are known.
@@ -257,6 +264,25 @@ def on_planes(surface: Surface, planes: Planes, *, reach: float) -> tuple[NDArra
     moved = system.any(axis=(1, 2))
     vertices[moved] += np.einsum("vir,vr->vi", np.linalg.pinv(system[moved], rcond=1e-3), wanted[moved])
     return vertices.astype(np.float32), np.asarray(moved)
+
+
+def seen_triangles(surface: Surface, poses: Sequence[Rigid3], kept: Mask, *, threads: int = 1) -> NDArray[np.int32]:
+    """Return the triangles of a surface, (F, 3), that a panorama sees, and those near them or vertices that are kept.
+
+    What is left out are back sides of thin surfaces, and noise behind walls.
+
+    `poses`: cam_from_world of the panoramas. `kept`: (V,) vertices that stay. `threads`: number of threads; the result
+    does not depend on it.
+    """
+    vertices, faces = surface
+    seen = kept.copy()
+    for pose in poses:
+        shown = surface_view(vertices, faces, pose, size_hw=(512, 1024), threads=threads).triangle
+        seen[faces[np.unique(shown[shown >= 0])]] = True
+    links = adjacency(faces, len(vertices))
+    for _ in range(3):
+        seen |= links @ seen.astype(np.float32) > 0
+    return faces[seen[faces].all(axis=1)]
 
 
 def plane_of_faces(surface: Surface, planes: Planes, *, tolerance: float) -> NDArray[np.int64]:

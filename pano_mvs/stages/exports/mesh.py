@@ -32,6 +32,7 @@ from pano_mvs.algorithms.mesh.volume import (
     most_certain,
     on_planes,
     plane_of_faces,
+    seen_triangles,
 )
 from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.core.text import plural
@@ -259,13 +260,15 @@ def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedPar
         volume.add(view.range_map, view.cam_from_world, valid, threads=ctx.threads)
     volume.continue_planes(planes)
     volume.close_gaps()
+    volume.smooth()
     vertices, faces = volume.surface()
+    vertices, moved = on_planes((vertices, faces), planes, reach=1.5 * volume.cell)
+    faces = seen_triangles((vertices, faces), [view.cam_from_world for view in views], moved, threads=ctx.threads)
     whole = Mesh(vertices, np.zeros(vertices.shape, np.uint8), faces)
     whole = without_crumbs(whole, smallest_share=params.smallest_part)
     if not len(whole.faces):
         raise InputError("the mesh has no faces: the range maps show no common surface. Check the poses and ranges")
-    vertices, _ = on_planes((whole.vertices_in_world, whole.faces), planes, reach=1.5 * volume.cell)
-    vertices, faces = decimated(vertices, whole.faces, triangles=params.triangles)
+    vertices, faces = decimated(whole.vertices_in_world, whole.faces, triangles=params.triangles)
 
     def load(idx: int) -> PaintView:
         return views[idx].load()

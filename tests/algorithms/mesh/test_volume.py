@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.mesh.volume import NO_PLANES, Planes, Volume, empty_volume, most_certain, on_planes
+from pano_mvs.algorithms.mesh.volume import (
+    NO_PLANES,
+    Planes,
+    Volume,
+    empty_volume,
+    most_certain,
+    on_planes,
+    plane_of_faces,
+    seen_triangles,
+)
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from tests.algorithms.mesh.box import HALF, Capture, capture, poses
+from tests.algorithms.mesh.box import HALF, Capture, box, capture, poses
 from tests.oracles.surfaces import mean_distances
 
 AXES = np.concatenate([-np.eye(3), np.eye(3)])
@@ -39,7 +48,7 @@ def test_distances_are_those_of_numpy(threads: int) -> None:
     volume = filled(shown, cell=0.25, threads=threads)
     places = volume.origin + volume.cell * np.moveaxis(np.indices(volume.distances.shape), 0, -1).reshape(-1, 3)
     maps = [(view.range_map, view.cam_from_world) for view in shown.views if view.range_map is not None]
-    distances, weights = mean_distances(places, maps, limit=2 * volume.cell, middle=volume.middle)
+    distances, weights = mean_distances(places, maps, limit=3 * volume.cell, middle=volume.middle)
     # A cell on the border between two pixels may get the other one.
     same = np.isclose(volume.weights.ravel(), weights, rtol=1e-4)
     assert same.mean() > 0.99
@@ -88,7 +97,7 @@ def test_planes_continue_behind_a_board_and_not_beyond_the_walls() -> None:
     assert in_hole(volume) == 0
     volume.continue_planes(WALLS)
     assert in_hole(volume) >= 4
-    assert (np.abs(volume.surface()[0]) < HALF + 2 * volume.cell).all()
+    assert (np.abs(volume.surface()[0]) < HALF + 3 * volume.cell).all()
 
 
 def test_narrow_gaps_close() -> None:
@@ -118,3 +127,20 @@ def test_without_ranges_there_is_no_surface() -> None:
     nothing = RangeMap(np.full((4, 8), np.nan, np.float32), np.zeros((4, 8), np.uint8))
     with pytest.raises(InputError, match="no panorama measured a surface"):
         empty_volume([(nothing, Rigid3.identity())])
+
+
+def test_what_no_panorama_sees_is_left_out_unless_it_is_kept() -> None:
+    """The back of a wall 0.3 behind the walls of the box."""
+    vertices, faces, _ = box(16)
+    both = np.concatenate([vertices, vertices * np.float32(1.3)]), np.concatenate([faces, faces + len(vertices)])
+    outer = np.arange(len(both[0])) >= len(vertices)
+    np.testing.assert_array_equal(seen_triangles(both, poses(2), np.zeros_like(outer)), faces)
+    np.testing.assert_array_equal(seen_triangles(both, poses(2), outer), both[1])
+    assert not len(seen_triangles(both, [], np.zeros_like(outer)))
+
+
+def test_triangles_know_their_plane() -> None:
+    vertices, faces, wall = box(2)
+    order = [0, 3, 1, 4, 2, 5]  # of the planes −x, −y, −z, +x, +y, +z by wall
+    found = plane_of_faces((vertices, faces), (-WALLS[0], WALLS[1]), tolerance=1e-3)
+    np.testing.assert_array_equal(found, np.array(order)[wall])
