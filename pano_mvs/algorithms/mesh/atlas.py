@@ -75,8 +75,8 @@ def unwrapped(
     for part, used, local in parts:
         atlas.add_mesh(vertices[used].astype(np.float32), local.reshape(len(part), 3).astype(np.uint32))
     options = xatlas.PackOptions()
-    # Texels between charts: half of them belong to each of two neighbours, enough for three levels of a mipmap.
-    options.padding, options.texels_per_unit = 8, float(min(texels_per_unit, most))
+    # Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
+    options.padding, options.texels_per_unit = 4, float(min(texels_per_unit, most))
     atlas.generate(pack_options=options)
     made = [atlas.get_mesh(number) for number in range(len(parts))]
     of_atlas, first = np.empty_like(faces, np.int32), 0
