@@ -147,29 +147,29 @@ def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.06)
     heights = [plane.y for plane in moved_ceilings(views, [floor, ceiling])]
     assert heights == pytest.approx([HALF[1], -HALF[1]], abs=0.02)
-    assert moved_ceilings(views, [floor, ceiling])[1].uncertainty == 0.02
-    assert moved_ceilings(views, [floor, replace(ceiling, precise_support=1.0)])[1].y == ceiling.y
+    assert moved_ceilings(views, [floor, ceiling])[1].uncertainty == 0.05
+    assert moved_ceilings(views, [floor, replace(ceiling, uncertainty=0.01)])[1].y == ceiling.y
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])
-@pytest.mark.parametrize("grey", [True, False], ids=["one grey", "clear creases"])
-def test_a_plain_ceiling_stays_where_creases_do_not_contradict(grey: bool, noise: float) -> None:
-    """Its ranges are exact and weak; no crease shows its height, or all do."""
+@pytest.mark.parametrize("darker", [0.0, 10.0, None], ids=["no creases", "faint creases", "clear creases"])
+def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float | None, noise: float) -> None:
+    """Its ranges are exact and weak. One faint edge counted as the crease with the floor and as a skirting board."""
     box, random = Box((256, 512)), np.random.default_rng(1)
     for number, name in enumerate(box.maps):
         normals = box_range((256, 512), HALF, CENTERS[number])[1]
         above = normals[..., 1] > 0.5
         colors = box.pictures[name].astype(np.float64)
-        if grey:
+        if darker is not None:
             colors[above | box.walls[name]] = 200.0
+            colors[above] -= darker
         colors += random.normal(0.0, noise, colors.shape)
         box.pictures[name] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
         own = box.maps[name]
         box.maps[name] = replace(own, confidence=np.where(above, SEEN, own.confidence).astype(np.uint8))
     structure = box.structure()
     above = structure.normals_in_world[:, 1] > 0.5
-    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.003)
-    assert (structure.uncertainties[above] < 0.005).all()
+    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.012 if darker else 0.003)
 
 
 @pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
@@ -205,15 +205,15 @@ def test_a_camera_above_a_tried_ceiling_has_no_creases_with_it(monkeypatch: pyte
 
 
 def _plain_ceiling(box: Box, share: float) -> tuple[list[PlaneView], list[ScenePlane]]:
-    """Return the views of a box, its precise floor, and a ceiling without precise points at a share of its height."""
+    """Return the views of a box, its floor, and an uncertain ceiling at a share of its height."""
     views = [
         plane_view(item, lambda name=name: box.pictures[name], box.cams[name])  # type: ignore[misc]
         for name, item in box.maps.items()
     ]
     up = -0.2 - share * (-0.2 + HALF[1])
     return views, [
-        ScenePlane(np.array([0.0, sign, 0.0]), sign * y, 5.0, precise, uncertainty=0.01, is_level=True)
-        for sign, y, precise in ((-1.0, HALF[1], 4.0), (1.0, up, 0.1))
+        ScenePlane(np.array([0.0, sign, 0.0]), sign * y, 5.0, uncertainty=uncertainty, is_level=True)
+        for sign, y, uncertainty in ((-1.0, HALF[1], 0.003), (1.0, up, 0.05))
     ]
 
 
@@ -225,8 +225,8 @@ def test_of_two_rooms_of_one_shape_the_supported_one_is_taken(box: Box, first: b
     for normal in np.concatenate([np.eye(3), -np.eye(3)]):
         offset, at = float(-np.abs(normal) @ HALF), float(normal @ center)
         is_level = normal[1] != 0
-        right.append(ScenePlane(normal, offset, 2.0, 0.0, uncertainty=0.01, is_level=is_level))
-        smaller.append(ScenePlane(normal, at + 0.9 * (offset - at), 1.0, 0.0, uncertainty=0.01, is_level=is_level))
+        right.append(ScenePlane(normal, offset, 2.0, uncertainty=0.01, is_level=is_level))
+        smaller.append(ScenePlane(normal, at + 0.9 * (offset - at), 1.0, uncertainty=0.01, is_level=is_level))
     planes = right + smaller if first else smaller + right
     own = box.maps["0.png"]
     unsure = replace(own, confidence=np.full(SIZE, FILLED_CONFIDENCE[1], np.uint8))

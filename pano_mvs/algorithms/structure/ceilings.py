@@ -30,9 +30,9 @@ _FINE_DISTANCES, _CEILING_VIEWS = np.geomspace(0.35, 9.0, 220), 12
 _CEILINGS = np.geomspace(0.3, 1.6, 36)
 # Heights relative to that of a ceiling in ranges, and to the best of these.
 _MOVED_CEILINGS, _FINE_CEILINGS = np.linspace(0.9, 1.1, 11), np.linspace(0.98, 1.02, 9)
-# A ceiling is moved if less than this share of its support is precise: on rendered houses, ceilings with a share up to
-# 0.05 were 1 to 8 % off, and in rooms with textured ceilings, those with a share above 0.15 at most 0.4 %.
-_LEAST_PRECISE = 1 / 15
+# A ceiling is moved if its ranges are less certain: a plain one of a rendered house was at 0.05, and those of three
+# rendered captures, at most 1 % off, at 0.014 or less.
+_PLAIN_UNCERTAINTY = 0.02
 # Creases show its height if their mean clarity differs by this much between the heights: in plain boxes without visible
 # creases it differed by at most 0.018, with and without noise, in rendered houses by 0.25 to 0.5, and in two groups of
 # a real tour, over all heights, by 0.16 and 0.30.
@@ -62,7 +62,7 @@ def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -
     floor = max(floors, key=lambda plane: plane.support)
     middle = float(np.mean([view.cam_from_world.center[1] for view in roofed]))
     y = middle - float(np.median(_CEILINGS)) * (floor.y - middle)
-    plane = ScenePlane(-floor.normal, y, 0.0, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=True)
+    plane = ScenePlane(-floor.normal, y, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=True)
     clarity = _HeightClarity.around(roofed, floor, plane)
     if clarity is None:
         return []
@@ -77,8 +77,8 @@ def supposed_ceiling(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -
 def moved_ceilings(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
     """Return level planes, those with most support first; ceilings are at the heights at which creases are clearest.
 
-    Ranges of a ceiling without texture can be wrong in all views by the same few percent; one with precise points
-    stays. Ceilings at nearly one height are joined. `views`: of one group. `planes`: its level planes.
+    Ranges of a ceiling without texture can be wrong in all views by the same few percent; one whose ranges
+    are certain stays. Ceilings at nearly one height are joined. `views`: of one group. `planes`: its level planes.
     """
     result: list[ScenePlane] = []
     for plane in sorted(planes, key=lambda plane: -plane.support):
@@ -88,9 +88,10 @@ def moved_ceilings(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> 
             continue
         middle = float(np.mean([view.cam_from_world.center[1] for view in below]))
         floors = [other for other in planes if other.normal[1] < 0 and other.y > middle]
-        is_plain = plane.precise_support < _LEAST_PRECISE * plane.support
+        is_plain = plane.uncertainty > _PLAIN_UNCERTAINTY
         if floors and is_plain and len(below) >= _LEAST_VIEWS:
-            floor = max(floors, key=lambda other: sum(_area_on(view, other) for view in below))
+            # Of floors a little apart, views show nearly the same area.
+            floor = max(floors, key=lambda other: other.support * sum(_area_on(view, other) for view in below))
             plane = _moved_ceiling(below, floor, plane)
         if not any(other.normal[1] > 0 and abs(other.y - plane.y) < _SAME_HEIGHT * (middle - plane.y)
                    for other in result):  # fmt: skip

@@ -1,10 +1,10 @@
 """Place planes by creases: the lines where upright planes meet level ones.
 
 Plain walls show nothing to match, but their lower and upper edges do. In every view, the picture is sampled across the
-predicted crease, at many azimuths. A plane is placed where differences of colour across the crease have most in common:
-they are added as vectors, so that texture beside the crease cancels out and the crease remains. All views, and the
-creases with all level planes, count together. The level plane that is best confirmed by matches is kept; the others
-move, too.
+predicted crease, at many azimuths. Each upright plane is first moved to where differences of colour across its creases
+have most in common: they are added as vectors, so that texture beside the crease cancels out and the crease remains.
+Then the places of short pieces of all creases of all views are measured, and all planes are adjusted to them together,
+each held by its ranges according to their uncertainty.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
-from pano_mvs.algorithms.structure.outline import room_labels, room_of
+from pano_mvs.algorithms.structure.outline import room_labels, room_of, same_wall
+from pano_mvs.algorithms.structure.skyline import CLEAR_LEVELS
 from pano_mvs.algorithms.structure.view import (
     HALF_DIFFERENCE,
+    LEAST_UNCERTAINTY,
     STEP_RAD,
     PlaneView,
     ScenePlane,
@@ -38,46 +40,70 @@ _COARSE_STEPS = 2
 # The planes must be seen on their sides of the crease, this far from it.
 _BESIDE_RAD = np.radians([2.0, 3.5])
 
-# Standard deviations of the shift and the turn of planes that were fitted to precise points, and to others.
-_PRECISE_STDS, _PLAIN_STDS = np.array([0.002, np.radians(0.1)]), np.array([0.02, np.radians(0.7)])
-# The loss of a shift by one standard deviation, as a share of the contrast across the crease.
-_LOSS = 0.025
-_COARSE_SHIFTS, _COARSE_TURNS_RAD = np.linspace(-0.06, 0.06, 25), np.radians(np.linspace(-1, 1, 5))
-_FINE_SHIFTS, _FINE_TURNS_RAD = np.linspace(-0.004, 0.004, 9), np.radians(np.linspace(-0.3, 0.3, 5))
-_HEIGHT_SHIFTS = np.linspace(-0.01, 0.01, 21)
+# The standard deviation of the turn of a plane, in radians, relative to that of its distance.
+_TURN_STD = 0.6
+# Level planes are wide: in ranges of three rendered captures they were 0.02 to 0.8 % off. Cornices along all walls
+# would move them farther.
+_LEVEL_STD = 1 / 3
+# A shift by one standard deviation costs about this share of the contrast across the crease, and larger ones less than
+# its square: Cauchy weights begin to fall at as many standard deviations.
+_LOSS, _TAIL = 0.025, 2.0
+_SHIFTS, _TURNS_RAD = np.linspace(-0.06, 0.06, 25), np.radians(np.linspace(-1, 1, 5))
+# Pieces of creases have at most as many samples. In three rendered captures with true planes, they scattered by 0.02 to
+# 0.05° around what the creases of two planes have in common, and this was 0.02° (hall) to 0.3° (skirting boards of a
+# small room) from the truth. The last scale of the search, from coarse to fine, is that of these common errors; pieces
+# are sought within five times a scale.
+_PIECE, _PIECE_RAD, _SCALES_RAD = 12, np.radians(0.05), np.radians([0.2, 0.14, 0.1, 0.08, 0.06, 0.06])
 
 
 def placed_by_creases(
     views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, max_relative_error: float
 ) -> list[ScenePlane]:
-    """Return the planes, in the same order, moved to where the pictures show their creases.
+    """Return the planes moved to where the pictures show their creases; level planes first.
 
     Planes without support that show no clear ones are left out. `views`: of one group, in whose world y points down
     along gravity. `planes`: found in ranges and outlines. `max_relative_error`: of ranges on a plane.
     """
     creases = _creases(views, planes, max_relative_error)
+    level_distances = [_level_distance(plane, views) if plane.is_level else 0.0 for plane in planes]
     heights = np.array([plane.y if plane.is_level else np.nan for plane in planes])
     placed = {idx: _Placement(planes[idx], of_plane) for idx, of_plane in sorted(creases.items())}
     for placement in placed.values():
-        placement.move(heights, _COARSE_SHIFTS, _COARSE_TURNS_RAD, fine=False)
-    levels = sorted(
-        (idx for idx, plane in enumerate(planes) if plane.is_level), key=lambda idx: -planes[idx].precise_support
-    )
-    for round_number in range(3):
-        for placement in placed.values():
-            placement.move(heights, _FINE_SHIFTS / (1 + round_number), _FINE_TURNS_RAD / (1 + round_number), fine=True)
-        for level in levels[1:]:
-            heights[level] = _best_height(planes[level], level, heights, placed=list(placed.values()))
-    clear = {idx: placement for idx, placement in placed.items() if placement.share >= 0.25}
-    return [
-        replace(plane, offset=float(heights[idx] * plane.normal[1]))
-        if plane.is_level
-        else clear[idx].result()
-        if idx in clear
-        else plane
-        for idx, plane in enumerate(planes)
-        if plane.is_level or plane.support or idx in clear
-    ]
+        placement.move(heights)
+    stds = _adjust(placed, heights, planes, level_distances=level_distances)
+    shares = {idx: placement.score(heights, fine=True) for idx, placement in placed.items()}
+    centers = np.array([view.cam_from_world.center for view in views])
+    moved: list[ScenePlane] = []
+    walls: list[tuple[float, ScenePlane]] = []
+    for idx, plane in enumerate(planes):
+        if plane.is_level:
+            offset = float(heights[idx] * plane.normal[1])
+            moved.append(replace(plane, offset=offset, uncertainty=stds.get(idx, plane.uncertainty)))
+        elif shares.get(idx, 0.0) >= 0.25:
+            walls.append((shares[idx], placed[idx].result(stds[idx])))
+        elif plane.support:
+            walls.append((0.0, replace(plane, uncertainty=min(plane.uncertainty, max_relative_error))))
+    # Of two that are one wall, one from an outline, that with clearer creases is kept.
+    kept: list[ScenePlane] = []
+    for _, wall in sorted(walls, key=lambda one: -one[0]):
+        same = next(
+            (
+                number
+                for number, other in enumerate(kept)
+                if min(wall.support, other.support) == 0 and same_wall(wall, other, centers)
+            ),
+            None,
+        )
+        if same is None:
+            kept.append(wall)
+        elif wall.support:
+            kept[same] = replace(kept[same], support=wall.support, uncertainty=wall.uncertainty)
+    return moved + kept
+
+
+def _level_distance(plane: ScenePlane, views: Sequence[PlaneView]) -> float:
+    """Return the mean distance of a level plane from the cameras."""
+    return float(np.mean([abs(plane.y - view.cam_from_world.center[1]) for view in views]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,96 +126,204 @@ class _Creases:
 
 
 class _Placement:
-    """The search for the place of one upright plane: a turn about its middle, and a relative shift."""
+    """The place of one upright plane: a turn about its middle, and a shift relative to its mean distance."""
 
     def __init__(self, plane: ScenePlane, creases: _Creases) -> None:
         self.plane, self.creases = plane, creases
-        across = np.stack([np.sin(creases.azimuth), np.cos(creases.azimuth)], axis=-1)
+        self._across = np.stack([np.sin(creases.azimuth), np.cos(creases.azimuth)], axis=-1)
         normal = plane.normal[[0, 2]]
-        self._height = plane.offset - creases.center[:, [0, 2]] @ normal
-        self._across = across
-        self._stds = plane.precise_share * _PRECISE_STDS + (1 - plane.precise_share) * _PLAIN_STDS
-        foot = creases.center[:, [0, 2]] + across * (self._height / (across @ normal))[:, None]
+        height = plane.offset - creases.center[:, [0, 2]] @ normal
+        foot = creases.center[:, [0, 2]] + self._across * (height / (self._across @ normal))[:, None]
         self._middle = foot.mean(axis=0)
-        self._distance = float(np.abs(self._height).mean())
+        self._distance = float(np.abs(height).mean())
         self._most = [
             max(float(np.sqrt((profiles**2).sum(axis=-1).max(axis=1)).sum()), 1e-9)
             for profiles in (creases.coarse, creases.fine)
         ]
         self.turn = self.shift = 0.0
-        self.share = 0.0
+        first = np.zeros(len(creases.azimuth), np.bool_)
+        first[creases.starts] = True
+        along = np.arange(len(first)) - np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
+        self._pieces = np.flatnonzero(first | (along % _PIECE == 0))
 
-    def move(
-        self, heights: FloatArray, shifts: NDArray[np.floating], turns: NDArray[np.floating], *, fine: bool
-    ) -> None:
-        """Move the plane to the best of some shifts and turns relative to its present place."""
-        _, self.turn, self.shift = max(
-            (self.score(heights, turn, shift, fine=fine), turn, shift)
-            for turn in self.turn + turns
-            for shift in self.shift + shifts
-        )
-        self.share = self.score(heights, self.turn, self.shift, fine=fine)
+    @property
+    def azimuth(self) -> float:
+        """The direction of the normal, from the z axis towards the x axis."""
+        (x, z), _ = self._moved()
+        return float(np.arctan2(x, z))
 
-    def score(self, heights: FloatArray, turn: float, shift: float, *, fine: bool = True) -> float:
-        """Return the share of the contrast that lies on the predicted creases, less the loss of the prior."""
-        normal, offset = self._moved(turn, shift)
-        creases = self.creases
-        center = creases.center
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (offset - center[:, [0, 2]] @ normal) / (self._across @ normal)
-        dip = np.arctan2(heights[creases.level] - center[:, 1], distance)
-        place = (dip - creases.dip) / STEP_RAD + _REACH
-        inside = (distance > 0) & (place >= 0) & (place < 2 * _REACH)
-        place = np.where(inside, place, 0.0)
-        first = place.astype(np.int64)
-        part = (place - first)[:, None]
-        profiles = creases.fine if fine else creases.coarse
-        samples = np.arange(len(first))
-        values = profiles[samples, first] * (1 - part) + profiles[samples, first + 1] * part
-        common = np.add.reduceat(values * inside[:, None], creases.starts, axis=0)
-        share = float(np.sqrt((common**2).sum(axis=-1)).sum() / self._most[fine])
-        shift_std, turn_std = self._stds
-        return float(share - _LOSS * ((shift / shift_std) ** 2 + (turn / turn_std) ** 2))
+    @property
+    def stds(self) -> FloatArray:
+        """Standard deviations of shift and turn, before any crease is known."""
+        return np.array([1.0, _TURN_STD]) * self.plane.uncertainty
 
-    def result(self) -> ScenePlane:
+    def move(self, heights: FloatArray) -> None:
+        """Move the plane to where most of the contrast across creases is."""
+
+        def score(place: tuple[float, float]) -> float:
+            self.turn, self.shift = place
+            return self.score(heights, fine=False) + _LOSS * float(
+                np.log(_tail(place / self.stds[::-1])).sum() * _TAIL**2
+            )
+
+        self.turn, self.shift = max(((turn, shift) for turn in _TURNS_RAD for shift in _SHIFTS), key=score)
+
+    def score(self, heights: FloatArray, *, fine: bool) -> float:
+        """Return the share of the contrast that lies on the predicted creases."""
+        place, inside = self._places(heights)
+        common = np.add.reduceat(self._sampled(place, fine=fine) * inside[:, None], self.creases.starts, axis=0)
+        return float(np.sqrt((common**2).sum(axis=-1)).sum() / self._most[fine])
+
+    def measured(self, heights: FloatArray, gate_rad: float) -> tuple[FloatArray, ...]:
+        """Return, for pieces of creases, how far below the predicted dip the picture shows them, and derivatives.
+
+        Returns:
+            Differences in radians (P,), contrasts in grey levels (P,), derivatives of the dip by shift, turn and the
+            height of the level plane (P, 3), and that plane (P,).
+        """
+        place, inside = self._places(heights)
+        reach = round(gate_rad / STEP_RAD)
+        steps = np.arange(-reach - 1, reach + 2)
+        tried = place[:, None] + steps
+        inside &= (tried[:, 0] >= 0) & (tried[:, -1] < 2 * _REACH)
+        values = self._sampled(np.clip(tried, 0, 2 * _REACH - 1e-6), fine=True) * inside[:, None, None]
+        counts = np.add.reduceat(inside.astype(np.float64), self._pieces)
+        sums = np.add.reduceat(values, self._pieces, axis=0)
+        contrast = np.sqrt((sums**2).sum(axis=-1)) / np.maximum(counts, 1)[:, None]
+        best = contrast[:, 1:-1].argmax(axis=1) + 1
+        before, at, after = (contrast[np.arange(len(best)), best + step] for step in (-1, 0, 1))
+        bend = before - 2 * at + after
+        is_peak = (bend < 0) & (at >= before) & (at >= after) & (counts >= 3)
+        part = np.where(is_peak, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+        derivatives = np.add.reduceat(self._derivatives(heights) * inside[:, None], self._pieces, axis=0)
+        derivatives /= np.maximum(counts, 1)[:, None]
+        found = (steps[best] + part) * STEP_RAD
+        return found[is_peak], at[is_peak], derivatives[is_peak], self.creases.level[self._pieces][is_peak]
+
+    def result(self, std: float) -> ScenePlane:
         """Return the plane at its place."""
-        (x, z), offset = self._moved(self.turn, self.shift)
-        uncertainty = self.plane.uncertainty
-        if self.plane.support:  # ranges and creases agree
-            # Standard deviation of ranges on planes that creases placed.
-            uncertainty = min(uncertainty, 0.004)
+        (x, z), offset = self._moved()
+        uncertainty = std if self.plane.support else self.plane.uncertainty
         return replace(self.plane, normal=np.array([x, 0.0, z]), offset=offset, uncertainty=uncertainty)
 
-    def _moved(self, turn: float, shift: float) -> tuple[FloatArray, float]:
+    def _level_distances(self) -> FloatArray:
+        normal, offset = self._moved()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((offset - self.creases.center[:, [0, 2]] @ normal) / (self._across @ normal))
+
+    def _places(self, heights: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the place of the predicted creases in each profile, and whether it is inside."""
+        distance = self._level_distances()
+        dip = np.arctan2(heights[self.creases.level] - self.creases.center[:, 1], distance)
+        place = (dip - self.creases.dip) / STEP_RAD + _REACH
+        inside = (distance > 0) & (place >= 0) & (place < 2 * _REACH)
+        return np.where(inside, place, 0.0), inside
+
+    def _sampled(self, place: FloatArray, *, fine: bool) -> FloatArray:
+        """Return the differences of colour at places (S, ...) of the profiles."""
+        profiles = self.creases.fine if fine else self.creases.coarse
+        samples = np.arange(len(place)).reshape(-1, *[1] * (place.ndim - 1))
+        first = place.astype(np.int64)
+        part = (place - first)[..., None]
+        return np.asarray(profiles[samples, first] * (1 - part) + profiles[samples, first + 1] * part)
+
+    def _derivatives(self, heights: FloatArray) -> FloatArray:
+        normal, _ = self._moved()
+        aside = np.array([-normal[1], normal[0]])
+        distance, cosine = self._level_distances(), self._across @ normal
+        down = heights[self.creases.level] - self.creases.center[:, 1]
+        by_turn = (self._middle - self.creases.center[:, [0, 2]]) @ aside - distance * (self._across @ aside)
+        by_distance = -down / (distance**2 + down**2)
+        by_height = distance / (distance**2 + down**2)
+        return np.stack([by_distance * self._distance / cosine, by_distance * by_turn / cosine, by_height], axis=-1)
+
+    def _moved(self) -> tuple[FloatArray, float]:
         x, z = self.plane.normal[[0, 2]]
-        normal = np.array([x * np.cos(turn) - z * np.sin(turn), x * np.sin(turn) + z * np.cos(turn)])
-        return normal, float(self._middle @ normal + shift * self._distance)
+        sine, cosine = np.sin(self.turn), np.cos(self.turn)
+        normal = np.array([x * cosine - z * sine, x * sine + z * cosine])
+        return normal, float(self._middle @ normal + self.shift * self._distance)
 
 
-def _best_height(plane: ScenePlane, level: int, heights: FloatArray, *, placed: Sequence[_Placement]) -> float:
-    """Return the height of a level plane at which the creases of all upright planes fit best, each moved to it."""
-    meeting = [placement for placement in placed if (placement.creases.level == level).any()]
-    if not meeting:
-        return float(heights[level])
-    middle = np.concatenate([placement.creases.center[:, 1] for placement in meeting]).mean()
-    samples = sum(len(placement.creases.azimuth) for placement in meeting)
-    # Standard deviations of the height of level planes that were fitted to precise points, and to others, relative to
-    # that above or below the cameras.
-    std = plane.precise_share * 0.001 + (1 - plane.precise_share) * 0.005
-    best, found = -np.inf, float(heights[level])
-    for shift in _HEIGHT_SHIFTS:
-        tried = heights.copy()
-        tried[level] += shift * (heights[level] - middle)
-        moved = (tried[level] - plane.y) / (plane.y - middle)
-        total = sum(
-            len(placement.creases.azimuth)
-            * max(placement.score(tried, placement.turn, placement.shift + own) for own in _FINE_SHIFTS[::2])
-            for placement in meeting
-        )
-        total -= samples * _LOSS * (moved / std) ** 2
-        if total > best:
-            best, found = total, float(tried[level])
-    return found
+def _tail(shift: FloatArray) -> FloatArray:
+    """Return the Cauchy weights of shifts from the ranges, in standard deviations: these, too, can be wrong."""
+    return np.asarray(1 / (1 + (shift / _TAIL) ** 2))
+
+
+def _adjust(
+    placed: dict[int, _Placement],
+    heights: FloatArray,
+    planes: Sequence[ScenePlane],
+    *,
+    level_distances: Sequence[float],
+) -> dict[int, float]:
+    """Move all planes together to where pieces of creases are (Gauss-Newton with Cauchy weights).
+
+    `heights` of level planes are changed.
+
+    Returns:
+        Relative standard deviations of the distances of the planes.
+    """
+    levels = [idx for idx, plane in enumerate(planes) if plane.is_level]
+    if not placed:
+        return {}
+    column = {idx: number for number, idx in enumerate(levels)}
+    own = {idx: len(levels) + 2 * number for number, idx in enumerate(placed)}
+    scales = np.array([level_distances[idx] for idx in levels])
+    stds = np.concatenate(
+        [[_LEVEL_STD * planes[idx].uncertainty for idx in levels], *(one.stds for one in placed.values())]
+    )
+    start = np.array([heights[idx] for idx in levels])
+    stds[np.argmin(stds[: len(levels)])] *= 0.01  # it stays: creases show no scale
+    turns = np.array([at + 1 for at in own.values()])
+    for scale in _SCALES_RAD:
+        now = np.concatenate([(heights[levels] - start) / scales, *([one.shift, one.turn] for one in placed.values())])
+        prior = _tail(now / stds) * stds**-2.0
+        matrix, right = np.diag(prior), -prior * now
+        for idx, placement in placed.items():
+            residual, contrast, derivatives, level = placement.measured(heights, 5 * scale)
+            rows = np.zeros((len(residual), len(stds)))
+            rows[:, own[idx] : own[idx] + 2] = derivatives[:, :2]
+            which = np.array([column[one] for one in level], np.int64)
+            rows[np.arange(len(rows)), which] = derivatives[:, 2] * scales[which]
+            weight = np.minimum(contrast / CLEAR_LEVELS, 1.0) / _PIECE_RAD**2
+            for one in np.unique(which):
+                weight[which == one] *= _reliability(residual[which == one], weight[which == one], scale)
+            matrix += (rows * weight[:, None]).T @ rows
+            right += rows.T @ (weight * residual)
+        turned = _off_right_angles(np.array([one.azimuth for one in placed.values()]), stds[turns], 5 * scale)
+        weight = 1 / ((5 * scale) ** 2 + turned**2)
+        matrix[turns, turns] += weight
+        right[turns] += weight * turned
+        change = np.linalg.solve(matrix, right)
+        heights[levels] += change[: len(levels)] * scales
+        for idx, placement in placed.items():
+            placement.shift += change[own[idx]]
+            placement.turn += change[own[idx] + 1]
+    found = np.sqrt(np.diag(np.linalg.inv(matrix)))
+    return {idx: max(float(found[at]), LEAST_UNCERTAINTY) for idx, at in (column | own).items()}
+
+
+def _off_right_angles(azimuths: FloatArray, stds: FloatArray, scale: float) -> FloatArray:
+    """Return how far walls are turned from the nearest of four directions at right angles that most of them have."""
+    weight, residual = stds**-2.0, np.zeros(len(azimuths))
+    for _ in range(10):
+        middle = np.angle(np.sum(weight / (scale**2 + residual**2) * np.exp(4j * azimuths))) / 4
+        residual = np.angle(np.exp(4j * (azimuths - middle))) / 4
+    return residual
+
+
+def _reliability(residual: FloatArray, weight: FloatArray, scale: float) -> FloatArray:
+    """Return factors for the weights of the pieces of all creases of two planes, which are off by angles.
+
+    Pieces scatter, and have an error in common: what is seen may be a skirting board or a cornice. Both have tails
+    (Cauchy).
+    """
+    order = np.argsort(residual)
+    total = np.cumsum(weight[order])
+    common = residual[order][np.searchsorted(total, total[-1] / 2)]
+    alike = 1 / (1 + ((residual - common) / _PIECE_RAD) ** 2)
+    variance = scale**2 + common**2
+    return np.asarray(alike / (1 + (weight * alike).sum() * variance))
 
 
 def _creases(views: Sequence[PlaneView], planes: Sequence[ScenePlane], tolerance: float) -> dict[int, _Creases]:

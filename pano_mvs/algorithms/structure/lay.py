@@ -46,9 +46,14 @@ def lay_structure(
     group: int = 0,
     valid: Mask | None = None,
     textured_error: Annotated[
-        float, Setting("maximum relative error of a confirmed pixel with texture that is moved", gt=0, le=1)
+        float,
+        Setting(
+            "relative error within which confirmed pixels with texture are moved; more if they are uncertain",
+            gt=0,
+            le=1,
+        ),
     ] = 0.015,
-    plain_error: Annotated[float, Setting("the same of a pixel without texture", gt=0, le=1)] = 0.08,
+    plain_error: Annotated[float, Setting("the same of pixels without texture", gt=0, le=1)] = 0.08,
 ) -> tuple[RangeMap, float]:
     """Move pixels to the planes of a place that they show.
 
@@ -74,7 +79,12 @@ def lay_structure(
     stride = stride_of(size)
     rays = ray_grid(size) @ cam_from_world.rotation
     textured = has_texture(guide)
-    tolerance = np.where(textured & (range_map.confidence >= CONSISTENT_CONFIDENCE[0]), textured_error, plain_error)
+    precise = textured & (range_map.confidence >= CONSISTENT_CONFIDENCE[0])
+    # Ranges may be as far from their plane as their uncertainty explains.
+    explained = np.full(size, textured_error)
+    if range_map.uncertainty is not None:
+        explained = np.maximum(3 * np.nan_to_num(range_map.uncertainty.astype(np.float64)), textured_error)
+    tolerance = np.where(precise, np.minimum(explained, plain_error), plain_error)
     on_planes = [
         plane_ranges(
             rays, cam_from_world.center, normal=structure.normals_in_world[idx], offset=float(structure.offsets[idx])
@@ -83,7 +93,7 @@ def lay_structure(
     ]
     coarse_rays, coarse_planes = on_grid(rays, stride), [on_grid(ranges, stride) for ranges in on_planes]
     known = [
-        ScenePlane(normal, float(structure.offsets[idx]), 1.0, 0.0, uncertainty=1.0, is_level=abs(normal[1]) > 0.5)
+        ScenePlane(normal, float(structure.offsets[idx]), 1.0, uncertainty=1.0, is_level=abs(normal[1]) > 0.5)
         for idx, normal in zip(planes, structure.normals_in_world[planes], strict=True)
     ]
     room = room_of(plane_view(range_map, lambda: guide, cam_from_world), known)
@@ -108,12 +118,12 @@ def lay_structure(
     label, agree = _enlarged(np.where(seen_through, -1, label), size), _enlarged(agree, size) > 0
     laid = _chosen(on_planes, label)
     with np.errstate(invalid="ignore"):
-        near = np.abs(range_map.range / laid - 1) <= tolerance
+        error = np.abs(range_map.range / laid - 1)
     matched, confirmed = (range_map.confidence >= least[0] for least in (WEAK_CONFIDENCE, CONSISTENT_CONFIDENCE))
     # Creases of single views confirm nothing, and correct nothing that is confirmed.
     alone = np.isin(label, np.flatnonzero(structure.uncertainties[planes] >= OUTLINE_UNCERTAINTY))
-    near, agree = near & ~(alone & confirmed), agree & ~alone
-    unsure = np.where(textured, ~matched, ~confirmed) | sunk
+    near, agree = (error <= tolerance) & ~(alone & confirmed), agree & ~alone
+    unsure = np.where(textured, ~matched, ~confirmed) | (error <= explained) & ~(alone & confirmed) | sunk
     moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
     kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
     confidence = np.select(

@@ -159,7 +159,7 @@ def _walls_of(one: Around, planes: Sequence[ScenePlane], turn: float) -> list[tu
         direction = turn + wall // len(DISTANCES) * np.pi / 2
         normal = -np.array([np.sin(direction), 0.0, np.cos(direction)])
         offset = float(normal @ center) - down * float(DISTANCES[wall % len(DISTANCES)])
-        plane = ScenePlane(normal, offset, 0.0, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=False)
+        plane = ScenePlane(normal, offset, 0.0, uncertainty=OUTLINE_UNCERTAINTY, is_level=False)
         with np.errstate(invalid="ignore"):
             apart = np.abs(np.log(distance[:, azimuths] / distance[wall, azimuths]))
         other = np.where(np.isfinite(apart) & (apart > _STEP_SIZE), clarity[:, azimuths], 0.0)

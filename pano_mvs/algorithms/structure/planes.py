@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.creases import placed_by_creases
-from pano_mvs.algorithms.structure.outline import outline_planes, same_wall
-from pano_mvs.algorithms.structure.view import PLAIN_WEIGHT, PlaneView, ScenePlane, plane_view
+from pano_mvs.algorithms.structure.outline import outline_planes
+from pano_mvs.algorithms.structure.view import LEAST_UNCERTAINTY, PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import UP
@@ -29,7 +29,6 @@ from pano_mvs.scene.upright import states_y_down
 
 _LEVEL_DRAWS, _UPRIGHT_DRAWS, _FIT_ROUNDS = 64, 200, 5
 _ALONG_NORMAL = 0.7
-_LEAST_UNCERTAINTY = 0.002
 # Cosines of the angles between the two points that a plane is drawn from.
 _PAIR_COSINES = 0.9, 0.9985
 
@@ -55,13 +54,7 @@ def find_planes(
     planes += supposed_ceiling(views, planes)
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
     planes += outline_planes(views, planes)
-    placed = placed_by_creases(views, planes, max_relative_error=max_relative_error)
-    centers = np.array([view.cam_from_world.center for view in views])
-    return [
-        plane
-        for number, plane in enumerate(placed)
-        if plane.support or not any(same_wall(plane, other, centers) for other in placed[:number])
-    ]
+    return placed_by_creases(views, planes, max_relative_error=max_relative_error)
 
 
 @dataclass(eq=False)
@@ -73,7 +66,6 @@ class _Points:
     rays: FloatArray
     normals: FloatArray
     ranges: FloatArray
-    precise: Mask
     uncertainty: FloatArray
     view: NDArray[np.int64]
     weight: FloatArray
@@ -94,9 +86,8 @@ class _Points:
     def fit_weights(self, normal: FloatArray, chosen: NDArray[np.intp]) -> FloatArray:
         """Return the weights of some points in the fit of a plane: inverse variances of their distances to it."""
         height = np.abs((self.xyz[chosen] - self.centers[chosen]) @ normal)
-        std = np.maximum(self.uncertainty[chosen], _LEAST_UNCERTAINTY) * height
-        share = np.where(self.precise[chosen], 1.0, PLAIN_WEIGHT)
-        return np.asarray(self.weight[chosen] * share / np.maximum(std, 1e-12) ** 2)
+        std = np.maximum(self.uncertainty[chosen], LEAST_UNCERTAINTY) * height
+        return np.asarray(self.weight[chosen] / np.maximum(std, 1e-12) ** 2)
 
     def take(self, plane: ScenePlane, tolerance: float) -> None:
         """Remove the points of a plane from those that are left."""
@@ -121,19 +112,17 @@ def _drawn_points(views: Sequence[PlaneView], rng: np.random.Generator) -> _Poin
 def _points_of(view: PlaneView, number: int) -> _Points:
     normals = _normals(view)
     seen = np.isfinite(view.ranges) & (view.confidence >= WEAK_CONFIDENCE[0]) & np.isfinite(normals).all(axis=-1)
-    rays, ranges, precise = view.rays[seen], view.ranges[seen], view.precise[seen]
+    rays, ranges = view.rays[seen], view.ranges[seen]
     center = view.cam_from_world.center
-    # A point without texture counts for this share of a precise one in the support of a plane.
     return _Points(
         xyz=center + rays * ranges[:, None],
         centers=np.broadcast_to(center, rays.shape),
         rays=rays,
         normals=normals[seen],
         ranges=ranges,
-        precise=precise,
         uncertainty=view.uncertainty[seen],
         view=np.full(len(ranges), number),
-        weight=view.area[seen] * np.where(precise, 1.0, 0.5),
+        weight=view.area[seen],
         left=np.ones(len(ranges), np.bool_),
     )
 
@@ -242,18 +231,18 @@ def _fitted_upright(
 
 
 def _described(points: _Points, normal: FloatArray, offset: float, *, tolerance: float, is_level: bool) -> ScenePlane:
-    """Return a plane with its support, and the scatter of the points on it."""
+    """Return a plane with its support, and the uncertainty that its points have on average.
+
+    They have much of their errors in common, so that many points are no more certain than one.
+    """
     every = np.flatnonzero(points.left)
     inliers = every[points.on(normal, offset, every, tolerance=tolerance)]
-    errors = np.abs(points.errors(normal, offset, inliers))
-    precise = points.precise[inliers]
-    scatter = _weighted_median(errors, np.where(precise, 1.0, PLAIN_WEIGHT)) if len(inliers) else tolerance
+    information = np.maximum(points.uncertainty[inliers], LEAST_UNCERTAINTY) ** -2.0
     return ScenePlane(
         normal,
         offset,
         support=float(points.weight[inliers].sum()),
-        precise_support=float(points.weight[inliers][precise].sum()),
-        uncertainty=max(scatter, _LEAST_UNCERTAINTY),
+        uncertainty=float(np.mean(information) ** -0.5) if len(inliers) else tolerance,
         is_level=is_level,
     )
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import cv2
@@ -33,10 +32,11 @@ AZIMUTHS = 360
 LEAST_COSINE = 0.1
 """Least cosine of the angle between a level ray and the normal of a wall that is seen."""
 _HALF_WINDOW = 4  # azimuths along a crease
-_CLEAR_LEVELS = 20.0  # a difference of colour that could not be clearer
+CLEAR_LEVELS = 20.0
+"""A difference of colour that could not be clearer."""
 # Heights above the floor of the upper edges of skirting boards, in heights of the camera. Edges are others than the
 # crease at angles that the differences of colour resolve.
-_SKIRTINGS, _APART_RAD = (0.04, 0.05, 0.06, 0.07, 0.08), 2 * HALF_DIFFERENCE * STEP_RAD
+_SKIRTINGS, _APART_RAD = (0.04, 0.06, 0.08), 2 * HALF_DIFFERENCE * STEP_RAD
 DISTANCES = np.geomspace(0.35, 9.0, 110)
 """The distances of the walls of a search, in heights of the camera above the floor."""
 _TURNS_RAD, _FINE_TURNS_RAD = np.radians(np.arange(0.0, 90.0, 3.0)), np.radians(np.arange(-2.0, 2.1, 1.0))
@@ -70,30 +70,24 @@ class Skyline:
     def crease_clarity(self, distance: FloatArray, height: float) -> FloatArray:
         """Return how clear one crease of walls is, at a height above the camera that is negative for the floor."""
         seen = np.isfinite(distance)
-        elevation = np.arctan2(height, np.where(seen, distance, 1.0))
-        common = mean_along(self._at(elevation) * seen[..., None], self.half_window)
-        clear = np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / _CLEAR_LEVELS, 1.0))
+        distance = np.where(seen, distance, 1.0)
+        clear = self._edge_clarity(distance, height, seen)
         if height < 0:
-            row = ((elevation + np.pi / 2) / STEP_RAD + 0.5).astype(np.int64)
-            clear = clear + self._skirtings[row, np.arange(distance.shape[1])]
+            elevation, other = np.arctan2(height, distance), []
+            for sign in (1, -1):
+                clearest = np.zeros(clear.shape)
+                for part in _SKIRTINGS:
+                    beside = height * (1 - sign * part)
+                    apart = np.abs(np.arctan2(beside, distance) - elevation) > _APART_RAD
+                    clearest = np.maximum(clearest, self._edge_clarity(distance, beside, seen & apart))
+                other.append(clearest)
+            clear *= (1 + other[0] - other[1]).astype(np.float32)
         return np.where(seen, clear, -np.inf)
 
-    @cached_property
-    def _skirtings(self) -> NDArray[np.float32]:
-        """How much clearer an edge a little above each place of a crease with the floor is than one below, (E, A)."""
-        common = np.linalg.norm(self.differences, axis=-1)
-        edges = np.sqrt(np.minimum(common / _CLEAR_LEVELS, 1.0))
-        dip = np.pi / 2 - STEP_RAD * np.arange(len(edges))
-        result = np.zeros(edges.shape, np.float32)
-        for sign in (1, -1):
-            clearest = np.zeros(edges.shape, np.float32)
-            for height in _SKIRTINGS:
-                other = np.arctan(np.tan(dip) * (1 - sign * height))
-                row = ((np.pi / 2 - other) / STEP_RAD + 0.5).astype(np.int64)
-                apart = (dip > 0) & (np.abs(other - dip) > _APART_RAD)
-                clearest = np.maximum(clearest, edges[row] * apart[:, None])
-            result += sign * clearest
-        return result
+    def _edge_clarity(self, distance: FloatArray, height: float, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Return how clear the edges of walls at a height are, from 0 to 1; 0 where they do not count."""
+        common = mean_along(self._at(np.arctan2(height, distance)) * counted[..., None], self.half_window)
+        return np.asarray(np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / CLEAR_LEVELS, 1.0)))
 
     def _at(self, elevation: FloatArray) -> NDArray[np.float32]:
         place = (elevation + np.pi / 2) / STEP_RAD
@@ -111,6 +105,10 @@ def skyline(picture: NDArray[np.float32], cam_from_world: Rigid3, step: int = 1)
     dip = np.pi / 2 - STEP_RAD * np.arange(round(np.pi / STEP_RAD) + 1)[:, None]
     rays = world_rays(np.linspace(0, 2 * np.pi, AZIMUTHS // step, endpoint=False), dip) @ cam_from_world.rotation.T
     changes = differences(picture, rays, axis=0)
+    # The tails of one edge must not be taken for other edges.
+    size = np.linalg.norm(changes, axis=-1)
+    around = cv2.dilate(size, np.ones((4 * HALF_DIFFERENCE + 1, 1), np.uint8))
+    changes *= ((size / np.maximum(around, 1e-6)) ** 2 / np.maximum(around / CLEAR_LEVELS, 1.0))[..., None]
     padded = np.pad(changes, [((len(dip) - len(changes)) // 2,) * 2, (0, 0), (0, 0)])
     return Skyline(padded, half_window=_HALF_WINDOW if step == 1 else 1)
 

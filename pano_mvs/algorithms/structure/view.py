@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
-from pano_mvs.core.arrays import FloatArray, Mask, Picture
+from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -23,10 +23,9 @@ STEP_RAD = np.radians(0.1)
 """Distance of the samples across a crease."""
 HALF_DIFFERENCE = 4
 """Steps from a crease to the two colours that are compared."""
-_BLUR_PX, _CLIP_LEVELS, _PAD_PX = 0.7, 40.0, 4
-PLAIN_WEIGHT = 0.05
-"""Weight of a point without texture relative to a precise one in the fit of a plane."""
-
+_BLUR_PX, _MOST_LEVELS, _PAD_PX = 0.7, 40.0, 4
+LEAST_UNCERTAINTY = 0.002
+"""Least relative standard deviation of the distance of a plane, and of a point in the fit of one."""
 _ROWS = 256
 
 
@@ -36,7 +35,7 @@ class PlaneView:
 
     `load`: returns the panorama, (H, W, 3) RGB at full resolution. `cam_from_world`: its pose. `rays`: (h, w, 3) unit
     rays in the world. `ranges`: (h, w), NaN is invalid. `confidence`: (h, w). `uncertainty`: (h, w) relative standard
-    deviation of the ranges. `precise`: (h, w) confirmed pixels with texture. `area`: (h, w) solid angle.
+    deviation of the ranges. `area`: (h, w) solid angle.
     """
 
     load: Callable[[], Picture]
@@ -45,7 +44,6 @@ class PlaneView:
     ranges: FloatArray
     confidence: NDArray[np.uint8]
     uncertainty: FloatArray
-    precise: Mask
     area: FloatArray
 
 
@@ -68,7 +66,9 @@ def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world:
     stride = stride_of((size[0], size[1]))
     rays = on_grid(ray_grid((size[0], size[1])), stride) @ cam_from_world.rotation
     confidence = on_grid(range_map.confidence, stride)
-    uncertainty = np.full(confidence.shape, UNCONFIRMED_UNCERTAINTY)
+    confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
+    supposed = np.where(on_grid(has_texture(load()), stride), 0.003, 0.02)
+    uncertainty = np.where(confirmed, supposed, UNCONFIRMED_UNCERTAINTY)
     if range_map.uncertainty is not None:
         known = on_grid(range_map.uncertainty, stride).astype(np.float64)
         uncertainty = np.where(np.isnan(known), uncertainty, known)
@@ -80,7 +80,6 @@ def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world:
         on_grid(range_map.range, stride).astype(np.float64),
         confidence,
         uncertainty,
-        on_grid(has_texture(load()), stride) & (confidence >= CONSISTENT_CONFIDENCE[0]),
         on_grid(area, stride),
     )
 
@@ -99,23 +98,15 @@ class ScenePlane:
     """The plane n · X = offset.
 
     `normal`: (3,) unit normal n in the world, towards the side from which it was seen. `offset`: in scene units.
-    `support`: solid angle of its points, summed over views. `precise_support`: that of confirmed points with texture.
-    `uncertainty`: relative standard deviation of ranges on it. `is_level`: whether the normal is vertical; else it is
-    horizontal.
+    `support`: solid angle of its points, summed over views. `uncertainty`: relative standard deviation of its distance
+    from the cameras. `is_level`: whether the normal is vertical; else it is horizontal.
     """
 
     normal: NDArray[np.float64]
     offset: float
     support: float
-    precise_support: float
     uncertainty: float
     is_level: bool
-
-    @property
-    def precise_share(self) -> float:
-        """The share of precise points in the fit."""
-        plain = PLAIN_WEIGHT * (self.support - self.precise_support)
-        return self.precise_support / max(self.precise_support + plain, 1e-9)
 
     @property
     def y(self) -> float:
@@ -137,10 +128,13 @@ def blurred(picture: Picture) -> NDArray[np.float32]:
 def differences(picture: NDArray[np.float32], rays_in_cam: FloatArray, *, axis: int) -> NDArray[np.float32]:
     """Return how colours change along an axis of rays, `STEP_RAD` apart; it is 2 `HALF_DIFFERENCE` entries shorter.
 
-    `picture`: from `blurred`. A strong edge counts no more than one of 40 levels.
+    `picture`: from `blurred`. A strong edge counts no more than one of 40 levels, and stays as sharp as it is.
     """
     size = picture.shape[0] - 2 * _PAD_PX, picture.shape[1] - 2 * _PAD_PX
     pixels = (pixel_from_ray(rays_in_cam, size) + (_PAD_PX - 0.5)).astype(np.float32)
     colors = np.moveaxis(cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR), axis, 0)
-    changes = np.clip(colors[2 * HALF_DIFFERENCE :] - colors[: -2 * HALF_DIFFERENCE], -_CLIP_LEVELS, _CLIP_LEVELS)
+    changes = colors[2 * HALF_DIFFERENCE :] - colors[: -2 * HALF_DIFFERENCE]
+    largest = np.abs(changes).max(axis=-1)
+    around = cv2.dilate(largest.reshape(len(largest), -1), np.ones((4 * HALF_DIFFERENCE + 1, 1), np.uint8))
+    changes /= np.maximum(around.reshape(largest.shape) / _MOST_LEVELS, 1.0)[..., None]
     return np.asarray(np.moveaxis(changes, 0, axis))
