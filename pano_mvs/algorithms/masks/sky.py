@@ -211,28 +211,32 @@ def judged_areas(view: View, models: tuple[Model, Model]) -> tuple[Mask, list[tu
     smooth = view.valid & (far | (contrast_around(view.picture, 1) < _SMOOTH))
     areas = _numbered(area_labels(smooth), view, min_share=_MIN_SHARE)
     sky: Mask = np.zeros_like(view.valid)
-    done = []
-    features = area_features(view, areas)
-    for number in range(_ROUNDS):
+    away = np.zeros(view.valid.shape, np.float32)  # from the colours of the sky, once these are known
+    done: list[tuple[Labels, dict[str, FloatArray]]] = []
+    while (areas >= 0).any() and len(done) < _ROUNDS:
+        features = area_features(view, areas)
+        if done:
+            features |= {
+                "first": models[0].log_odds(features),
+                "like": _mean(away, areas),
+                "touches": border_shares(areas, sky)[: int(areas.max()) + 1],
+            }
+        taken = (areas >= 0) & (models[min(len(done), 1)].probabilities(features) > MIN_PROBABILITY)[areas]
         done.append((areas, features))
-        taken = (areas >= 0) & (models[min(number, 1)].probabilities(features) > MIN_PROBABILITY)[areas]
-        sky = sky | taken
         if not taken.any():
             break
+        sky = sky | taken
         colors = sky_colors(view.picture, sky)
-        away = largest_channel(np.abs(view.picture - colors.mean)) / colors.tolerance
+        away = np.asarray(largest_channel(np.abs(view.picture - colors.mean)) / colors.tolerance)
         reached = view.valid & ~sky & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
         areas = _numbered(area_labels(reached & (far | (away <= 1))), view)
-        if not (areas >= 0).any():
-            break
-        sizes = np.bincount(areas[areas >= 0])
-        features = area_features(view, areas)
-        features |= {
-            "first": models[0].log_odds(features),
-            "like": np.bincount(areas[areas >= 0], away[areas >= 0]) / sizes,
-            "touches": border_shares(areas, sky)[: len(sizes)],
-        }
     return _without_specks(sky, view), done
+
+
+def _mean(values: NDArray[np.float32], areas: Labels) -> FloatArray:
+    """Return the mean of values (H, W) in each area."""
+    inside = areas >= 0
+    return np.asarray(np.bincount(areas[inside], values[inside]) / np.bincount(areas[inside]))
 
 
 def _without_specks(sky: Mask, view: View) -> Mask:
