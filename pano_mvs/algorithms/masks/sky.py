@@ -27,8 +27,6 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
-_RADII = (24, 6)
-_MIN_SEEDS = 40.0
 _TOLERANCE, _SPREAD, _MAX_TOLERANCE = 7.0, 3.0, 40.0
 _BAND_PX, _BAND_BESIDE_PX = 2, 3
 
@@ -55,13 +53,18 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
     `picture`: (H, W, 3) uint8. `seeds`: (H, W), at least one pixel.
     """
     levels = picture.astype(np.float64)
-    mean = _polynomial(levels, seeds)
+    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
+    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
+    step = max(1, int(seeds.sum()) // 4000)
+    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
+    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
+    mean = np.asarray(np.clip(terms @ factors, low, high))
     spread = np.full(seeds.shape, np.sqrt(float(((levels - mean)[seeds] ** 2).max(axis=-1).mean())))
-    for radius in _RADII:
+    for radius in (24, 6):
         if 2 * radius >= picture.shape[0]:
             continue
         count = box_sum(seeds.astype(np.float64), radius)
-        share = np.clip(count / _MIN_SEEDS, 0, 1)
+        share = np.clip(count / 40.0, 0, 1)
         local = box_sum(levels * seeds[..., None], radius) / np.maximum(count, 1)[..., None]
         mean = share[..., None] * local + (1 - share)[..., None] * mean
         squares = box_sum(largest_channel((levels - mean) ** 2) * seeds, radius) / np.maximum(count, 1)
@@ -92,16 +95,6 @@ def sharpened_sky(sky: Mask, colors: SkyColors, picture: Picture) -> Mask:
     limit = np.maximum(_resized(colors.tolerance, (height, width)), 0.5 * np.linalg.norm(between, axis=-1))
     nearer = np.where(total > 1, position > 0.5, wide) & (away <= limit)
     return np.where(band, nearer, wide)
-
-
-def _polynomial(levels: NDArray[np.float64], seeds: Mask) -> NDArray[np.float64]:
-    """Return the quadratic function of direction that fits the colours of the seeds, limited to their range."""
-    x, y, z = np.moveaxis(ray_grid((seeds.shape[0], seeds.shape[1])), -1, 0)
-    terms = np.stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, x * z, y * z], axis=-1)
-    step = max(1, int(seeds.sum()) // 4000)
-    factors = np.linalg.lstsq(terms[seeds][::step], levels[seeds][::step], rcond=None)[0]
-    low, high = np.quantile(levels[seeds], [0.01, 0.99], axis=0)
-    return np.asarray(np.clip(terms @ factors, low, high))
 
 
 def _resized(values: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
