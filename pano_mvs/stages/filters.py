@@ -91,7 +91,7 @@ def sky(
             source_from_reference=[other.cam_from_world @ pose.cam_from_world.inverse() for _, other in used],
             valid=image.load_mask(),
             source_valid=[source.load_mask() for source, _ in used],
-            up=pose.cam_from_world.rotation @ WORLD_UP if states_y_down(poses.frame) else None,
+            up=pose.cam_from_world.rotation @ WORLD_UP if states_y_down(poses.worlds[pose.group].frame) else None,
         )
         found = found if range_map.sky is None else found | range_map.sky
         result = with_ranges(replace(range_map, sky=found), range_map.range)

@@ -93,6 +93,15 @@ def test_the_outline_of_an_l_shaped_room_is_closed_at_any_angle(angle_deg: float
     assert not plan.openings
 
 
+@pytest.mark.parametrize("x", [5.0, 300.0])
+def test_a_room_far_from_the_origin_has_the_same_plan(x: float) -> None:
+    cloud, shift = room_cloud(), np.array([x, 3.0])
+    moved = RoomCloud(cloud.points + np.append(shift, 0), cloud.normals, cloud.colors)
+    (room,) = plan_of_cloud(moved, np.array([2, 2]) + shift, np.array([5, 1]) + shift).rooms
+    assert room.area == pytest.approx(25, rel=0.01)
+    assert len(room.outline) == 6
+
+
 def test_the_side_that_was_seen_is_on_the_left() -> None:
     for wall in plan_of_cloud(room_cloud(), np.array([2, 2]), np.array([5, 1])).walls:
         along = wall.ends[1] - wall.ends[0]

@@ -207,6 +207,9 @@ def test_sizes_must_agree(blue: Views) -> None:
             )
 
 
+UPPER_HALF = np.where(ray_grid(SIZE_HW)[..., 1] < 0, 0, -1)
+
+
 def seen(views: Views, *, source_valid: NDArray[np.bool_]) -> View:
     """Return the first view with the second one as its source."""
     pictures, ranges, poses = views
@@ -220,16 +223,18 @@ def test_walls_disagree_at_infinity_and_agree_at_their_range() -> None:
     far, near = (np.nanmedian(each) for each in view.errors)
     assert near < 2
     assert far > 3 * near
-    measures = area_features(view, np.zeros(SIZE_HW, np.int64))
-    assert measures["edge_prefers"] < -0.5 or np.isnan(measures["edge_prefers"])
+    measures = area_features(view, UPPER_HALF)
+    assert measures["edge_prefers"] < -0.5
     assert measures["confirmed"] > 0.9
 
 
 def test_masked_sources_say_nothing(blue: Views) -> None:
     view = seen(blue, source_valid=np.zeros(SIZE_HW, np.bool_))
     assert np.isnan(view.errors).all()
-    measures = area_features(view, (view.heights > 2).astype(np.int64))
+    unmasked = area_features(seen(blue, source_valid=np.ones(SIZE_HW, np.bool_)), UPPER_HALF)
+    measures = area_features(view, UPPER_HALF)
     for name in ("edge_prefers", "behind"):
+        assert np.isfinite(unmasked[name]).all()
         assert np.isnan(measures[name]).all()
 
 

@@ -149,7 +149,7 @@ def test_without_a_scale_units_are_scene_units(tmp_path: Path) -> None:
     files, _ = planned(tmp_path, the_cloud(room_cloud()), the_poses((2, 2, 1.5), metric=False), formats=("svg", "dxf"))
     assert stated(files)["unit"] == "scene unit"
     assert stated(files)["storeys"][0]["metres_per_pixel"] is None
-    assert ">1 scene units</text>" in files.files["floor_plan/storey_0.svg"].read_text()
+    assert ">1 scene unit</text>" in files.files["floor_plan/storey_0.svg"].read_text()
     assert readfile(files.files["floor_plan/storey_0.dxf"]).units == 0
 
 

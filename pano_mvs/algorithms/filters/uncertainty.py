@@ -30,7 +30,8 @@ EXPONENTS = {"motion": -0.85, "error": 0.69, "roughness": 0.3, "steps": 0.65, "c
 def probability_within(sigma: FloatArray, error: float) -> FloatArray:
     """Return the probability that a range with a relative standard deviation is within a relative error.
 
-    Errors have long tails: half of them are below 0.3 σ, 95 % below 2 σ (fitted like σ; errors of 1 to 5 %).
+    Errors have long tails: half of them are below 0.3 σ. The form was fitted to errors of 2 %; where it says less than
+    a half, more ranges are right than it says.
     """
     return np.asarray(error / (error + 0.3 * sigma))
 

@@ -84,10 +84,13 @@ def find_rooms(
         outlines = [np.array([ends[0] for ends, _ in loop]) for loop in loops]
         areas = [_area(outline) for outline in outlines]
         outer = int(np.argmax(areas))
-        within = cameras[contains(outlines[outer], cameras)]
+        holes = [one for idx, one in enumerate(outlines) if idx != outer]
+        inside = contains(outlines[outer], cameras)
+        for hole in holes:
+            inside &= ~contains(hole, cameras)
+        within = cameras[inside]
         if not len(within):
             continue
-        holes = [one for idx, one in enumerate(outlines) if idx != outer]
         rooms.append(Room(outlines[outer], holes, sum(areas), within[0]))
         sides += [Side(ends, line, len(rooms) - 1) for loop in loops for ends, line in loop]
     return rooms, sides
@@ -144,7 +147,7 @@ def _labels(
     # walls that are found by a few percent.
     for side, sign in ((edges.front, 1), (edges.back, -1)):
         gain += np.bincount(side, sign * 0.4 * height * seen, count)
-    gain *= unit
+    gain = np.clip(gain * unit, -1e9, 1e9)  # in 32 bits
     gain[edges.back[edges.line >= len(lines)]] = -1e9  # beyond the extent
     full, cost = (0.05 * height * unit * unseen for unseen in (length, length - seen))
     source, sink, every = count, count + 1, np.arange(count)

@@ -54,7 +54,7 @@ def wall_lines(cells: WallCells, known: Sequence[Line], *, min_area: float) -> l
         nonlocal cells
         near = cells.only(line.holds(cells, within=_NEAR_CELLS))
         taken = line.holds(cells, within=_TAKEN_CELLS)
-        if near.layers.sum() >= min_area:
+        if near.layers.sum() >= max(min_area, 1):
             found.append(line)
             held.append(near)
         elif line in known:
@@ -90,16 +90,22 @@ def _aligned(lines: Sequence[Line], held: Sequence[WallCells]) -> list[Line]:
 def _strongest(cells: WallCells) -> tuple[Line, float]:
     """Return the line with the most support, and how much that is."""
     normals, weights = cells.normals_xy, cells.layers.sum(axis=1).astype(np.float64)
-    angle = np.arctan2(normals[:, 1], normals[:, 0]) / (2 * np.pi) * _ANGLE_BINS
-    offset = (cells.xy * normals).sum(axis=1) / cells.cell
+    turns = (np.arange(_ANGLE_BINS) + 0.5) * 2 * np.pi / _ANGLE_BINS
+    centers = np.column_stack([np.cos(turns), np.sin(turns)])
+    share = np.arctan2(normals[:, 1], normals[:, 0]) / (2 * np.pi)
+    angle = np.floor(share * _ANGLE_BINS).astype(np.int64) % _ANGLE_BINS
+    # Offsets are those of the normal of the bin, about the middle: otherwise lines far from the origin were beside
+    # their cells.
+    middle = cells.xy.mean(axis=0)
+    offset = ((cells.xy - middle) * centers[angle]).sum(axis=1) / cells.cell
     low = np.floor(offset.min()) - 2
     size = int(offset.max() - low) + 4
-    index = (np.floor(angle).astype(np.int64) % _ANGLE_BINS) * size + np.floor(offset - low).astype(np.int64)
+    index = angle * size + np.floor(offset - low).astype(np.int64)
     support = np.bincount(index, weights, _ANGLE_BINS * size).reshape(_ANGLE_BINS, size)
     smooth = gaussian_filter(support, (1.5, 1.0), mode=("wrap", "constant"), truncate=3)
     best = int(np.argmax(smooth))
-    turn = (best // size + 0.5) * 2 * np.pi / _ANGLE_BINS
-    line = Line(np.array([np.cos(turn), np.sin(turn)]), (best % size + low + 0.5) * cells.cell)
+    normal = centers[best // size]
+    line = Line(normal, float(middle @ normal + (best % size + low + 0.5) * cells.cell))
     # The smoothing spreads the support of one line over about 1.5 × 1 × 2π bins.
     return line, float(smooth.flat[best] * 1.5 * 2 * np.pi)
 

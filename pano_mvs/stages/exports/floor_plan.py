@@ -142,11 +142,15 @@ class _GroupPlan:
 
     def write(self) -> dict[str, Any]:
         """Write the files of all storeys, and return what floor_plan.json states."""
-        sampled = [(one.points[::16], one.normals[::16]) for one in map(self.view, range(len(self.poses.names)))]
+        # Copies: parts of arrays would hold all of them.
+        views = map(self.view, range(len(self.poses.names)))
+        sampled = [(one.points[::16].copy(), one.normals[::16].copy()) for one in views]
         points, normals = (np.concatenate(parts) for parts in zip(*sampled, strict=True))
         storeys = find_storeys(points[:, 2], normals[:, 2], self.centers[:, 2])
         extent = self._extent([points[:, :2] for points, _ in sampled if len(points)])
         entries = [self._storey(number, storey, extent) for number, storey in enumerate(storeys)]
+        if not storeys:
+            self.notes.append("no floor plan: no view has confirmed ranges of surfaces")
         if not all(storey.has_floor for storey in storeys):
             self.notes.append("no level surface was found below some cameras: the floor of the plan is a guess")
         return {
@@ -208,7 +212,8 @@ class _GroupPlan:
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
         rows, columns = extent.size_hw
         width, height = columns * extent.pixel, rows * extent.pixel
-        unit = "m" if self.poses.metric else "scene units"
+        bar = bar_length(width)
+        unit = "m" if self.poses.metric else "scene unit" if bar == 1 else "scene units"
         box = ((extent.left, extent.top - height), (extent.left + width, extent.top))
         drawing = PlanDrawing(
             f"storey {number}",
@@ -218,7 +223,7 @@ class _GroupPlan:
             plan.rooms,
             names,
             box,
-            bar_length(width),
+            bar,
             unit,
             self.poses.metric,
         )
