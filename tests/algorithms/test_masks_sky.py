@@ -108,7 +108,7 @@ def test_skies_are_found(sky: str, turned: bool) -> None:
     views = outdoors(sky, turned=turned)
     truth = np.isnan(views[1][0])
     found = found_in(views)
-    assert AREA[found & truth].sum() > 0.96 * AREA[truth].sum()  # edges weigh more at this size
+    assert AREA[found & truth].sum() > 0.94 * AREA[truth].sum()  # edges weigh more at this size
     assert AREA[found & ~truth].sum() < 0.005 * AREA[~truth].sum()
 
 

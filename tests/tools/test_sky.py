@@ -23,7 +23,7 @@ def test_the_models_in_use_are_those_of_the_stored_areas() -> None:
 def test_kinds_of_places_that_were_left_out_lose_little() -> None:
     areas = read_areas()
     found, lost = np.array(list(left_out(areas).values())).T
-    assert np.nanmean(found) > 0.45
+    assert np.nanmean(found) > 0.4
     assert np.nanmax(lost) < 0.05
     found_in_all, lost_in_all = outcome((FIRST, LATER), areas)
     assert found_in_all > 0.7

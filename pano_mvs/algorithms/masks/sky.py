@@ -123,11 +123,8 @@ _SMOOTH = 16
 # Smaller areas of the sphere are not judged without known sky; farther from it, its colours are not known.
 _MIN_SHARE, _REACH_PX = 1e-4, 40
 _ROUNDS = 3
-MIN_PROBABILITY = 0.7
-"""An area is sky above this.
-
-A surface that is called sky is lost, and with it all that has its colours; what is missed keeps the ranges that it has.
-"""
+MIN_PROBABILITY = 5 / 6
+"""An area is sky above this: five missed ones cost as much as a surface that is lost, as in the verdict on cameras."""
 
 # Larger parts within the sky are something else.
 _SPECK_SHARE = 1e-3

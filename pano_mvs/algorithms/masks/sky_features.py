@@ -138,6 +138,7 @@ def area_features(view: View, areas: Labels) -> dict[str, FloatArray]:
         "blue": (mean(view.lights[1]) - share / 2) / (1 - share),
         "edge_prefers": np.log((edge_near + 1) / (edge_far + 1)),
         "surface": share * mean(view.solid),  # of the sphere: single ranges in the sky are chance, and edges are thin
+        "apart": np.log1p(_quantiles(view.least_errors[0][inside], label, count, share=0.5)),
         "behind": _quantiles(np.fmax.reduce(view.errors[1])[edge], areas[edge], count, share=0.9),
         "far_beside": np.log((view.usual_px + 0.2) / (_quantiles(*_beside(view, areas), count, share=0.15) + 0.2)),
     }

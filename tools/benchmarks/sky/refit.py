@@ -47,6 +47,7 @@ SIGNS = {
     "blue": 1,
     "edge_prefers": 1,
     "surface": -1,
+    "apart": -1,
     "behind": 1,
     "far_beside": 1,
 }
