@@ -1,1 +1,1 @@
-"""Floor plans: storeys, wall lines and an orthophoto of the floor from an upright cloud."""
+"""Floor plans: storeys, lines of walls, rooms with openings, and an orthophoto of the floor."""

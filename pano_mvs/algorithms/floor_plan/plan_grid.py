@@ -1,4 +1,4 @@
-"""Storeys of a place, and their grids seen from above, filled with parts of a cloud; the drawn plan."""
+"""Storeys of a place, and their grids seen from above, filled with parts of a cloud."""
 
 from __future__ import annotations
 

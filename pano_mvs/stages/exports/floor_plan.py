@@ -56,7 +56,10 @@ class FloorPlanParams(Params):
     pixel: float = Field(default=0.0, ge=0, description="edge of a pixel in scene units; 0: by `width_px`")
     cut: float = Field(default=0.9, gt=0, le=2, description="height of the cut of the orthophoto, in camera heights")
     min_wall_share: float = Field(
-        default=0.4, gt=0, le=1, description="share of the height of the room at which a wall must be seen"
+        default=0.4,
+        gt=0,
+        le=1,
+        description="share of the height of the room that a wall must show, over 15 % of it along",
     )
     min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
 
