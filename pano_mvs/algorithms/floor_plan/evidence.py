@@ -49,7 +49,8 @@ def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
     if range_map.uncertainty is not None:
         known = on_grid(range_map.uncertainty, stride).astype(np.float64)
         error = np.where(np.isnan(known), UNCONFIRMED_UNCERTAINTY, known)
-    ranges[error > UNCONFIRMED_UNCERTAINTY / 3] = np.nan  # confirmed neither by views nor by planes
+    # Confirmed neither by views nor by planes.
+    ranges[(error > UNCONFIRMED_UNCERTAINTY / 3) & (confidence < CONSISTENT_CONFIDENCE[0])] = np.nan
     normals = on_grid(normals_from_range(range_map, given=given), stride)
     seen = np.isfinite(ranges)
     rays = on_grid(ray_grid((height, width)), stride)
