@@ -159,7 +159,7 @@ def measured(
         with patch.object(consistency, "confirmed_uncertainty", wraps=confirmed_uncertainty) as called:
             chain.run_one("checked", image, index, given, done)
         (consistent, ranges, comparison), further = called.call_args
-        factors = error_factors(consistent, ranges, comparison, **further)
+        factors = dict(error_factors(consistent, ranges, comparison, **further))
         true, shown = capture.ranges[image], kinds.get(image, np.full(ranges.shape, -1))
         bare = is_bare(capture.panoramas[image].load())
         for at in zip(*np.nonzero(consistent & np.isfinite(true) & (shown != LEFT_OUT)), strict=True):

@@ -8,6 +8,8 @@ ranges, leaving out each place in turn.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,17 +48,17 @@ def confirmed_uncertainty(
     `consistent`: (H, W) pixels that other views confirm. `ranges`: (H, W), finite where consistent. `comparison`: of
     each pixel with its sources. `step`: (H, W) ln(largest / smallest range) around the pixel.
     """
-    factors = error_factors(consistent, ranges, comparison, step=step)
-    sigma = FACTOR * np.prod([factors[name] ** power for name, power in EXPONENTS.items()], axis=0)
-    return np.where(consistent, np.clip(sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY), UNCONFIRMED_UNCERTAINTY).astype(
-        np.float16
-    )
+    sigma = np.ones(ranges.shape)
+    for name, values in error_factors(consistent, ranges, comparison, step=step):
+        sigma *= values ** EXPONENTS[name]
+    sigma = np.clip(FACTOR * sigma, LEAST_UNCERTAINTY, MOST_UNCERTAINTY)
+    return np.where(consistent, sigma, UNCONFIRMED_UNCERTAINTY).astype(np.float16)
 
 
 def error_factors(
     consistent: Mask, ranges: NDArray[np.float32], comparison: Comparison, *, step: NDArray[np.float32]
-) -> dict[str, FloatArray]:
-    """Return what errors of confirmed ranges depend on, name to (H, W), all positive.
+) -> Iterator[tuple[str, FloatArray]]:
+    """Yield what errors of confirmed ranges depend on, names and (H, W), all positive; one by one, to save memory.
 
     `motion`: M, the motion of the pixel in its sources per relative change of its range, in pixels. `error`: the rms
     reprojection error of the confirmed pixels within 4 pixels, weighted by their support, in pixels. `roughness`: the
@@ -68,23 +70,22 @@ def error_factors(
     near, rough, wide = (max(1, min(radius, len(ranges) // 2 - 1)) for radius in (4, 2, 8))
     px_per_rad = ranges.shape[1] / (2 * np.pi)
     motion = np.maximum(px_per_rad * np.sqrt(comparison.motion), 1e-6)
-    squares, support = (
-        box_sum(np.where(consistent, values, 0), near) for values in (comparison.squared_error, comparison.support)
-    )
+    yield "motion", motion
+    # Smaller reprojection errors, and less roughness, are chance.
+    error = box_sum(np.where(consistent, comparison.squared_error, 0), near)
+    error /= np.maximum(box_sum(np.where(consistent, comparison.support, 0), near), 1e-9)
+    yield "error", np.maximum(px_per_rad * np.sqrt(np.maximum(error, 0)), 0.02)
+    del error
     # The rms relative deviation of 1/range from the mean around it, of the consistent pixels of a window.
     inverse = np.where(consistent, 1 / np.where(consistent, ranges, 1).astype(np.float64), 0)
     count = np.maximum(box_sum(consistent.astype(np.float64), rough), 1)
     mean = np.maximum(box_sum(inverse, rough) / count, 1e-12)
     deviation = box_sum(np.where(consistent, (inverse / mean - 1) ** 2, 0), rough) / count
-    # Smaller reprojection errors, and less roughness, are chance.
-    return {
-        "motion": motion,
-        "error": np.maximum(px_per_rad * np.sqrt(np.maximum(squares / np.maximum(support, 1e-9), 0)), 0.02),
-        "roughness": np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, 0.01),
-        "steps": 1 + 5 * _share(step > 0.1, wide),
-        "confirmed": np.maximum(_share(consistent, near), 0.05),
-        "opposed": 1.0 + comparison.contradicting + comparison.hiding,
-    }
+    yield "roughness", np.maximum(np.sqrt(np.maximum(deviation, 0)) * motion, 0.01)
+    del motion, inverse, count, mean, deviation
+    yield "steps", 1 + 5 * _share(step > 0.1, wide)
+    yield "confirmed", np.maximum(_share(consistent, near), 0.05)
+    yield "opposed", (1 + comparison.contradicting + comparison.hiding).astype(np.float64)
 
 
 def _share(part: Mask, radius: int) -> FloatArray:

@@ -85,10 +85,10 @@ def find_rooms(
         areas = [_area(outline) for outline in outlines]
         outer = int(np.argmax(areas))
         holes = [one for idx, one in enumerate(outlines) if idx != outer]
-        inside = contains(outlines[outer], cameras)
+        stand_in = contains(outlines[outer], cameras)
         for hole in holes:
-            inside &= ~contains(hole, cameras)
-        within = cameras[inside]
+            stand_in &= ~contains(hole, cameras)
+        within = cameras[stand_in]
         if not len(within):
             continue
         rooms.append(Room(outlines[outer], holes, sum(areas), within[0]))
