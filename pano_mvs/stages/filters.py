@@ -24,7 +24,8 @@ from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.sky import MAX_SOURCES, sky_pixels
 from pano_mvs.algorithms.patchmatch.exchange import respect_free_space
 from pano_mvs.algorithms.scales import sharp_halvings
-from pano_mvs.algorithms.structure.lay import lay_structure
+from pano_mvs.algorithms.structure.laid import OtherView
+from pano_mvs.algorithms.structure.lay import MAX_LAID_SOURCES, lay_structure
 from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.api import (
     All,
@@ -134,6 +135,7 @@ def structure(
     pose: Each[Pose],
     sources: Near[RangeMap],
     source_poses: Near[Pose],
+    source_images: Near[Panorama],
     planes: One[Structure],
     params: StructureParams,
     ctx: Context,
@@ -145,13 +147,13 @@ def structure(
     require_one_group(pose, source_poses)
     result, share = range_map, 0.0
     if params.enabled and len(planes):
+        used = list(zip(sources, source_poses, source_images, strict=True))[:MAX_LAID_SOURCES]
         result, share = lay_structure(
             range_map,
             image.load(),
             planes,
             cam_from_world=pose.cam_from_world,
-            sources=sources,
-            source_poses=[other.cam_from_world for other in source_poses],
+            sources=[OtherView(ranges, other.cam_from_world, source.load()) for ranges, other, source in used],
             group=pose.group,
             valid=image.load_mask(),
             **arguments_from(lay_structure, params),

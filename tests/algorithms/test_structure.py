@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
+from pano_mvs.algorithms.structure.laid import OtherView
 from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_of
 from pano_mvs.algorithms.structure.planes import find_structure
@@ -67,8 +68,10 @@ class Box:
             self.pictures[name],
             structure,
             cam_from_world=self.cams[name],
-            sources=given["sources"],
-            source_poses=[self.cams[other] for other in others],
+            sources=[
+                OtherView(ranges, self.cams[other], self.pictures[other])
+                for ranges, other in zip(given["sources"], others, strict=True)
+            ],
         )[0]
 
 
@@ -241,6 +244,24 @@ def test_what_stands_before_a_wall_stays(box: Box, planes: Structure) -> None:
     area[60:70, 100:120] = True
     before = replace(own, range=np.where(area, 0.7 * own.range, own.range).astype(np.float32))
     np.testing.assert_array_equal(box.laid(planes, range_map=before).range[area], before.range[area])
+
+
+@pytest.mark.parametrize("red", [True, False])
+def test_what_is_not_confirmed_before_the_floor_stays_if_other_views_show_another_colour(
+    planes: Structure, red: bool
+) -> None:
+    """A plain table, or a part of the floor whose range is too small: no view confirms it."""
+    box = Box()
+    for name, picture in box.pictures.items():
+        picture[~box.walls[name] & (ray_grid(SIZE)[..., 1] > 0)] = 120
+    own, area = box.maps["0.png"], np.zeros(SIZE, np.bool_)
+    area[100:112, 60:90] = True
+    box.pictures["0.png"][area] = (160, 60, 40) if red else 120
+    near = np.where(area, 0.7 * own.range, own.range).astype(np.float32)
+    table = replace(own, range=near, confidence=np.where(area, SEEN, own.confidence).astype(np.uint8))
+    laid = box.laid(planes, range_map=table).range[area]
+    expected = near[area] if red else box.truth["0.png"][area]
+    assert np.mean(np.abs(laid / expected - 1) < 0.01) > 0.9
 
 
 def test_a_plane_is_not_laid_where_another_view_sees_through_it(box: Box, planes: Structure) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from pano_mvs.algorithms.filters.uncertainty import EXPONENTS, FACTOR, probability_within
 from pano_mvs.algorithms.scales import sharp_halvings
+from pano_mvs.algorithms.structure.laid_coefficients import FITTED as LAID
 from pano_mvs.algorithms.sweep import hypotheses
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap, Record
@@ -18,7 +19,7 @@ from tests.synthetic.places import window_room
 from tests.synthetic.scenes import weak_room, white_room, write_scene
 from tools.benchmarks.captures import Capture, read_capture, scene_capture
 from tools.benchmarks.dense_chain import DenseChain
-from tools.benchmarks.depth import ablation
+from tools.benchmarks.depth import ablation, laid
 from tools.benchmarks.depth.ablation import Ablation, gains, place_rows, real_rows, synthetic_rows
 from tools.benchmarks.depth.layouts import OPENING, layout_ranges, view_shares
 from tools.benchmarks.depth.mechanisms import FULL, MECHANISMS, Mechanism
@@ -251,6 +252,20 @@ def test_confidence_is_right_as_often_as_it_says() -> None:
         here = (probability >= least) & (probability < least + 0.25)
         excess = (errors.error[here] < 0.02).mean() - probability[here].mean()
         assert -0.05 < excess < (0.2 if least < 0.5 else 0.05)
+
+
+def test_the_model_of_laid_planes_is_that_of_the_stored_pixels() -> None:
+    fitted = laid.fit(laid.read())
+    assert fitted.intercept == pytest.approx(LAID.intercept, abs=0.02)
+    for name, term in LAID.terms.items():
+        assert fitted.terms[name].losses == pytest.approx(term.losses, abs=0.05)
+
+
+def test_planes_are_laid_where_they_are_better_in_places_that_were_left_out() -> None:
+    pixels = laid.read()
+    kept = laid.left_out(pixels)
+    assert kept[pixels.better].mean() > 0.96
+    assert kept[~pixels.better].mean() < 0.75
 
 
 def test_a_halved_plane_is_the_plane_and_edges_do_not_mix() -> None:

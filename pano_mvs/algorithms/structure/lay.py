@@ -8,7 +8,7 @@ range from it, which counts little where nothing was matched; the guided filter 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import cv2
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.guided import guided_values
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.ranges.agreement import pixels_containing
+from pano_mvs.algorithms.structure.laid import OtherView, Seen, laid_evidence, seen_by
+from pano_mvs.algorithms.structure.laid_coefficients import FITTED
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
 from pano_mvs.algorithms.structure.view import ScenePlane, on_grid, plane_ranges, plane_view, stride_of
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
@@ -31,7 +32,12 @@ from pano_mvs.scene.surfaces import Structure
 # Weights of the own ranges of precise and other confirmed pixels, of weak ones with texture, and of all others: without
 # texture, weak ranges are right no more often than filled ones.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
-_SOURCES = 4
+MIN_PROBABILITY = 1 / 3
+"""A plane is laid above this: a right one that is missing costs twice as much as a wrong one, which has no more errors
+than what it replaces in plain places."""
+
+MAX_LAID_SOURCES = 4
+"""More sources than this are not compared with planes."""
 
 
 @checks_settings
@@ -41,8 +47,7 @@ def lay_structure(
     structure: Structure,
     *,
     cam_from_world: Rigid3,
-    sources: Sequence[RangeMap],
-    source_poses: Sequence[Rigid3],
+    sources: Sequence[OtherView],
     group: int = 0,
     valid: Mask | None = None,
     textured_error: Annotated[
@@ -65,8 +70,8 @@ def lay_structure(
         guide: (H, W, 3) RGB panorama.
         structure: planes in the world.
         cam_from_world: pose of the view.
-        sources: range maps of other views; a pixel is not moved to where one of them sees through the plane.
-        source_poses: cam_from_world of each.
+        sources: other views; a pixel is not moved to where one of them sees through the plane, nor where its own range
+            is off the plane and the fitted model (`laid_evidence`) holds that it shows something else.
         group: of the poses of the view.
         valid: (H, W) pixels that may have a range; None: all.
 
@@ -74,6 +79,92 @@ def lay_structure(
         The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
         whose place another view confirms, are consistent (confidence 128 or more).
     """
+    found = proposed_planes(
+        range_map,
+        guide,
+        structure,
+        cam_from_world=cam_from_world,
+        sources=sources,
+        group=group,
+        errors=(textured_error, plain_error),
+    )
+    size, planes, textured, tolerance = guide.shape[:2], found.planes, found.textured, found.tolerance
+    other = found.off.copy()
+    evidence = {name: values[found.off] for name, values in found.evidence.items()}
+    other[found.off] = FITTED.probabilities(evidence) < MIN_PROBABILITY
+    label = _enlarged(np.where(found.seen_through | other, -1, found.label), size)
+    agree = _enlarged(found.agree, size) > 0
+    laid = _chosen(found.on_planes, label)
+    with np.errstate(invalid="ignore"):
+        error = np.abs(range_map.range / laid - 1)
+    matched, confirmed = (range_map.confidence >= least[0] for least in (WEAK_CONFIDENCE, CONSISTENT_CONFIDENCE))
+    # Creases of single views confirm nothing, and correct nothing that is confirmed.
+    alone = np.isin(label, np.flatnonzero(structure.uncertainties[planes] >= OUTLINE_UNCERTAINTY))
+    near, agree = (error <= tolerance) & ~(alone & confirmed), agree & ~alone
+    unsure = np.where(textured, ~matched, ~confirmed) | (error <= found.explained) & ~(alone & confirmed) | found.sunk
+    moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
+    kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
+    confidence = np.select(
+        [near & matched & agree, near & matched, agree],
+        [np.maximum(range_map.confidence, np.uint8(CONSISTENT_CONFIDENCE[0])), kept, np.uint8(WEAK_CONFIDENCE[1])],
+        np.uint8(FILLED_CONFIDENCE[1]),
+    )
+    result = with_ranges(
+        range_map,
+        np.where(moved, laid, range_map.range).astype(np.float32),
+        np.where(moved, confidence, range_map.confidence),
+    )
+    moved &= result.valid
+    return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
+        (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """The planes that the pixels of a view may show: (H, W), and (h, w) on the grid (`on_grid`).
+
+    Attributes:
+        planes: positions in the structure.
+        on_planes: (H, W) range on each of them.
+        textured: (H, W) whether the picture has texture.
+        explained: (H, W) relative error of the own range that its uncertainty explains.
+        tolerance: (H, W) largest relative error of an own range that is on its plane.
+        sunk: (H, W) whether the pixel lies below the floor, or would.
+        label: (h, w) position in `planes`; −1 for none.
+        laid: (h, w) range on that plane; NaN without one.
+        agree: (h, w) whether another view confirms a range on it.
+        seen_through: (h, w) whether other views see through it.
+        off: (h, w) whether the own range is not on the plane, or unknown.
+        evidence: what was measured of each pixel (`laid_evidence`), (h, w) each.
+    """
+
+    planes: NDArray[np.intp]
+    on_planes: Sequence[FloatArray]
+    textured: Mask
+    explained: FloatArray
+    tolerance: FloatArray
+    sunk: Mask
+    label: NDArray[np.int16]
+    laid: FloatArray
+    agree: Mask
+    seen_through: Mask
+    off: Mask
+    evidence: dict[str, FloatArray]
+
+
+def proposed_planes(
+    range_map: RangeMap,
+    guide: Picture,
+    structure: Structure,
+    *,
+    cam_from_world: Rigid3,
+    sources: Sequence[OtherView],
+    group: int,
+    errors: tuple[float, float],
+) -> Proposal:
+    """Return the plane of each pixel, and what speaks for it; the arguments are those of `lay_structure`."""
+    textured_error, plain_error = errors
     planes = np.flatnonzero(structure.group_idx == group)
     size = range_map.range.shape[0], range_map.range.shape[1]
     stride = stride_of(size)
@@ -113,32 +204,17 @@ def lay_structure(
             on_planes[floor], range_map, error=plain_error, cosine=-rays @ structure.normals_in_world[planes[floor]]
         )
         label[on_grid(sunk, stride)] = floor
-    places = cam_from_world.center + coarse_rays * _chosen(coarse_planes, label)[..., None]
-    agree, seen_through = _seen_by_others(places, sources[:_SOURCES], source_poses[:_SOURCES], error=plain_error)
-    label, agree = _enlarged(np.where(seen_through, -1, label), size), _enlarged(agree, size) > 0
-    laid = _chosen(on_planes, label)
+    laid = _chosen(coarse_planes, label)
+    places = cam_from_world.center + coarse_rays * laid[..., None]
+    views = [seen_by(view, places) for view in sources[:MAX_LAID_SOURCES]]
+    agree, seen_through = _seen_by_others(views, laid.shape, error=plain_error)
+    own = on_grid(range_map.range, stride).astype(np.float64)
+    colors = cv2.resize(guide, laid.shape[::-1], interpolation=cv2.INTER_AREA)
     with np.errstate(invalid="ignore"):
-        error = np.abs(range_map.range / laid - 1)
-    matched, confirmed = (range_map.confidence >= least[0] for least in (WEAK_CONFIDENCE, CONSISTENT_CONFIDENCE))
-    # Creases of single views confirm nothing, and correct nothing that is confirmed.
-    alone = np.isin(label, np.flatnonzero(structure.uncertainties[planes] >= OUTLINE_UNCERTAINTY))
-    near, agree = (error <= tolerance) & ~(alone & confirmed), agree & ~alone
-    unsure = np.where(textured, ~matched, ~confirmed) | (error <= explained) & ~(alone & confirmed) | sunk
-    moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
-    kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
-    confidence = np.select(
-        [near & matched & agree, near & matched, agree],
-        [np.maximum(range_map.confidence, np.uint8(CONSISTENT_CONFIDENCE[0])), kept, np.uint8(WEAK_CONFIDENCE[1])],
-        np.uint8(FILLED_CONFIDENCE[1]),
-    )
-    result = with_ranges(
-        range_map,
-        np.where(moved, laid, range_map.range).astype(np.float32),
-        np.where(moved, confidence, range_map.confidence),
-    )
-    moved &= result.valid
-    return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
-        (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
+        off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, stride)) & ~on_grid(sunk, stride)
+    evidence = laid_evidence(own, laid, picture=colors, views=views, error=plain_error)
+    return Proposal(
+        planes, on_planes, textured, explained, tolerance, sunk, label, laid, agree, seen_through, off, evidence
     )
 
 
@@ -209,20 +285,13 @@ def _chosen(on_planes: Sequence[FloatArray], label: NDArray[np.int16]) -> FloatA
     return chosen
 
 
-def _seen_by_others(
-    places: FloatArray, sources: Sequence[RangeMap], poses: Sequence[Rigid3], *, error: float
-) -> tuple[Mask, Mask]:
-    """Return where a confirmed range of another view agrees with places (h, w, 3), and where one is clearly behind."""
-    agree, through = np.zeros(places.shape[:2], np.int64), np.zeros(places.shape[:2], np.int64)
-    known = np.isfinite(places).all(axis=-1)
-    for source, pose in zip(sources, poses, strict=True):
-        in_source = pose.apply(places[known])
-        distance = np.linalg.norm(in_source, axis=-1)
-        row, column = pixels_containing(in_source / distance[:, None], source.range.shape)
-        confirmed = source.confidence[row, column] >= CONSISTENT_CONFIDENCE[0]
-        seen = source.range[row, column] / distance
-        agree[known] += confirmed & (np.abs(seen - 1) < error)
-        through[known] += confirmed & (seen > 1 + error)
+def _seen_by_others(views: Sequence[Seen], shape: tuple[int, ...], *, error: float) -> tuple[Mask, Mask]:
+    """Return where a confirmed range of another view agrees with places (h, w), and where one is clearly behind."""
+    agree, through = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    for seen in views:
+        with np.errstate(invalid="ignore"):
+            agree += seen.confirmed & (np.abs(seen.ratio - 1) < error)
+            through += seen.confirmed & (seen.ratio > 1 + error)
     return np.asarray(agree > 0), np.asarray(through > agree)
 
 
