@@ -72,25 +72,20 @@ def laid_evidence(
 
     Returns:
         `nearer` (logarithm of the range on the plane relative to its own, which may be that of something before the
-        plane), `clash` (least difference of its colour to views that confirm the plane there, in grey levels), and
-        `unlike` (median difference to the views that confirm nothing nearer).
+        plane), and `unlike` (median difference of its colour, in grey levels, to the views whose own ranges are not
+        nearer than the place).
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         nearer = np.log(laid / own)
         gains = [_gain(picture, seen, near=np.abs(nearer) < error, error=error) for seen in views]
         different = [_difference(picture, seen, gain) for seen, gain in zip(views, gains, strict=True)]
-        clash = [
-            np.where(seen.confirmed & (np.abs(seen.ratio - 1) < error), difference, np.nan)
-            for seen, difference in zip(views, different, strict=True)
-        ]
         unlike = [
-            np.where(seen.confirmed & (seen.ratio < 1 - error), np.nan, difference)
+            np.where(seen.ratio < 1 - error, np.nan, difference)
             for seen, difference in zip(views, different, strict=True)
         ]
     return {
         "nearer": np.maximum(nearer, 0.0),
-        "clash": _ordered(clash, own.shape, share=0.0),
-        "unlike": _ordered(unlike, own.shape, share=0.5),
+        "unlike": _median(unlike, own.shape),
     }
 
 
@@ -106,11 +101,10 @@ def _difference(picture: Picture, seen: Seen, gain: FloatArray) -> FloatArray:
     return largest_channel(np.abs(picture - np.minimum(seen.colors * gain, 255.0)))
 
 
-def _ordered(values: Sequence[FloatArray], shape: tuple[int, ...], *, share: float) -> FloatArray:
-    """Return the value (h, w) that at most a share of the known ones lies below; NaN where there is none."""
+def _median(values: Sequence[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    """Return the lower median (h, w) of the known values; NaN where there is none."""
     if not values:
         return np.full(shape, np.nan)
     ordered = np.sort(np.array(values), axis=0)  # NaN last
-    last = np.isfinite(ordered).sum(axis=0) - 1
-    at = np.floor(share * np.maximum(last, 0)).astype(np.intp)
-    return np.asarray(np.take_along_axis(ordered, at[None], axis=0)[0], np.float64)
+    middle = np.maximum(np.isfinite(ordered).sum(axis=0) - 1, 0) // 2
+    return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0], np.float64)
