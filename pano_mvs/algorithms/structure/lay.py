@@ -19,6 +19,7 @@ from pano_mvs.algorithms.filters.guided import guided_values
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
+from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
 from pano_mvs.algorithms.structure.view import ScenePlane, on_grid, plane_ranges, plane_view, stride_of
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
@@ -72,7 +73,7 @@ def lay_structure(
 
     Returns:
         The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
-        whose place another view confirms, are consistent (confidence 128 or more).
+        whose place another view confirms, are consistent (confidence 128 or more). Mirrors have the range of their pane.
     """
     planes = np.flatnonzero(structure.group_idx == group)
     size = range_map.range.shape[0], range_map.range.shape[1]
@@ -137,7 +138,8 @@ def lay_structure(
         np.where(moved, confidence, range_map.confidence),
     )
     moved &= result.valid
-    return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
+    result = _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation)
+    return with_mirrors(result, structure, cam_from_world, group=group), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
 
