@@ -126,7 +126,7 @@ def range_ticks(near: float, far: float) -> Ticks:
     return tuple(found)
 
 
-VERSION = 4  # raise it when the pictures change: earlier pages' are then drawn again
+VERSION = 5  # raise it when the pictures change: earlier pages' are then drawn again
 MAX_CARDS = 36
 WIDTH = 768
 MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}

@@ -73,7 +73,7 @@ def lay_structure(
 
     Returns:
         The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
-        whose place another view confirms, are consistent (confidence 128 or more). Mirrors have the range of their pane.
+        whose place another view confirms, are consistent (confidence 128 or more). For mirrors see `with_mirrors`.
     """
     planes = np.flatnonzero(structure.group_idx == group)
     size = range_map.range.shape[0], range_map.range.shape[1]
