@@ -30,7 +30,7 @@ CORNERS = np.array([[(x, y, WALL_Z) for x, y in zip((-1.2, 0.4, 0.4, -1.2), (-0.
 
 
 def views_of(scene: Scene, *, phantom: bool) -> tuple[list[PlaneView], list[NDArray[np.float32]]]:
-    """Return the views of a scene and their true ranges; with `phantom`, views have in the mirror those of its image."""
+    """Return the views of a scene and their true ranges; with `phantom`, views have other ranges in the mirror."""
     views, truth = [], []
     for idx, pose in enumerate(scene.poses):
         picture, ranges = scene.view(idx, SIZE, supersample=1)
