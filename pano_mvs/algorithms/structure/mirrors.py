@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_ranges
-from pano_mvs.core.arrays import FloatArray, Mask
+from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import MIRROR_CONFIDENCE, WEAK_CONFIDENCE
@@ -95,38 +95,42 @@ def with_mirrors(range_map: RangeMap, structure: Structure, cam_from_world: Rigi
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A view with its picture (h, w, 3) at the size of the grid, and its coloured points (N, 3)."""
+    """A view with its picture (h, w, 3) at the size of the grid."""
 
     view: PlaneView
-    picture: Image
-    points: FloatArray
-    colors: Image
+    picture: Picture
 
     @classmethod
     def of(cls, view: PlaneView) -> _Seen:
-        height, width = view.ranges.shape
-        picture = cv2.resize(view.load(), (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        known = np.isfinite(view.ranges)
-        points = view.cam_from_world.center + view.rays[known] * view.ranges[known][:, None]
-        return cls(view, picture, points, picture[known])
+        return cls(view, cv2.resize(view.load(), view.ranges.shape[::-1], interpolation=cv2.INTER_AREA))
 
     @property
     def center(self) -> FloatArray:
         return self.view.cam_from_world.center
 
     def on(self, plane: ScenePlane) -> FloatArray:
-        """Return the points (N, 3) on a plane."""
-        ranges = plane_ranges(self.view.rays, self.center, normal=plane.normal, offset=plane.offset)
+        """Return the points (N, 3) on a plane, of every fourth row and column."""
+        some = slice(None, None, 4), slice(None, None, 4)
+        rays, own = self.view.rays[some], self.view.ranges[some]
+        ranges = plane_ranges(rays, self.center, normal=plane.normal, offset=plane.offset)
         with np.errstate(invalid="ignore"):
-            near = (np.abs(self.view.ranges / ranges - 1) < _ON_PLANE) & (self.view.confidence >= WEAK_CONFIDENCE[0])
-        return np.asarray(self.center + self.view.rays[near] * ranges[near][:, None])
+            near = (np.abs(own / ranges - 1) < _ON_PLANE) & (self.view.confidence[some] >= WEAK_CONFIDENCE[0])
+        return np.asarray(self.center + rays[near] * ranges[near][:, None])
+
+    def before(self, plane: ScenePlane, *, height: float, most: int) -> tuple[FloatArray, Image]:
+        """Return points (N, 3) at more than a height before a plane, evenly at most so many, and their colours."""
+        points = self.center + self.view.rays * self.view.ranges[..., None]
+        with np.errstate(invalid="ignore"):
+            chosen = np.flatnonzero(points @ plane.normal - plane.offset > height)
+        chosen = chosen[:: -(-len(chosen) // most)] if len(chosen) else chosen
+        return points.reshape(-1, 3)[chosen], self.picture.reshape(-1, 3)[chosen].astype(np.float32)
 
     def colors_at(self, points: FloatArray) -> tuple[Image, FloatArray, NDArray[np.uint8]]:
         """Return colours, ranges over distances, and confidences where the view sees points (h, w, 3)."""
         in_cam = self.view.cam_from_world.apply(points)
         distance = np.linalg.norm(in_cam, axis=-1)
         pixels = pixel_from_ray(in_cam, self.view.ranges.shape).astype(np.float32) - 0.5
-        padded = np.concatenate([self.picture, self.picture[:, :1]], axis=1)
+        padded = np.concatenate([self.picture, self.picture[:, :1]], axis=1).astype(np.float32)
         columns = np.mod(pixels[..., 0], self.picture.shape[1])
         colors = cv2.remap(padded, columns, pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         row, column = pixels_containing(in_cam, self.view.ranges.shape)
@@ -167,21 +171,19 @@ class _Grid:
 def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, FloatArray, FloatArray]]:
     """Return the strength and the corners of each mirror on a plane, and the centre of a camera before it."""
     shares = [one.on(plane) for one in seen]
-    least = 0.005 * seen[0].view.ranges.size
+    least = 0.005 * seen[0].view.ranges.size / 16
     chosen = [idx for idx in np.argsort([-len(points) for points in shares])[:_VIEWS] if len(shares[idx]) > least]
     if len(chosen) < 2:
         return []
     used = [seen[idx] for idx in chosen]
     distance = float(np.median([one.center @ plane.normal - plane.offset for one in used]))
     grid = _grid_of(plane, [shares[idx] for idx in chosen], distance / seen[0].view.ranges.shape[0])
-    points, colors = (np.concatenate([getattr(one, name) for one in used]) for name in ("points", "colors"))
-    height = points @ plane.normal - plane.offset
-    before = np.flatnonzero(height > 0.05 * distance)
-    before = before[:: max(1, len(before) // _POINTS)]
+    parts = [one.before(plane, height=0.05 * distance, most=_POINTS // len(used)) for one in used]
+    points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     pictures, predicted, weights, on_plane = [], [], [], np.zeros(grid.size_hw, np.bool_)
     for one in used:
         picture, ratio, confidence = one.colors_at(grid.centers())
-        reflected, known = _reflected(one.center, grid, points[before], colors[before])
+        reflected, known = _reflected(one.center, grid, points, colors)
         with np.errstate(invalid="ignore"):
             known &= ~(ratio < 1 - _BEFORE_PLANE)
             on_plane |= (np.abs(ratio - 1) < _ON_PLANE) & (confidence >= WEAK_CONFIDENCE[0])
