@@ -118,7 +118,7 @@ class _Seen:
         return np.asarray(self.center + rays[near] * ranges[near][:, None])
 
     def before(self, plane: ScenePlane, *, height: float, most: int) -> tuple[FloatArray, Image]:
-        """Return points (N, 3) at more than a height before a plane, evenly at most so many, and their colours."""
+        """Return points (N, 3) at more than a height before a plane, evenly and at most `most`, and their colours."""
         points = self.center + self.view.rays * self.view.ranges[..., None]
         with np.errstate(invalid="ignore"):
             chosen = np.flatnonzero(points @ plane.normal - plane.offset > height)
@@ -183,27 +183,27 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
     pictures, predicted, weights, on_plane = [], [], [], np.zeros(grid.size_hw, np.bool_)
     for one in used:
         picture, ratio, confidence = one.colors_at(grid.centers())
-        reflected, known = _reflected(one.center, grid, points, colors)
+        reflected, known = _reflected(one.center, grid, points=points, colors=colors)
         with np.errstate(invalid="ignore"):
             known &= ~(ratio < 1 - _BEFORE_PLANE)
             on_plane |= (np.abs(ratio - 1) < _ON_PLANE) & (confidence >= WEAK_CONFIDENCE[0])
         weights.append(known.astype(np.float32))
         pictures.append(picture)
         predicted.append(reflected)
-    both, own, others, count = _sums(*(np.array(arrays) for arrays in (pictures, predicted, weights)))
-    label = _labels(both, own, others, count)
+    sums = _sums(*(np.array(arrays) for arrays in (pictures, predicted, weights)))
+    label = sums.areas()
     found = []
     for number in range(1, label.max() + 1):
         mirror = cv2.morphologyEx(
             (label == number).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _WINDOW + 1,) * 2, np.uint8)
         )
         inside = mirror > 0
-        mean = both[inside].sum() / np.sqrt(own[inside].sum() * others[inside].sum())
+        mean = sums.correlation(inside)
         area = inside.sum() * (grid.cell / distance) ** 2
         near, far = (cv2.dilate(mirror, np.ones((size,) * 2, np.uint8)) for size in (2 * _WINDOW - 1, 4 * _WINDOW + 1))
         around = on_plane[far > near]
         if mean >= _LEAST_MEAN and area >= _LEAST_AREA and len(around) and around.mean() >= _LEAST_AROUND:
-            found.append((float(mean * area), _outlined(inside, np.mean(pictures, axis=0), grid), used[0].center))
+            found.append((mean * float(area), _outlined(inside, np.mean(pictures, axis=0), grid), used[0].center))
     return found
 
 
@@ -219,7 +219,7 @@ def _grid_of(plane: ScenePlane, on_plane: Sequence[FloatArray], pixel: float) ->
     return _Grid(plane, low, cell, (int(height), int(width)))
 
 
-def _reflected(center: FloatArray, grid: _Grid, points: FloatArray, colors: Image) -> tuple[Image, Mask]:
+def _reflected(center: FloatArray, grid: _Grid, *, points: FloatArray, colors: Image) -> tuple[Image, Mask]:
     """Return what a mirror would show a camera in each cell, (h, w, 3), and where that is known.
 
     `points`: (N, 3) before the plane, with `colors` (N, 3).
@@ -250,8 +250,36 @@ def _blurred(picture: Image, weight: Image) -> Image:
     return np.asarray(cv2.GaussianBlur(picture * weight[..., None], (0, 0), _BLUR) / np.maximum(total, 1e-6)[..., None])
 
 
-def _sums(shown: Image, predicted: Image, weights: Image) -> tuple[Image, Image, Image, Image]:
-    """Return windowed sums over views (K, h, w, 3): of products, of squares of both, and of the weights."""
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums over views and windows of a grid, (h, w) each.
+
+    `products`: of colours and predictions, both without their means. `shown`, `predicted`: of the squares of each.
+    `count`: of the weights.
+    """
+
+    products: Image
+    shown: Image
+    predicted: Image
+    count: Image
+
+    def correlation(self, cells: Mask) -> float:
+        """Return the correlation over some cells."""
+        products, *squares = (one[cells].sum() for one in (self.products, self.shown, self.predicted))
+        return float(products / np.sqrt(squares[0] * squares[1]))
+
+    def areas(self) -> NDArray[np.int32]:
+        """Return the number (h, w) of the area that may be a mirror, 0 elsewhere."""
+        gain = self.products / np.maximum(self.predicted, 1e-6)
+        alike = self.products > _LEAST_CORRELATION * np.sqrt(self.shown * self.predicted)
+        # The noise of a prediction must not be all that there is of it.
+        alike &= (self.count > 1.2) & (self.predicted > 3 * _NOISE_LEVELS**2 * self.count)
+        alike &= (gain > _GAINS[0]) & (gain < _GAINS[1])
+        return np.asarray(cv2.connectedComponents(alike.astype(np.uint8), connectivity=4)[1])
+
+
+def _sums(shown: Image, predicted: Image, weights: Image) -> _Sums:
+    """Return the sums over views of colours and predictions (K, h, w, 3) with weights (K, h, w)."""
     count = weights.sum(axis=0)
     total = np.maximum(count, 1e-6)[..., None]
     shown, predicted = (
@@ -270,16 +298,7 @@ def _sums(shown: Image, predicted: Image, weights: Image) -> tuple[Image, Image,
     products = (np.einsum("khwc,khwc->khw", *pair) for pair in ((own, other), (own, own), (other, other)))
     both, own_squares, other_squares = (window(one) for one in products)
     weight = window(np.ones_like(weights))
-    return both, own_squares + 3 * _NOISE_LEVELS**2 * weight, other_squares, weight
-
-
-def _labels(both: Image, own: Image, others: Image, count: Image) -> NDArray[np.int32]:
-    """Return the number (h, w) of the area that may be a mirror, 0 elsewhere."""
-    gain = both / np.maximum(others, 1e-6)
-    alike = both > _LEAST_CORRELATION * np.sqrt(own * others)
-    # The noise of a prediction must not be all that there is of it.
-    alike &= (count > 1.2) & (others > 3 * _NOISE_LEVELS**2 * count) & (gain > _GAINS[0]) & (gain < _GAINS[1])
-    return np.asarray(cv2.connectedComponents(alike.astype(np.uint8), connectivity=4)[1])
+    return _Sums(both, own_squares + 3 * _NOISE_LEVELS**2 * weight, other_squares, weight)
 
 
 def _outlined(inside: Mask, steady: Image, grid: _Grid) -> FloatArray:
