@@ -20,7 +20,7 @@ from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_rang
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import MIRROR_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 
 Image = NDArray[np.float32]
@@ -30,9 +30,11 @@ _VIEWS, _POINTS, _CELLS = 6, 250_000, 60_000
 _BLUR, _WINDOW = 2, 6
 _ON_PLANE, _BEFORE_PLANE = 0.03, 0.07
 # Of the cells of a mirror: the least correlation of each and of all; the area over the squared distance of the cameras;
-# the share of the cells around it that lie on the plane. In places without mirrors, what meets the other conditions
-# correlates by 0.77 at most; mirrors by 0.80 to 0.94.
-_LEAST_CORRELATION, _LEAST_MEAN, _LEAST_AREA, _LEAST_AROUND = 0.75, 0.8, 0.03, 0.7
+# the share of the cells around it that lie on the plane; the explained contrast, in grey levels; and the share of views
+# in which a cell is confirmed on the plane. Mirrors that were measured have .85–.94, .15–.35, .88–1, 13–15, .03–.26.
+# Without a mirror, what meets the second to fourth condition explains 6 levels, and is confirmed in .35–1 of the views.
+_LEAST_CORRELATION, _LEAST_MEAN, _LEAST_AREA, _LEAST_AROUND = 0.75, 0.8, 0.03, 0.8
+_LEAST_LEVELS, _MOST_CONFIRMED = 10.0, 0.3
 _GAINS = 0.1, 1.5
 _NOISE_LEVELS = 3.0
 
@@ -181,12 +183,15 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
     parts = [one.before(plane, height=0.05 * distance, most=_POINTS // len(used)) for one in used]
     points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     pictures, predicted, weights, on_plane = [], [], [], np.zeros(grid.size_hw, np.bool_)
+    confirmed = np.zeros(grid.size_hw)
     for one in used:
         picture, ratio, confidence = one.colors_at(grid.centers())
         reflected, known = _reflected(one.center, grid, points=points, colors=colors)
         with np.errstate(invalid="ignore"):
             known &= ~(ratio < 1 - _BEFORE_PLANE)
-            on_plane |= (np.abs(ratio - 1) < _ON_PLANE) & (confidence >= WEAK_CONFIDENCE[0])
+            near = known & (np.abs(ratio - 1) < _ON_PLANE)
+        on_plane |= near & (confidence >= WEAK_CONFIDENCE[0])
+        confirmed += near & (confidence >= CONSISTENT_CONFIDENCE[0])
         weights.append(known.astype(np.float32))
         pictures.append(picture)
         predicted.append(reflected)
@@ -202,8 +207,15 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
         area = inside.sum() * (grid.cell / distance) ** 2
         near, far = (cv2.dilate(mirror, np.ones((size,) * 2, np.uint8)) for size in (2 * _WINDOW - 1, 4 * _WINDOW + 1))
         around = on_plane[far > near]
-        if mean >= _LEAST_MEAN and area >= _LEAST_AREA and len(around) and around.mean() >= _LEAST_AROUND:
-            found.append((mean * float(area), _outlined(inside, np.mean(pictures, axis=0), grid), used[0].center))
+        is_surface = confirmed[inside].sum() > _MOST_CONFIRMED * np.sum(weights, axis=0)[inside].sum()
+        is_clear = mean >= _LEAST_MEAN and sums.explained(inside) >= _LEAST_LEVELS
+        if area >= _LEAST_AREA and is_clear and not is_surface and around.size and around.mean() >= _LEAST_AROUND:
+            left, right, top, bottom = _outlined(inside, np.mean(pictures, axis=0))
+            # Mirrors are rectangles: this one and the area have most of their cells in common.
+            common = int(inside[top:bottom, left:right].sum())
+            if common > 0.5 * max(int(inside.sum()), (right - left) * (bottom - top)):
+                columns, rows = np.array([left, right, right, left], np.float64), np.array([top, top, bottom, bottom])
+                found.append((mean * float(area), grid.at(columns, rows), used[0].center))
     return found
 
 
@@ -268,6 +280,11 @@ class _Sums:
         products, *squares = (one[cells].sum() for one in (self.products, self.shown, self.predicted))
         return float(products / np.sqrt(squares[0] * squares[1]))
 
+    def explained(self, cells: Mask) -> float:
+        """Return the standard deviation of colours, in grey levels, that the prediction explains in some cells."""
+        products, squares, count = (one[cells].sum() for one in (self.products, self.predicted, self.count))
+        return float(products / np.sqrt(3 * squares * count))
+
     def areas(self) -> NDArray[np.int32]:
         """Return the number (h, w) of the area that may be a mirror, 0 elsewhere."""
         gain = self.products / np.maximum(self.predicted, 1e-6)
@@ -301,9 +318,9 @@ def _sums(shown: Image, predicted: Image, weights: Image) -> _Sums:
     return _Sums(both, own_squares + 3 * _NOISE_LEVELS**2 * weight, other_squares, weight)
 
 
-def _outlined(inside: Mask, steady: Image, grid: _Grid) -> FloatArray:
-    """Return the corners (4, 3) of a mirror, moved to the strongest edges of the mean picture near its border."""
-    sides = []
+def _outlined(inside: Mask, steady: Image) -> tuple[int, int, int, int]:
+    """Return the ends of the columns and rows of a mirror, at edges of the mean picture near the border of its cells."""
+    sides: list[int] = []
     for axis in (1, 0):
         filled = inside.sum(axis=1 - axis)
         full = np.flatnonzero(filled > 0.4 * filled.max())
@@ -311,6 +328,6 @@ def _outlined(inside: Mask, steady: Image, grid: _Grid) -> FloatArray:
         change = changes.compress(inside.any(axis=axis), axis=1 - axis).mean(axis=1 - axis)
         for end in (full[0], full[-1] + 1):
             near = np.arange(max(1, end - 2 * _WINDOW), min(len(change), end + 2 * _WINDOW) + 1)
-            sides.append(near[np.argmax(change[near - 1])] if len(near) else end)
+            sides.append(int(near[np.argmax(change[near - 1])]) if len(near) else int(end))
     left, right, top, bottom = sides
-    return grid.at(np.array([left, right, right, left], np.float64), np.array([top, top, bottom, bottom], np.float64))
+    return left, right, top, bottom
