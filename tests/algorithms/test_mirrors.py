@@ -41,7 +41,7 @@ def views_of(scene: Scene, *, phantom: bool) -> tuple[list[PlaneView], list[NDAr
 
 
 @pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_mirror_is_found_whatever_ranges_it_has(seed: int) -> None:
+def test_a_mirror_is_found_where_the_frame_ends(seed: int) -> None:
     views, _ = views_of(mirror_room(seed=seed, exposure=0.1), phantom=True)
     (corners,) = find_mirrors(views, WALLS)
     # The frame is 8 cm wide; a cell is 4 cm.

@@ -32,9 +32,9 @@ _ON_PLANE, _BEFORE_PLANE = 0.03, 0.07
 # Of the cells of a mirror: the least correlation of each and of all; the area over the squared distance of the cameras;
 # the share of the cells around it that lie on the plane; the explained contrast, in grey levels; and the share of views
 # in which a cell is confirmed on the plane. Mirrors that were measured have .85–.94, .15–.35, .88–1, 13–15, .03–.26.
-# Without a mirror, what meets the second to fourth condition explains 6 levels, and is confirmed in .35–1 of the views.
+# Without a mirror, what meets the second to fourth condition explains 6 levels; what shines is confirmed in .6–1.
 _LEAST_CORRELATION, _LEAST_MEAN, _LEAST_AREA, _LEAST_AROUND = 0.75, 0.8, 0.03, 0.8
-_LEAST_LEVELS, _MOST_CONFIRMED = 10.0, 0.3
+_LEAST_LEVELS, _MOST_CONFIRMED = 10.0, 0.5
 _GAINS = 0.1, 1.5
 _NOISE_LEVELS = 3.0
 
