@@ -319,7 +319,7 @@ def _sums(shown: Image, predicted: Image, weights: Image) -> _Sums:
 
 
 def _outlined(inside: Mask, steady: Image) -> tuple[int, int, int, int]:
-    """Return the ends of the columns and rows of a mirror, at edges of the mean picture near the border of its cells."""
+    """Return the ends of the columns and rows of a mirror, at edges of the mean picture near the ends of its cells."""
     sides: list[int] = []
     for axis in (1, 0):
         filled = inside.sum(axis=1 - axis)
