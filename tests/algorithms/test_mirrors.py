@@ -78,6 +78,8 @@ def test_the_range_in_a_mirror_is_that_of_its_pane() -> None:
     assert np.mean(result.range[~mirror] == own.range[~mirror]) > 0.9998
     assert confidence_name(MIRROR_CONFIDENCE) == "mirror"
     assert with_mirrors(own, structure(group=1), scene.poses[1]) is own
+    masked = with_mirrors(own, structure(), scene.poses[1], valid=np.zeros(SIZE, np.bool_))
+    np.testing.assert_array_equal(masked.range, own.range)
 
 
 def test_things_before_a_mirror_keep_their_ranges() -> None:

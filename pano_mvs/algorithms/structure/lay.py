@@ -139,7 +139,7 @@ def lay_structure(
     )
     moved &= result.valid
     result = _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation)
-    return with_mirrors(result, structure, cam_from_world, group=group), float(
+    return with_mirrors(result, structure, cam_from_world, group=group, valid=valid), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
 

@@ -66,7 +66,9 @@ def pane_ranges(rays: FloatArray, center: FloatArray, corners: FloatArray) -> Fl
         return np.asarray(np.where(((shares >= 0) & (shares <= 1)).all(axis=0), ranges, np.nan))
 
 
-def with_mirrors(range_map: RangeMap, structure: Structure, cam_from_world: Rigid3, *, group: int = 0) -> RangeMap:
+def with_mirrors(
+    range_map: RangeMap, structure: Structure, cam_from_world: Rigid3, *, group: int = 0, valid: Mask | None = None
+) -> RangeMap:
     """Give what a view sees in mirrors the range of the pane, and `MIRROR_CONFIDENCE`.
 
     Pixels with a range before the pane that was seen keep it.
@@ -76,6 +78,7 @@ def with_mirrors(range_map: RangeMap, structure: Structure, cam_from_world: Rigi
         structure: mirrors in the world.
         cam_from_world: pose of the view.
         group: of the poses of the view.
+        valid: (H, W) pixels that may have a range; None: all.
     """
     corners = structure.mirror_corners[structure.mirror_group_idx == group]
     if not len(corners):
@@ -83,7 +86,7 @@ def with_mirrors(range_map: RangeMap, structure: Structure, cam_from_world: Rigi
     rays = ray_grid(range_map.range.shape) @ cam_from_world.rotation
     pane = np.fmin.reduce([pane_ranges(rays, cam_from_world.center, one) for one in corners])
     before = (range_map.confidence >= WEAK_CONFIDENCE[0]) & (range_map.range < pane * (1 - _BEFORE_PLANE))
-    shown = np.isfinite(pane) & ~before
+    shown = np.isfinite(pane) & ~before & (True if valid is None else valid)
     uncertainty, normals = range_map.uncertainty, range_map.normals_in_cam
     return replace(
         range_map,
