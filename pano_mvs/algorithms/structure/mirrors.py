@@ -37,6 +37,7 @@ _LEAST_CORRELATION, _LEAST_MEAN, _LEAST_AREA, _LEAST_AROUND = 0.75, 0.8, 0.03, 0
 _LEAST_LEVELS, _MOST_CONFIRMED = 10.0, 0.5
 _GAINS = 0.1, 1.5
 _NOISE_LEVELS = 3.0
+_DOWN = np.array([0.0, 1.0, 0.0])
 
 
 def find_mirrors(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[FloatArray]:
@@ -153,14 +154,12 @@ class _Grid:
 
     @property
     def along(self) -> FloatArray:
-        return np.cross(self.plane.normal, (0.0, 1.0, 0.0))
+        return np.cross(self.plane.normal, _DOWN)
 
     def at(self, column: FloatArray, row: FloatArray) -> FloatArray:
         """Return the points (..., 3) at positions in cells."""
-        level = (self.low[0] + column * self.cell)[..., None] * self.along
-        return np.asarray(
-            self.plane.normal * self.plane.offset + level + (self.low[1] + row * self.cell)[..., None] * (0.0, 1.0, 0.0)
-        )
+        level, down = (self.low[0] + column * self.cell)[..., None], (self.low[1] + row * self.cell)[..., None]
+        return np.asarray(self.plane.normal * self.plane.offset + level * self.along + down * _DOWN)
 
     def centers(self) -> FloatArray:
         """Return the centres (h, w, 3) of the cells."""
@@ -224,10 +223,8 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
 
 def _grid_of(plane: ScenePlane, on_plane: Sequence[FloatArray], pixel: float) -> _Grid:
     """Return cells over the points (N, 3) that views have on a plane, about as wide as a pixel."""
-    empty = _Grid(plane, np.zeros(2), 1.0, (0, 0))
-    limits = [
-        np.percentile(points @ np.stack([empty.along, (0.0, 1.0, 0.0)], 1), (1, 99), axis=0) for points in on_plane
-    ]
+    axes = np.stack([np.cross(plane.normal, _DOWN), _DOWN], axis=1)
+    limits = [np.percentile(points @ axes, (1, 99), axis=0) for points in on_plane]
     low, high = np.min([one[0] for one in limits], axis=0), np.max([one[1] for one in limits], axis=0)
     cell = max(2.0 * pixel, float(np.sqrt(np.prod(high - low) / _CELLS)))
     width, height = np.maximum(np.ceil((high - low) / cell), 1).astype(int)
