@@ -254,7 +254,8 @@ def manifest_document(
             },
             "confidence": {
                 "format": "8-bit PNG",
-                "value": "1-63 filled in, 64-127 seen but not confirmed, 128-255 consistent with other views",
+                "value": "1 the pane of a mirror, 2-63 filled in, 64-127 seen but not confirmed, "
+                "128-255 consistent with other views",
                 "unknown": 0,
             },
             "mask": {"format": "8-bit PNG", "used": 255, "ignored": 0},

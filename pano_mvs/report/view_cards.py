@@ -21,7 +21,7 @@ from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_p
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Shares:
 
     consistent: float  # other views agree (confidence 128–255)
     weak: float  # seen, but not confirmed (64–127)
-    filled: float  # interpolated, not seen (1–63)
+    filled: float  # interpolated, not seen (2–63), or at the pane of a mirror (1)
     invalid: float  # no range
     masked: float  # excluded by a mask, or sky
 
@@ -54,7 +54,7 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
     weights = np.repeat(np.cos(elevation_rad)[:, None], width, axis=1)
     weights /= weights.sum()
     kept = np.ones(sampled.shape, bool) if mask is None else mask[step // 2 :: step, step // 2 :: step]
-    classes = np.digitize(sampled, [FILLED_CONFIDENCE[0], WEAK_CONFIDENCE[0], CONSISTENT_CONFIDENCE[0]])
+    classes = np.digitize(sampled, [MIRROR_CONFIDENCE, WEAK_CONFIDENCE[0], CONSISTENT_CONFIDENCE[0]])
     classes[(classes == 0) & ~kept] = 4
     invalid, filled, weak, consistent, masked = np.bincount(classes.ravel(), weights.ravel(), minlength=5)
     return Shares(*(round(float(share), 6) for share in (consistent, weak, filled, invalid, masked)))
@@ -75,6 +75,7 @@ def fact_of(shares: Shares) -> list[float]:
 UNCERTAINTY_LIMITS = 0.001, 0.2
 # Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
+    ((MIRROR_CONFIDENCE, MIRROR_CONFIDENCE), (60, 60, 160), (60, 60, 160)),
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
     (WEAK_CONFIDENCE, (200, 130, 20), (245, 180, 60)),
     (CONSISTENT_CONFIDENCE, (10, 90, 110), (60, 190, 190)),
@@ -125,7 +126,7 @@ def range_ticks(near: float, far: float) -> Ticks:
     return tuple(found)
 
 
-VERSION = 4  # raise it when the pictures change: earlier pages' are then drawn again
+VERSION = 5  # raise it when the pictures change: earlier pages' are then drawn again
 MAX_CARDS = 36
 WIDTH = 768
 MAX_BYTES = {"panorama": 75_000, "range": 55_000, "own_range": 50_000, "confidence": 35_000, "uncertainty": 45_000}

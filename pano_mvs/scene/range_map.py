@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
 
-FILLED_CONFIDENCE = 1, 63
+MIRROR_CONFIDENCE = 1
+FILLED_CONFIDENCE = 2, 63
 WEAK_CONFIDENCE = 64, 127
 CONSISTENT_CONFIDENCE = 128, 255
 
@@ -21,8 +22,8 @@ class RangeMap(Record):
 
     Attributes:
         range: (H, W) float32 distance along the ray in scene units; NaN is invalid.
-        confidence: (H, W) uint8: 0 invalid, 1–63 filled (interpolated, not seen), 64–127 seen but weak, 128–255
-            consistent with other views.
+        confidence: (H, W) uint8: 0 invalid, 1 the pane of a mirror, 2–63 filled (interpolated, not seen), 64–127 seen
+            but weak, 128–255 consistent with other views.
         normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
             where unknown. None if they were not computed.
         uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where unknown, ignored where the
@@ -79,6 +80,11 @@ class RangeMap(Record):
 
 
 def confidence_name(confidence: int) -> str:
-    """Return what a confidence means: "no range", "filled", "seen but weak" or "consistent"."""
-    limits = (0, "no range"), (FILLED_CONFIDENCE[1], "filled"), (WEAK_CONFIDENCE[1], "seen but weak")
+    """Return what a confidence means: "no range", "mirror", "filled", "seen but weak" or "consistent"."""
+    limits = (
+        (0, "no range"),
+        (MIRROR_CONFIDENCE, "mirror"),
+        (FILLED_CONFIDENCE[1], "filled"),
+        (WEAK_CONFIDENCE[1], "seen but weak"),
+    )
     return next((name for most, name in limits if confidence <= most), "consistent")

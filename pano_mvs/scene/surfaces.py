@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -14,9 +14,10 @@ from pano_mvs.scene.record import Axis, Record, positions_fit, require, require_
 
 @dataclass(frozen=True, eq=False)
 class Structure(Record):
-    """Planes that a place consists of, n · X = offset in the world, unbounded."""
+    """Planes that a place consists of, n · X = offset in the world, unbounded, and its mirrors."""
 
     axis: ClassVar[Axis | None] = Axis.ONE
+    kind_version: ClassVar[int] = 2
 
     # (K, 3) float64 unit normals n, towards the side from which the plane was seen
     normals_in_world: NDArray[np.float64]
@@ -24,6 +25,9 @@ class Structure(Record):
     # (K,) float64 standard deviation of ranges on the plane, relative to them
     uncertainties: NDArray[np.float64]
     group_idx: NDArray[np.int32]  # (K,) int32 group of the poses in whose world the plane is
+    # (M, 4, 3) float64 corners in the world of mirrors; seen from the front, clockwise from the upper left
+    mirror_corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 3)))
+    mirror_group_idx: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))  # (M,) as group_idx
 
     def __len__(self) -> int:
         """Return the number of planes."""
@@ -36,6 +40,8 @@ class Structure(Record):
         require_array(self, "offsets", dtype=np.float64, shape=(count,))
         positive = require_array(self, "uncertainties", dtype=np.float64, shape=(count,)) > 0
         require_array(self, "group_idx", dtype=np.int32, shape=(count,))
+        mirrors = require_array(self, "mirror_corners", dtype=np.float64, shape=(None, 4, 3))
+        require_array(self, "mirror_group_idx", dtype=np.int32, shape=(len(mirrors),))
         require(bool(positive.all()), self, "an uncertainty is not positive")
         require(bool(np.allclose(np.linalg.norm(normals, axis=1), 1)), self, "a normal is not of unit length")
 

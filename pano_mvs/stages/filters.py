@@ -106,7 +106,10 @@ def sky(
 def scene_planes(
     poses: One[Poses], ranges: All[RangeMap], images: All[Panorama], params: Params, ctx: Context
 ) -> Structure:
-    """Find the level and upright planes of a place in all range maps, and place them by the lines where they meet.
+    """Find the level and upright planes of a place in all range maps, and the mirrors on these.
+
+    Planes are placed by the lines where they meet. A mirror is where the pictures show, differently in each view, what
+    the room in front of a plane predicts.
 
     Use it after poses.level: without known gravity, there are none.
     """
@@ -118,6 +121,7 @@ def scene_planes(
         **arguments_from(find_structure, params),
     )
     ctx.metric("planes", len(found))
+    ctx.metric("mirrors", len(found.mirror_corners))
     return found
 
 
@@ -142,7 +146,8 @@ def structure(
 ) -> RangeMap:
     """Move pixels to the planes of depth.scene_planes that they show, unless other views contradict.
 
-    Confirmed pixels with texture move only a little, those without texture farther. Masked pixels get no range.
+    Confirmed pixels with texture move only a little, those without texture farther. Masked pixels get no range. Mirrors
+    get the range of their pane, and confidence 1.
     """
     require_one_group(pose, source_poses)
     result, share = range_map, 0.0
@@ -188,7 +193,7 @@ def _prior_memory(params: Params, inputs: Mapping[str, Any]) -> int:
 def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams, ctx: Context) -> RangeMap:
     """Fill what no view saw with the ranges of a neural network of your own, aligned to the ranges that views measured.
 
-    Such networks see one panorama. Their ranges are filled ones (confidence 1-63), never confirmed. Use it last, after
+    Such networks see one panorama. Their ranges are filled ones (confidence 2-63), never confirmed. Use it last, after
     depth.structure. Where the network agrees with the measured ranges no better than a constant range would, the map
     stays as it is.
     """
@@ -328,7 +333,7 @@ def bilateral_solver(range_map: Each[RangeMap], image: Each[Panorama], params: P
 
 @stage("filters.fill", settings=fill_from_neighbours, memory=bytes_per_pixel(96))
 def fill(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
-    """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 1–63).
+    """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 2–63).
 
     Masked pixels get no range.
     """

@@ -16,6 +16,7 @@ from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
 from pano_mvs.algorithms.photographs import PhotographColors, PhotographColorSettings
 from pano_mvs.algorithms.points.tracking import sample_surface, track_points
 from pano_mvs.algorithms.poses.photograph_camera import PhotographCamera
+from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.api import (
     All,
     Context,
@@ -34,14 +35,22 @@ from pano_mvs.api import (
 from pano_mvs.io.growing_arrays import GrowingArrays
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.surfaces import SurfaceSamples, TrackedPoints
+from pano_mvs.scene.surfaces import Structure, SurfaceSamples, TrackedPoints
 
 
 @stage("fusion.vote", settings=FusionSettings)
-def vote(ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: Params, ctx: Context) -> PointCloud:
+def vote(
+    ranges: All[RangeMap],
+    poses: All[Pose],
+    images: All[Panorama],
+    params: Params,
+    ctx: Context,
+    planes: One[Structure] | None = None,
+) -> PointCloud:
     """Fuse range maps into one coloured cloud with normals, keeping points on which several views agree.
 
-    Groups of poses are fused one by one, because their relative positions are unknown.
+    Groups of poses are fused one by one, because their relative positions are unknown. What views see in the mirrors of
+    depth.scene_planes is left out.
     """
     settings = settings_from(FusionSettings, params)
     groups = {name: pose.group for name, pose in poses.items()}
@@ -49,7 +58,9 @@ def vote(ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params:
     for number in range(max(groups.values(), default=0) + 1):
         names = [name for name in ranges if groups.get(name) == number and name in images]
         join = partial(_joined_in_files, folder=ctx.scratch / f"group_{number}")
-        fused = _fused(names, ranges, poses, images=images, settings=settings, join=join, threads=ctx.threads)
+        fused = _fused(
+            names, ranges, poses, images=images, planes=planes, settings=settings, join=join, threads=ctx.threads
+        )
         clouds.append(fused)
         if not len(clouds[-1]):
             which = f"group {number}: " if len(set(groups.values())) > 1 else ""
@@ -123,6 +134,7 @@ def _fused(
     poses: All[Pose],
     *,
     images: All[Panorama],
+    planes: Structure | None,
     settings: FusionSettings,
     join: Callable[[Iterable[PointCloud]], PointCloud],
     threads: int,
@@ -131,8 +143,11 @@ def _fused(
     settings = replace(settings, min_views=_min_views(settings, len(names)))
 
     def load(idx: int) -> FusionView:
-        name, image = names[idx], images[names[idx]]
-        return FusionView(ranges[name], poses[name].cam_from_world, image.load(), image.load_mask())
+        name, image, pose = names[idx], images[names[idx]], poses[names[idx]]
+        seen = ranges[name]
+        if planes is not None:
+            seen = with_mirrors(seen, planes, pose.cam_from_world, group=pose.group)
+        return FusionView(seen, pose.cam_from_world, image.load(), image.load_mask())
 
     cams = [poses[name].cam_from_world for name in names]
     return fuse_stream(cams, load, settings, join=join, threads=threads)

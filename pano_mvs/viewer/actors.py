@@ -13,7 +13,7 @@ from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, unconfirmed_classes
+from pano_mvs.io.images.preview import MARKS, color_mapped, mark_unconfirmed, range_limits, unconfirmed_classes
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.viewer.cloud_colors import Coloring, DrawnCloud
@@ -136,14 +136,13 @@ def _actor(data: Any) -> Any:
 
 # At most this wide, so that stripes are as wide as in previews relative to what they mark.
 _WIDTH = 2048
-_MEANINGS = {"weak": "pale: not confirmed by other views", "filled": "striped: filled in, not seen"}
 
 
 def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | None, str]:
     """Return the ranges of a camera as colours, (H, W, 3) RGB, and their legend.
 
-    Weak ranges are pale and filled ones striped (`mark_unconfirmed`); pixels without a range are grey. Without readable
-    ranges, the picture is None and the legend is the reason.
+    Weak ranges are pale, filled ones striped and mirrors chequered (`mark_unconfirmed`); pixels without a range are
+    grey. Without readable ranges, the picture is None and the legend is the reason.
     """
     if camera.range_file is None:
         return None, "no ranges of this camera: the workflow has no export.ranges, or the run did not reach it"
@@ -159,7 +158,7 @@ def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | 
     parts = [f"ranges: red {length_text(near, unit)} to blue {length_text(far, unit)}"]
     if confidence is not None and confidence.shape == ranges.shape:
         colors = mark_unconfirmed(colors, confidence)
-        parts += [_MEANINGS[name] for name in unconfirmed_classes(confidence)]
+        parts += [MARKS[name] for name in unconfirmed_classes(confidence)]
     if not np.isfinite(ranges).all():
         parts.append("grey: no range")
     return colors, "\n".join(parts)

@@ -41,7 +41,9 @@ KINDS: dict[str, Record] = {
     ),
     "range map": RangeMap(np.ones((2, 4), np.float32), np.full((2, 4), 200, np.uint8)),
     "samples": SurfaceSamples(UNITS, FLOATS, COLORS, BYTES),
-    "structure": Structure(UNITS, np.ones(4), np.full(4, 0.01), np.zeros(4, np.int32)),
+    "structure": Structure(
+        UNITS, np.ones(4), np.full(4, 0.01), np.zeros(4, np.int32), np.ones((2, 4, 3)), np.zeros(2, np.int32)
+    ),
     "tracked points": TrackedPoints(("a", "b"), UNITS, COLORS, FLOATS, TRACKS, TRACKS % 2, UNITS[:3]),
     "two views": GENERAL.with_alternatives([replace(GENERAL, direction=UNITS[idx]) for idx in (1, 2)]),
 }

@@ -171,6 +171,10 @@ class DenseChain:
             ranges=run.range_maps[self.graph.edges[name]["ranges"].producer],
             poses={image: Pose(pose) for image, pose in capture.poses.items()},
             images=dict(capture.panoramas),
+            planes=next(
+                (planes for made in run.results.values() for planes in made.values() if isinstance(planes, Structure)),
+                None,
+            ),
             **extras(entry),
         )
         assert isinstance(cloud, PointCloud)

@@ -93,7 +93,7 @@ def fill_from_prior(
         The range map and the relative standard deviation of the network's ranges: their deviation from confirmed ranges
         in areas that were left out of the alignment. It is infinite, and the range map is unchanged, where that is
         not less than the deviation of a constant range. Pixels that other views saw, or that lie on the planes of
-        depth.structure, keep their ranges. Others get the network's, with confidence 1–63; none where the network's are
+        depth.structure, keep their ranges. Others get the network's, with confidence 2–63; none where the network's are
         nearer or farther than all measured ones, where the fit was not tested.
     """
     require_guide(guide, range_map)

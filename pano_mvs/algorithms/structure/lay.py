@@ -20,6 +20,7 @@ from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.structure.laid import OtherView, Seen, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.laid_coefficients import FITTED
+from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
 from pano_mvs.algorithms.structure.view import ScenePlane, on_grid, plane_ranges, plane_view, stride_of
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
@@ -77,7 +78,7 @@ def lay_structure(
 
     Returns:
         The range map, and the share of the sphere that is on a plane. Pixels on a plane that were matched near it, and
-        whose place another view confirms, are consistent (confidence 128 or more).
+        whose place another view confirms, are consistent (confidence 128 or more). For mirrors see `with_mirrors`.
     """
     found = proposed_planes(
         range_map,
@@ -115,7 +116,8 @@ def lay_structure(
         np.where(moved, confidence, range_map.confidence),
     )
     moved &= result.valid
-    return _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation), float(
+    result = _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation)
+    return with_mirrors(result, structure, cam_from_world, group=group, valid=valid), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
 

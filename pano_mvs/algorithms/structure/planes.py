@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.creases import placed_by_creases
+from pano_mvs.algorithms.structure.mirrors import find_mirrors
 from pano_mvs.algorithms.structure.outline import outline_planes
 from pano_mvs.algorithms.structure.view import LEAST_UNCERTAINTY, PlaneView, ScenePlane, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
@@ -265,7 +266,7 @@ def find_structure(
         float, Setting("least extent of a plane, as a share of the sphere, in the mean over the views", gt=0, le=1)
     ] = 0.006,
 ) -> Structure:
-    """Find the level and upright planes of a place.
+    """Find the level and upright planes of a place, and the mirrors on these.
 
     A group of poses whose frame does not state that y points down along gravity has no planes.
 
@@ -275,7 +276,7 @@ def find_structure(
         load: returns the panorama of a view, (H, W, 3) RGB.
         rng: draws points and planes.
     """
-    planes, groups = [], []
+    planes, groups, mirrors, mirror_groups = [], [], [], []
     for number, group in enumerate(split_groups(poses)):
         named = [(idx, name) for idx, name in enumerate(group.names) if name in range_maps]
         if not named or not states_y_down(group.frame):
@@ -288,9 +289,14 @@ def find_structure(
         found = find_planes(views, rng=rng, max_relative_error=max_relative_error, min_share=share)
         planes += found
         groups += [number] * len(found)
+        panes = find_mirrors(views, found)
+        mirrors += panes
+        mirror_groups += [number] * len(panes)
     return Structure(
         np.array([plane.normal for plane in planes]).reshape(-1, 3),
         np.array([plane.offset for plane in planes], np.float64),
         np.array([plane.uncertainty for plane in planes], np.float64),
         np.array(groups, np.int32),
+        np.array(mirrors, np.float64).reshape(-1, 4, 3),
+        np.array(mirror_groups, np.int32),
     )

@@ -10,7 +10,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE
+
+Mark = Literal["weak", "filled", "mirror"]
+MARKS: dict[Mark, str] = {
+    "weak": "pale: not confirmed by other views",
+    "filled": "striped: filled in, not seen",
+    "mirror": "chequered: a mirror, at its pane",
+}
+"""What the marks of `mark_unconfirmed` mean."""
 
 _WIDTH = 1280
 _BAR_HEIGHT, _MARGIN = 24, 16
@@ -29,7 +37,7 @@ def write_preview(
 ) -> None:
     """Write a JPEG of a panorama above its range map, with a scale bar that carries numbers.
 
-    Weak ranges are pale and filled ones striped, with a legend; see `mark_unconfirmed`.
+    Weak ranges are pale, filled ones striped and mirrors chequered, with a legend; see `mark_unconfirmed`.
 
     Args:
         image: (H, W, 3) uint8 RGB.
@@ -90,45 +98,47 @@ def color_mapped(range_map: NDArray[np.float32], near: float, far: float) -> NDA
     return rgb
 
 
-def unconfirmed_classes(confidence: NDArray[np.uint8]) -> list[Literal["weak", "filled"]]:
+def unconfirmed_classes(confidence: NDArray[np.uint8]) -> list[Mark]:
     """Return which marks `mark_unconfirmed` makes; without confirmed ranges, views were not compared: none is weak."""
-    filled, weak = _unconfirmed(confidence)
-    found: list[Literal["weak", "filled"]] = ["weak"] if weak.any() else []
-    return [*found, "filled"] if filled.any() else found
+    return [mark for mark, pixels in _unconfirmed(confidence).items() if pixels.any()]
 
 
 def mark_unconfirmed(colors: NDArray[np.uint8], confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours of a range map with weak ranges pale and filled ones pale with stripes."""
-    filled, weak = _unconfirmed(confidence)
-    height, width = confidence.shape
+    """Return the colours of a range map with weak ranges pale, filled ones striped and mirrors chequered."""
+    marked = _unconfirmed(confidence)
+    row, column = np.arange(confidence.shape[0])[:, None], np.arange(confidence.shape[1])
     period, thickness = 10, 4  # px
-    stripes = (np.arange(height)[:, None] + np.arange(width)) % period < thickness
-    paper = np.where(weak | filled, 0.55, 0.0)  # the share of white in the colours of unconfirmed ranges
-    paper[filled & stripes] = 1.0
+    paper = np.where(np.logical_or.reduce(list(marked.values())), 0.55, 0.0)  # the share of white in the colours
+    paper[marked["filled"] & ((row + column) % period < thickness)] = 1.0
+    paper[marked["mirror"] & ((row // thickness + column // thickness) % 2 == 0)] = 1.0
     mixed = (1 - paper[..., None]) * colors + 255 * paper[..., None]
     return np.asarray(np.rint(mixed), np.uint8)
 
 
-def _unconfirmed(confidence: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the filled and the weak pixels, (H, W) each."""
+def _unconfirmed(confidence: NDArray[np.uint8]) -> dict[Mark, NDArray[np.bool_]]:
+    """Return the pixels (H, W) of each mark."""
     low, high = FILLED_CONFIDENCE
-    filled = (confidence >= low) & (confidence <= high)
     confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
-    return filled, (confidence > high) & ~confirmed & confirmed.any()
+    return {
+        "weak": (confidence > high) & ~confirmed & confirmed.any(),
+        "filled": (confidence >= low) & (confidence <= high),
+        "mirror": confidence == MIRROR_CONFIDENCE,
+    }
 
 
-def _legend(classes: Sequence[Literal["weak", "filled"]]) -> NDArray[np.uint8]:
-    """Return a strip (h, W, 3) that explains the marks."""
-    strip = np.full((_BAR_HEIGHT + _MARGIN, _WIDTH, 3), _PAPER, np.uint8)
-    meanings = {"weak": "pale: not confirmed by other views", "filled": "striped: filled in, not seen"}
-    codes = {"weak": FILLED_CONFIDENCE[1] + 1, "filled": FILLED_CONFIDENCE[0]}
+def _legend(classes: Sequence[Mark]) -> NDArray[np.uint8]:
+    """Return a strip (h, W, 3) that explains the marks, two in a row."""
+    height = _BAR_HEIGHT + _MARGIN
+    strip = np.full((-(-len(classes) // 2) * height, _WIDTH, 3), _PAPER, np.uint8)
+    codes = {"weak": FILLED_CONFIDENCE[1] + 1, "filled": FILLED_CONFIDENCE[0], "mirror": MIRROR_CONFIDENCE}
     for idx, name in enumerate(classes):
-        left = 2 * _MARGIN + idx * _WIDTH // 2
+        left, top = 2 * _MARGIN + idx % 2 * _WIDTH // 2, idx // 2 * height
         colors = color_mapped(np.full((_BAR_HEIGHT, 3 * _BAR_HEIGHT + 1), 2, np.float32), 1.0, 8.0)
         confidence = np.full(colors.shape[:2], codes[name], np.uint8)
         confidence[:, -1] = CONSISTENT_CONFIDENCE[1]  # so that weak ones are pale
-        strip[:_BAR_HEIGHT, left : left + 3 * _BAR_HEIGHT] = mark_unconfirmed(colors, confidence)[:, :-1]
-        _write(strip, meanings[name], (left + 3 * _BAR_HEIGHT + _MARGIN, _BAR_HEIGHT - 3), centered=False)
+        box = slice(top, top + _BAR_HEIGHT), slice(left, left + 3 * _BAR_HEIGHT)
+        strip[box] = mark_unconfirmed(colors, confidence)[:, :-1]
+        _write(strip, MARKS[name], (left + 3 * _BAR_HEIGHT + _MARGIN, top + _BAR_HEIGHT - 3), centered=False)
     return strip
 
 
