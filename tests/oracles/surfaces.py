@@ -193,6 +193,28 @@ def nearest_triangles(corners_in_cam: FloatArray, size_hw: tuple[int, int]) -> t
     return ranges.reshape(size_hw), triangle.reshape(size_hw)
 
 
+def mean_distances(
+    places: FloatArray, maps: Sequence[tuple[RangeMap, Rigid3]], *, limit: float, middle: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `Volume.add` makes of places (N, 3), from maps without normals, uncertainties and sky."""
+    distances, weights = np.zeros(len(places)), np.zeros(len(places))
+    for range_map, pose in maps:
+        rays, (height, width) = ray_grid(range_map.range.shape), range_map.range.shape
+        for idx, place in enumerate(pose.apply(places)):
+            column, row = np.floor(pixel_from_ray(place, (height, width))).astype(int)
+            at = min(row, height - 1), column % width
+            found = float(range_map.range[at])
+            along = found - float(np.linalg.norm(place))
+            across = found - float(rays[at] @ place)
+            distance = along if abs(along) < abs(across) else across
+            if along < -4 * limit or distance < -limit:
+                continue
+            weight = (0.01 * middle / (0.03 * found)) ** 2 * (0.02 if distance > limit else 1.0)
+            distances[idx] += min(distance, limit) * weight
+            weights[idx] += weight
+    return distances / np.maximum(weights, 1e-30), weights
+
+
 def texel_looks(
     texels: Texels,
     mesh: tuple[FloatArray, FloatArray, NDArray[np.int32]],
@@ -204,7 +226,7 @@ def texel_looks(
     weights = np.column_stack([1 - texels.weights.sum(axis=1, dtype=np.float64), texels.weights])
     corner = faces[texels.triangle]
     points = np.einsum("tk,tkc->tc", weights, vertices[corner])
-    normal = np.einsum("tk,tkc->tc", weights, normals[corner])
+    normal = normals[texels.triangle]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     distance = np.linalg.norm(points, axis=1)
     cosine = -np.sum(points * normal, axis=1) / distance
