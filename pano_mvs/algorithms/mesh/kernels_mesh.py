@@ -155,27 +155,24 @@ def draw_charts(uv_px: FloatArray, triangle: NDArray[np.int32], weights: NDArray
 
 
 Grid = tuple[FloatArray, float, float]
-Measured = tuple[FloatImage, FloatImage, FloatImage]
-
-# The weight of a panorama that sees far through a cell: a thin board, such as a table top, has cells behind it that
-# others look through.
-_FREE_WEIGHT = 0.02
+Measured = tuple[FloatImage, FloatImage, FloatImage, FloatImage]
 
 
 @kernel
 def add_distances(
-    grid: Grid, pose: FloatArray, view: Measured, span: tuple[int, int], out: tuple[FloatImage, FloatImage]
+    grid: Grid, pose: FloatArray, view: Measured, span: tuple[int, int], out: tuple[FloatImage, FloatImage, FloatImage]
 ) -> None:
     """Add the signed distances that a panorama measured to the cells [first, end) of a grid.
 
-    `grid` holds the centre of the first cell, the width of the cells, and the distance at which distances are cut off.
-    `pose` is cam_from_world (3, 4). `view` holds the range of each pixel, its weight, and its plane (H, W, 4), normal
-    and offset in camera coordinates. `out` are the mean distances (X, Y, Z) and the sums of the weights. Cells farther
-    behind the surface stay as they are.
+    `grid` holds the centre of the first cell, the width of the cells, and the distance from the surface within which a
+    panorama measures. `pose` is cam_from_world (3, 4). `view` holds the range of each pixel, the least range around it,
+    its weight, and its plane (H, W, 4), normal and offset in camera coordinates. `out` are the mean distances
+    (X, Y, Z), the sums of the weights, and the votes: the number of panoramas that measured a surface here, twice, less
+    the number of those that see something farther away. Behind a surface, weights and votes fall to 0.
     """
     origin, cell, limit = grid
-    ranges, weights, planes = view
-    distances, totals = out
+    ranges, nearest, weights, planes = view
+    distances, totals, votes = out
     height, width = ranges.shape
     for i in range(span[0], span[1]):
         world_x = origin[0] + cell * i
@@ -194,19 +191,24 @@ def add_distances(
                 weight = weights[row, column]
                 if not weight > 0:
                     continue
-                along = ranges[row, column] - math.sqrt(x * x + y * y + z * z)
+                r = math.sqrt(x * x + y * y + z * z)
+                along = ranges[row, column] - r
                 if along < -4 * limit:
                     continue
                 distance = planes[row, column, 0] * x + planes[row, column, 1] * y + planes[row, column, 2] * z
                 distance -= planes[row, column, 3]
                 if abs(along) < abs(distance):
                     distance = along
-                if distance < -limit:
+                if distance <= -limit:
                     continue
                 if distance > limit:
-                    distance, weight = limit, weight * _FREE_WEIGHT
-                total = totals[i, j, k] + weight
-                distances[i, j, k] += (distance - distances[i, j, k]) * weight / total
+                    if nearest[row, column] - r > limit:
+                        votes[i, j, k] -= 1
+                    continue
+                share = min(1.0, 1.0 + distance / limit)
+                votes[i, j, k] += 2
+                total = totals[i, j, k] + weight * share
+                distances[i, j, k] += (distance - distances[i, j, k]) * weight * share / total
                 totals[i, j, k] = total
 
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -20,6 +21,7 @@ from scipy.sparse import coo_array, csr_array
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.mesh.view_quality import face_normals, surface_view
+from pano_mvs.algorithms.panoramas import filtered
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
@@ -41,8 +43,8 @@ MAX_CELLS = 1 << 23
 # Ranges on the planes of a place are not more accurate than this, relative to them.
 _PLANE_UNCERTAINTY = 0.01
 _GAPS = 3, 5, 9, 17
-# Distances are cut off this many cells from the surface.
-_LIMIT_CELLS = 3.0
+# Distances are averaged up to this many cells from the surface.
+_LIMIT_CELLS = 2.0
 
 
 def most_certain(range_map: RangeMap, measured: RangeMap) -> RangeMap:
@@ -73,20 +75,22 @@ class Volume:
     """Signed distances in a grid of cubic cells.
 
     `origin`: (3,) centre of the first cell. `cell`: width of a cell. `distances`: (X, Y, Z) float32, positive in front
-    of the surface, cut off three cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `middle`:
-    median range of what was measured.
+    of the surface, cut off two cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `votes`:
+    (X, Y, Z) float32, negative where panoramas see something farther away. `middle`: median range of what was measured.
     """
 
     origin: FloatArray
     cell: float
     distances: NDArray[np.float32]
     weights: NDArray[np.float32]
+    votes: NDArray[np.float32]
     middle: float
 
     def add(self, range_map: RangeMap, cam_from_world: Rigid3, valid: Mask, *, threads: int = 1) -> None:
         """Add what a panorama measured.
 
-        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)².
+        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)². Behind it,
+        weights fall, so that boards that are seen from both sides remain.
 
         `range_map`: (H, W). `cam_from_world`: its pose. `valid`: (H, W) pixels that are not masked. `threads`: number
         of threads; the result does not depend on it.
@@ -99,7 +103,9 @@ class Volume:
         deviation = np.maximum(_uncertainty(range_map) * ranges, 0.002 * self.middle)
         weights = np.where(known, (0.01 * self.middle / deviation) ** 2, 0.0).astype(np.float32)
         if range_map.sky is not None:
-            weights[range_map.sky & valid] = 0.3
+            weights[range_map.sky & valid] = 1.0
+        # Beside an edge, a ray may pass the nearer surface or not.
+        nearest = filtered(ranges, 1, lambda padded: cv2.erode(padded, np.ones((3, 3), np.uint8)))
         planes = np.empty((*ranges.shape, 4), np.float32)
         planes[..., :3] = -rays
         if range_map.normals_in_cam is not None:
@@ -108,9 +114,11 @@ class Volume:
         planes[..., 3] = ranges * np.einsum("ijk,ijk->ij", planes[..., :3], rays)
         pose = np.concatenate([cam_from_world.rotation, cam_from_world.translation[:, None]], axis=1)
 
+        out = self.distances, self.weights, self.votes
+
         def add_slab(first: int, count: int) -> None:
             grid, cells = (self.origin, self.cell, _LIMIT_CELLS * self.cell), (first, first + count)
-            add_distances(grid, pose, (ranges, weights, planes), cells, (self.distances, self.weights))
+            add_distances(grid, pose, (ranges, nearest, weights, planes), cells, out)
 
         for_bands(add_slab, len(self.distances), threads=threads)
 
@@ -158,12 +166,11 @@ class Volume:
         self.distances[gaps] = filled[gaps]
         self.weights[gaps] = np.finfo(np.float32).tiny
 
-    def smooth(self) -> None:
-        """Replace each distance by the mean of the known ones around it: single pixels leave no crumbs."""
-        known = (self.weights > 0).astype(np.float32)
-        around = ndimage.uniform_filter(known, 3, mode="constant")
-        means = ndimage.uniform_filter(self.distances * known, 3, mode="constant")
-        np.divide(means, around, out=self.distances, where=known > 0)
+    def carve(self) -> None:
+        """Make cells free that more than two panoramas look through for each one that measured a surface there."""
+        free = self.votes < 0
+        self.distances[free] = _LIMIT_CELLS * self.cell
+        self.weights[free] = np.maximum(self.weights[free], np.finfo(np.float32).tiny)
 
     def surface(self) -> Surface:
         """Return the surface where all eight cells around a vertex are known.
@@ -226,7 +233,7 @@ def empty_volume(maps: Sequence[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, 
     lower, upper = lower - margin, upper + margin
     width = max(cell or np.pi / height * middle, float(np.prod(upper - lower) / max_cells) ** (1 / 3))
     shape = np.ceil((upper - lower) / width).astype(int) + 1
-    return Volume(lower, width, np.zeros(shape, np.float32), np.zeros(shape, np.float32), middle)
+    return Volume(lower, width, *(np.zeros(shape, np.float32) for _ in range(3)), middle)
 
 
 def on_planes(surface: Surface, planes: Planes, *, reach: float) -> tuple[NDArray[np.float32], Mask]:

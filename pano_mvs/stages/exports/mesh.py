@@ -258,9 +258,9 @@ def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedPar
         size = view.range_map.range.shape
         valid = view.image.load_mask() if view.image.size_hw == size else np.ones(size, np.bool_)
         volume.add(view.range_map, view.cam_from_world, valid, threads=ctx.threads)
+    volume.carve()
     volume.continue_planes(planes)
     volume.close_gaps()
-    volume.smooth()
     vertices, faces = volume.surface()
     vertices, moved = on_planes((vertices, faces), planes, reach=1.5 * volume.cell)
     faces = seen_triangles((vertices, faces), [view.cam_from_world for view in views], moved, threads=ctx.threads)
