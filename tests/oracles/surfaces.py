@@ -195,24 +195,28 @@ def nearest_triangles(corners_in_cam: FloatArray, size_hw: tuple[int, int]) -> t
 
 def mean_distances(
     places: FloatArray, maps: Sequence[tuple[RangeMap, Rigid3]], *, limit: float, middle: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return what `Volume.add` makes of places (N, 3), from maps without normals, uncertainties and sky."""
-    distances, weights = np.zeros(len(places)), np.zeros(len(places))
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distances, weights and votes of `Volume.add` at places (N, 3); maps have ranges and confidence only."""
+    distances, weights, votes = np.zeros((3, len(places)))
     for range_map, pose in maps:
         rays, (height, width) = ray_grid(range_map.range.shape), range_map.range.shape
         for idx, place in enumerate(pose.apply(places)):
             column, row = np.floor(pixel_from_ray(place, (height, width))).astype(int)
             at = min(row, height - 1), column % width
-            found = float(range_map.range[at])
-            along = found - float(np.linalg.norm(place))
+            found, r = float(range_map.range[at]), float(np.linalg.norm(place))
             across = found - float(rays[at] @ place)
-            distance = along if abs(along) < abs(across) else across
-            if along < -4 * limit or distance < -limit:
+            distance = found - r if abs(found - r) < abs(across) else across
+            if found - r < -4 * limit or distance <= -limit:
                 continue
-            weight = (0.01 * middle / (0.03 * found)) ** 2 * (0.02 if distance > limit else 1.0)
-            distances[idx] += min(distance, limit) * weight
+            if distance > limit:
+                around = [wrap(at[0] + i, at[1] + j, height, width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+                votes[idx] -= min(float(range_map.range[other]) for other in around) - r > limit
+                continue
+            weight = (0.01 * middle / (0.03 * found)) ** 2 * (1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit)
+            votes[idx] += 2
+            distances[idx] += distance * weight
             weights[idx] += weight
-    return distances / np.maximum(weights, 1e-30), weights
+    return distances / np.maximum(weights, 1e-30), weights, votes
 
 
 def texel_looks(

@@ -168,7 +168,8 @@ def add_distances(
     panorama measures. `pose` is cam_from_world (3, 4). `view` holds the range of each pixel, the least range around it,
     its weight, and its plane (H, W, 4), normal and offset in camera coordinates. `out` are the mean distances
     (X, Y, Z), the sums of the weights, and the votes: the number of panoramas that measured a surface here, twice, less
-    the number of those that see something farther away. Behind a surface, weights and votes fall to 0.
+    the number of those that see something farther away. Weights are half as large again just behind a surface and fall
+    to 0, so that a layer of cells remains of a board that is seen from both sides.
     """
     origin, cell, limit = grid
     ranges, nearest, weights, planes = view
@@ -205,7 +206,7 @@ def add_distances(
                     if nearest[row, column] - r > limit:
                         votes[i, j, k] -= 1
                     continue
-                share = min(1.0, 1.0 + distance / limit)
+                share = 1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit
                 votes[i, j, k] += 2
                 total = totals[i, j, k] + weight * share
                 distances[i, j, k] += (distance - distances[i, j, k]) * weight * share / total

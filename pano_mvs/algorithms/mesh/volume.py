@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array
 
 from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.mesh.view_quality import face_normals, surface_view
-from pano_mvs.algorithms.panoramas import filtered
+from pano_mvs.algorithms.panoramas import filtered, square_window
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
@@ -89,8 +89,7 @@ class Volume:
     def add(self, range_map: RangeMap, cam_from_world: Rigid3, valid: Mask, *, threads: int = 1) -> None:
         """Add what a panorama measured.
 
-        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)². Behind it,
-        weights fall, so that boards that are seen from both sides remain.
+        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)².
 
         `range_map`: (H, W). `cam_from_world`: its pose. `valid`: (H, W) pixels that are not masked. `threads`: number
         of threads; the result does not depend on it.
@@ -105,7 +104,7 @@ class Volume:
         if range_map.sky is not None:
             weights[range_map.sky & valid] = 1.0
         # Beside an edge, a ray may pass the nearer surface or not.
-        nearest = filtered(ranges, 1, lambda padded: cv2.erode(padded, np.ones((3, 3), np.uint8)))
+        nearest = filtered(ranges, 1, lambda padded: cv2.erode(padded, square_window(1)))
         planes = np.empty((*ranges.shape, 4), np.float32)
         planes[..., :3] = -rays
         if range_map.normals_in_cam is not None:
@@ -113,7 +112,6 @@ class Volume:
             planes[oriented, :3] = range_map.normals_in_cam[oriented]
         planes[..., 3] = ranges * np.einsum("ijk,ijk->ij", planes[..., :3], rays)
         pose = np.concatenate([cam_from_world.rotation, cam_from_world.translation[:, None]], axis=1)
-
         out = self.distances, self.weights, self.votes
 
         def add_slab(first: int, count: int) -> None:
