@@ -206,14 +206,15 @@ def mean_distances(
             found, r = float(range_map.range[at]), float(np.linalg.norm(place))
             across = found - float(rays[at] @ place)
             distance = found - r if abs(found - r) < abs(across) else across
-            if found - r < -4 * limit or distance <= -limit:
+            if found - r < -8 * limit or distance <= -limit:
                 continue
+            vote = (int(range_map.confidence[at]) - 128) / 127
             if distance > limit:
                 around = [wrap(at[0] + i, at[1] + j, height, width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-                votes[idx] -= min(float(range_map.range[other]) for other in around) - r > limit
+                votes[idx] -= vote * (min(float(range_map.range[other]) for other in around) - r > limit)
                 continue
             weight = (0.01 * middle / (0.03 * found)) ** 2 * (1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit)
-            votes[idx] += 2
+            votes[idx] += vote
             distances[idx] += distance * weight
             weights[idx] += weight
     return distances / np.maximum(weights, 1e-30), weights, votes

@@ -155,7 +155,7 @@ def draw_charts(uv_px: FloatArray, triangle: NDArray[np.int32], weights: NDArray
 
 
 Grid = tuple[FloatArray, float, float]
-Measured = tuple[FloatImage, FloatImage, FloatImage, FloatImage]
+Measured = tuple[FloatImage, FloatImage, FloatImage, FloatImage, FloatImage]
 
 
 @kernel
@@ -166,13 +166,13 @@ def add_distances(
 
     `grid` holds the centre of the first cell, the width of the cells, and the distance from the surface within which a
     panorama measures. `pose` is cam_from_world (3, 4). `view` holds the range of each pixel, the least range around it,
-    its weight, and its plane (H, W, 4), normal and offset in camera coordinates. `out` are the mean distances
-    (X, Y, Z), the sums of the weights, and the votes: the number of panoramas that measured a surface here, twice, less
-    the number of those that see something farther away. Weights are half as large again just behind a surface and fall
-    to 0, so that a layer of cells remains of a board that is seen from both sides.
+    its weight, 0 where it has none, its vote, and its plane (H, W, 4), normal and offset in camera coordinates. `out`
+    are the mean distances (X, Y, Z), the sums of the weights, and the votes of panoramas that measured a surface here
+    less those of panoramas that see something farther away. Weights are half as large again just behind a surface and
+    fall to 0, so that a layer of cells remains of a board that is seen from both sides.
     """
     origin, cell, limit = grid
-    ranges, nearest, weights, planes = view
+    ranges, nearest, weights, worth, planes = view
     distances, totals, votes = out
     height, width = ranges.shape
     for i in range(span[0], span[1]):
@@ -194,7 +194,7 @@ def add_distances(
                     continue
                 r = math.sqrt(x * x + y * y + z * z)
                 along = ranges[row, column] - r
-                if along < -4 * limit:
+                if along < -8 * limit:
                     continue
                 distance = planes[row, column, 0] * x + planes[row, column, 1] * y + planes[row, column, 2] * z
                 distance -= planes[row, column, 3]
@@ -204,10 +204,10 @@ def add_distances(
                     continue
                 if distance > limit:
                     if nearest[row, column] - r > limit:
-                        votes[i, j, k] -= 1
+                        votes[i, j, k] -= worth[row, column]
                     continue
                 share = 1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit
-                votes[i, j, k] += 2
+                votes[i, j, k] += worth[row, column]
                 total = totals[i, j, k] + weight * share
                 distances[i, j, k] += (distance - distances[i, j, k]) * weight * share / total
                 totals[i, j, k] = total

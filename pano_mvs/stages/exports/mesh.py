@@ -262,7 +262,7 @@ def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedPar
     volume.continue_planes(planes)
     volume.close_gaps()
     vertices, faces = volume.surface()
-    vertices, moved = on_planes((vertices, faces), planes, reach=1.5 * volume.cell)
+    vertices, moved = on_planes((vertices, faces), planes, reach=0.75 * volume.cell)
     faces = seen_triangles((vertices, faces), [view.cam_from_world for view in views], moved, threads=ctx.threads)
     whole = Mesh(vertices, np.zeros(vertices.shape, np.uint8), faces)
     whole = without_crumbs(whole, smallest_share=params.smallest_part)
