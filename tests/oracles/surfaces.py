@@ -196,8 +196,8 @@ def nearest_triangles(corners_in_cam: FloatArray, size_hw: tuple[int, int]) -> t
 def mean_distances(
     places: FloatArray, maps: Sequence[tuple[RangeMap, Rigid3]], *, limit: float, middle: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return distances, weights and votes of `Volume.add` at places (N, 3); maps have ranges and confidence only."""
-    distances, weights, votes = np.zeros((3, len(places)))
+    """Return distances, weights and support of `Volume.add` at places (N, 3); maps have ranges and confidence only."""
+    distances, weights, support = np.zeros((3, len(places)))
     for range_map, pose in maps:
         rays, (height, width) = ray_grid(range_map.range.shape), range_map.range.shape
         for idx, place in enumerate(pose.apply(places)):
@@ -208,16 +208,16 @@ def mean_distances(
             distance = found - r if abs(found - r) < abs(across) else across
             if found - r < -8 * limit or distance <= -limit:
                 continue
-            vote = (int(range_map.confidence[at]) - 128) / 127
+            sure = (int(range_map.confidence[at]) - 128) / 127
             if distance > limit:
                 around = [wrap(at[0] + i, at[1] + j, height, width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-                votes[idx] -= vote * (min(float(range_map.range[other]) for other in around) - r > limit)
+                support[idx] -= sure * (min(float(range_map.range[other]) for other in around) - r > limit)
                 continue
             weight = (0.01 * middle / (0.03 * found)) ** 2 * (1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit)
-            votes[idx] += vote
+            support[idx] += sure
             distances[idx] += distance * weight
             weights[idx] += weight
-    return distances / np.maximum(weights, 1e-30), weights, votes
+    return distances / np.maximum(weights, 1e-30), weights, support
 
 
 def texel_looks(

@@ -165,15 +165,15 @@ def add_distances(
     """Add the signed distances that a panorama measured to the cells [first, end) of a grid.
 
     `grid` holds the centre of the first cell, the width of the cells, and the distance from the surface within which a
-    panorama measures. `pose` is cam_from_world (3, 4). `view` holds the range of each pixel, the least range around it,
-    its weight, 0 where it has none, its vote, and its plane (H, W, 4), normal and offset in camera coordinates. `out`
-    are the mean distances (X, Y, Z), the sums of the weights, and the votes of panoramas that measured a surface here
-    less those of panoramas that see something farther away. Weights are half as large again just behind a surface and
-    fall to 0, so that a layer of cells remains of a board that is seen from both sides.
+    panorama measures. `pose` is cam_from_world (3, 4). `view` holds for each pixel its range, the least range around,
+    its weight, 0 without a range, how much it counts as support, and its plane (H, W, 4), normal and offset in camera
+    coordinates. `out` are the mean distances (X, Y, Z), the sums of the weights, and the support by panoramas that
+    measured a surface here less that by panoramas that see something farther away. Weights are half as large again just
+    behind a surface and fall to 0, so that a layer of cells remains of a board that is seen from both sides.
     """
     origin, cell, limit = grid
     ranges, nearest, weights, worth, planes = view
-    distances, totals, votes = out
+    distances, totals, support = out
     height, width = ranges.shape
     for i in range(span[0], span[1]):
         world_x = origin[0] + cell * i
@@ -204,10 +204,10 @@ def add_distances(
                     continue
                 if distance > limit:
                     if nearest[row, column] - r > limit:
-                        votes[i, j, k] -= worth[row, column]
+                        support[i, j, k] -= worth[row, column]
                     continue
                 share = 1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit
-                votes[i, j, k] += worth[row, column]
+                support[i, j, k] += worth[row, column]
                 total = totals[i, j, k] + weight * share
                 distances[i, j, k] += (distance - distances[i, j, k]) * weight * share / total
                 totals[i, j, k] = total

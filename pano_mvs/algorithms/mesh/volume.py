@@ -43,8 +43,8 @@ MAX_CELLS = 1 << 23
 # Ranges on the planes of a place are not more accurate than this, relative to them.
 _PLANE_UNCERTAINTY = 0.01
 _GAPS = 3, 5, 9, 17
-# The vote of a range that is not confirmed; that of others is the probability that it is right.
-_LEAST_VOTE = np.float32(0.2)
+# How much a range counts that is not confirmed; others count by the probability that they are right.
+_LEAST_SUPPORT = np.float32(0.2)
 # Distances are averaged up to this many cells from the surface.
 _LIMIT_CELLS = 2.0
 
@@ -77,7 +77,7 @@ class Volume:
     """Signed distances in a grid of cubic cells.
 
     `origin`: (3,) centre of the first cell. `cell`: width of a cell. `distances`: (X, Y, Z) float32, positive in front
-    of the surface, cut off two cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `votes`:
+    of the surface, cut off two cells from it. `weights`: (X, Y, Z) float32, 0 where nothing was measured. `support`:
     (X, Y, Z) float32, negative where most panoramas see something farther away. `middle`: median range.
     """
 
@@ -85,14 +85,14 @@ class Volume:
     cell: float
     distances: NDArray[np.float32]
     weights: NDArray[np.float32]
-    votes: NDArray[np.float32]
+    support: NDArray[np.float32]
     middle: float
 
     def add(self, range_map: RangeMap, cam_from_world: Rigid3, valid: Mask, *, threads: int = 1) -> None:
         """Add what a panorama measured.
 
-        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)². It also votes
-        for a surface there and against surfaces before it, whatever its weight.
+        A range counts as the plane through its point, by the normal of the pixel, with weight 1 / (σ r)². It also
+        supports a surface there, and contradicts surfaces before it, whatever its weight.
 
         `range_map`: (H, W). `cam_from_world`: its pose. `valid`: (H, W) pixels that are not masked. `threads`: number
         of threads; the result does not depend on it.
@@ -107,7 +107,7 @@ class Volume:
         if range_map.sky is not None:
             weights[range_map.sky & valid] = 1.0
         confirmed, best = CONSISTENT_CONFIDENCE
-        votes = np.maximum((range_map.confidence.astype(np.float32) - confirmed) / (best - confirmed), _LEAST_VOTE)
+        support = np.maximum((range_map.confidence.astype(np.float32) - confirmed) / (best - confirmed), _LEAST_SUPPORT)
         # Beside an edge, a ray may pass the nearer surface or not.
         nearest = filtered(ranges, 1, lambda padded: cv2.erode(padded, square_window(1)))
         planes = np.empty((*ranges.shape, 4), np.float32)
@@ -117,11 +117,11 @@ class Volume:
             planes[oriented, :3] = range_map.normals_in_cam[oriented]
         planes[..., 3] = ranges * np.einsum("ijk,ijk->ij", planes[..., :3], rays)
         pose = np.concatenate([cam_from_world.rotation, cam_from_world.translation[:, None]], axis=1)
-        out = self.distances, self.weights, self.votes
+        out = self.distances, self.weights, self.support
 
         def add_slab(first: int, count: int) -> None:
             grid, cells = (self.origin, self.cell, _LIMIT_CELLS * self.cell), (first, first + count)
-            add_distances(grid, pose, (ranges, nearest, weights, votes, planes), cells, out)
+            add_distances(grid, pose, (ranges, nearest, weights, support, planes), cells, out)
 
         for_bands(add_slab, len(self.distances), threads=threads)
 
@@ -170,8 +170,8 @@ class Volume:
         self.weights[gaps] = np.finfo(np.float32).tiny
 
     def carve(self) -> None:
-        """Make cells free where the votes of panoramas that look through them outweigh those for a surface there."""
-        free = self.votes < 0
+        """Make cells free where panoramas that look through them outweigh those that measured a surface there."""
+        free = self.support < 0
         self.distances[free] = _LIMIT_CELLS * self.cell
         self.weights[free] = np.maximum(self.weights[free], np.finfo(np.float32).tiny)
 

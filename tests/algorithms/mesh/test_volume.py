@@ -48,11 +48,11 @@ def test_distances_are_those_of_numpy(threads: int) -> None:
     volume = filled(shown, cell=0.25, threads=threads)
     places = volume.origin + volume.cell * np.moveaxis(np.indices(volume.distances.shape), 0, -1).reshape(-1, 3)
     maps = [(view.range_map, view.cam_from_world) for view in shown.views if view.range_map is not None]
-    distances, weights, votes = mean_distances(places, maps, limit=2 * volume.cell, middle=volume.middle)
+    distances, weights, support = mean_distances(places, maps, limit=2 * volume.cell, middle=volume.middle)
     # A cell on the border between two pixels may get the other one.
     same = np.isclose(volume.weights.ravel(), weights, rtol=1e-3, atol=1e-5)
     assert same.mean() > 0.99
-    assert np.isclose(volume.votes.ravel(), votes, atol=1e-5).mean() > 0.99
+    assert np.isclose(volume.support.ravel(), support, atol=1e-5).mean() > 0.99
     np.testing.assert_allclose(volume.distances.ravel()[same], distances[same], atol=1e-4)
 
 
