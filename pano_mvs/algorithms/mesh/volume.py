@@ -236,7 +236,8 @@ def empty_volume(maps: Sequence[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, 
     lower, upper = lower - margin, upper + margin
     width = max(cell or np.pi / height * middle, float(np.prod(upper - lower) / max_cells) ** (1 / 3))
     shape = np.ceil((upper - lower) / width).astype(int) + 1
-    return Volume(lower, width, *(np.zeros(shape, np.float32) for _ in range(3)), middle)
+    distances, weights, support = np.zeros((3, *shape), np.float32)
+    return Volume(lower, width, distances, weights, support, middle)
 
 
 def on_planes(surface: Surface, planes: Planes, *, reach: float) -> tuple[NDArray[np.float32], Mask]:
