@@ -178,7 +178,7 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
         pixels = max(pixels, height * width)
     # Measured: of each texel and of each pixel of a panorama while the texture is painted, and of each cell.
     painting = params.texture_px**2 * 60 + pixels * 120 + 400_000_000
-    return max(MAX_CELLS * 60, painting)
+    return max(MAX_CELLS * 85, painting)
 
 
 @stage(
