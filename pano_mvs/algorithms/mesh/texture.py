@@ -26,7 +26,7 @@ _TEXELS_OF_PART = 1 << 20  # bounds the memory
 
 Places = Callable[[NDArray[np.intp]], FloatArray]
 
-_SAMPLES, _NEIGHBOURS = 100_000, 8
+_SAMPLES, _NEIGHBOURS = 20_000, 8
 
 
 def filled_colors(colors: FloatImage, seen: NDArray[np.bool_], places: Places) -> None:
@@ -46,7 +46,7 @@ def filled_colors(colors: FloatImage, seen: NDArray[np.bool_], places: Places) -
     hidden = np.flatnonzero(~seen)
     for first in range(0, len(hidden), _TEXELS_OF_PART):
         part = hidden[first : first + _TEXELS_OF_PART]
-        distances, nearest = tree.query(places(part), k=range(1, min(_NEIGHBOURS, len(known)) + 1))
+        distances, nearest = tree.query(places(part), k=range(1, min(_NEIGHBOURS, len(known)) + 1), eps=0.5)
         weights = 1 / np.maximum(distances, 1e-9)
         weights /= weights.sum(axis=1, keepdims=True)
         colors[part] = np.einsum("nk,nkc->nc", weights, colors[known[nearest]])
