@@ -136,7 +136,7 @@ def test_mesh_writes_a_textured_mesh_around_the_cameras(pano_mvs: Command, rende
     extent = read.vertices.max(axis=0) - read.vertices.min(axis=0)
     assert int(np.argmin(extent)) == 1  # y is up, and rooms are wider than high
     metrics = next(stage["metrics"] for stage in run_json(out)["stages"] if stage["name"] == "textured")
-    assert metrics["seen"] > 0.5
+    assert metrics["seen"] > 0.3
     assert read_picture(out / "mesh_textured_seen.png").any()
     for name in ("mesh_textured.obj", "mesh_textured.mtl", "mesh_textured.jpg"):
         assert (out / name).is_file()
