@@ -193,6 +193,33 @@ def nearest_triangles(corners_in_cam: FloatArray, size_hw: tuple[int, int]) -> t
     return ranges.reshape(size_hw), triangle.reshape(size_hw)
 
 
+def mean_distances(
+    places: FloatArray, maps: Sequence[tuple[RangeMap, Rigid3]], *, limit: float, middle: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return distances, weights and support of `Volume.add` at places (N, 3); maps have ranges and confidence only."""
+    distances, weights, support = np.zeros((3, len(places)))
+    for range_map, pose in maps:
+        rays, (height, width) = ray_grid(range_map.range.shape), range_map.range.shape
+        for idx, place in enumerate(pose.apply(places)):
+            column, row = np.floor(pixel_from_ray(place, (height, width))).astype(int)
+            at = min(row, height - 1), column % width
+            found, r = float(range_map.range[at]), float(np.linalg.norm(place))
+            across = found - float(rays[at] @ place)
+            distance = found - r if abs(found - r) < abs(across) else across
+            if found - r < -8 * limit or distance <= -limit:
+                continue
+            sure = (int(range_map.confidence[at]) - 128) / 127
+            if distance > limit:
+                around = [wrap(at[0] + i, at[1] + j, height, width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+                support[idx] -= sure * (min(float(range_map.range[other]) for other in around) - r > limit)
+                continue
+            weight = (0.01 * middle / (0.03 * found)) ** 2 * (1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit)
+            support[idx] += sure
+            distances[idx] += distance * weight
+            weights[idx] += weight
+    return distances / np.maximum(weights, 1e-30), weights, support
+
+
 def texel_looks(
     texels: Texels,
     mesh: tuple[FloatArray, FloatArray, NDArray[np.int32]],
@@ -204,7 +231,7 @@ def texel_looks(
     weights = np.column_stack([1 - texels.weights.sum(axis=1, dtype=np.float64), texels.weights])
     corner = faces[texels.triangle]
     points = np.einsum("tk,tkc->tc", weights, vertices[corner])
-    normal = np.einsum("tk,tkc->tc", weights, normals[corner])
+    normal = normals[texels.triangle]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     distance = np.linalg.norm(points, axis=1)
     cosine = -np.sum(points * normal, axis=1) / distance

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pano_mvs.algorithms.fusion.fuse import fuse_stream
-from pano_mvs.algorithms.fusion.view import FusionSettings, FusionView
-from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, PointCloud, Poses, RangeMap
+from pano_mvs.api import Context, FilePart, Files, InputError, Panorama, Poses, RangeMap
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.pose_groups import join_groups
@@ -22,12 +20,11 @@ from pano_mvs.stages.exports.mesh import TexturedParams, mesh_textured
 from tests.algorithms.mesh.box import HALF, WALL_COLORS, capture, poses
 from tests.stored import read_picture
 
-SETTINGS = {"triangles": 600, "texture_px": 256, "min_views": 1, "max_points": 3000, "depth": 5}
+SETTINGS = {"triangles": 3000, "texture_px": 256, "cell": 0.1}
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    cloud: PointCloud
     ranges: dict[str, RangeMap]
     poses: Poses
     images: dict[str, Panorama]
@@ -46,17 +43,15 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
         images[name], cams[name] = Panorama(FilePart(folder / name, external=True), size, size), view.cam_from_world
         assert view.range_map is not None
         ranges[name] = view.range_map
-    views = [FusionView(ranges[name], cams[name], images[name].load()) for name in images]
-    cloud = fuse_stream(list(cams.values()), views.__getitem__, FusionSettings(min_views=1))
     found = Poses.without_points(cams, frame="the box's", scale="metres", metric=True)
-    return Inputs(cloud, ranges, found, images)
+    return Inputs(ranges, found, images)
 
 
 def run(inputs: Inputs, folder: Path, **settings: object) -> Files:
     folder.mkdir(exist_ok=True)
     params = TexturedParams.model_validate(SETTINGS | settings)
     ctx = Context(np.random.default_rng(0), folder)
-    return mesh_textured(inputs.cloud, inputs.ranges, inputs.poses, inputs.images, params, ctx)
+    return mesh_textured(inputs.ranges, None, None, inputs.poses, inputs.images, params, ctx)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +90,7 @@ def test_the_obj_names_files_that_exist(delivered: Path) -> None:
     read = trimesh.load(delivered / "mesh_textured.glb", force="mesh", process=False)
     assert isinstance(read, trimesh.Trimesh)
     assert faces == len(read.faces)
-    assert 0.8 * 600 <= faces <= 600
+    assert 0.8 * 3000 <= faces <= 3000
 
 
 def test_the_bytes_are_the_same_again(inputs: Inputs, delivered: Path, tmp_path: Path) -> None:
@@ -118,15 +113,11 @@ def test_formats_and_frame_can_be_chosen(inputs: Inputs, tmp_path: Path) -> None
 
 
 def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -> None:
-    """The box twice, with other names; a third group has too few points for a mesh."""
+    """The box twice, with other names; a third group has no ranges."""
     again = {f"again-{name}": name for name in inputs.images}
-    cloud = inputs.cloud
-    arrays = cloud.points_in_world[:5], cloud.normals_in_world[:5], cloud.colors_rgb[:5], cloud.view_counts[:5]
-    few = PointCloud(*arrays)
     second = replace(inputs.poses, names=tuple(again))
     third = replace(inputs.poses, names=tuple(f"third-{name}" for name in inputs.images))
     both = Inputs(
-        PointCloud.of_groups([inputs.cloud, inputs.cloud, few]),
         inputs.ranges | {name: inputs.ranges[own] for name, own in again.items()},
         join_groups([inputs.poses, second, third]),
         inputs.images | {name: inputs.images[own] for name, own in again.items()},
@@ -135,7 +126,7 @@ def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -
     folder.mkdir()
     ctx = Context(np.random.default_rng(0), folder)
     params = TexturedParams.model_validate(SETTINGS | {"formats": ("glb",)})
-    files = mesh_textured(both.cloud, both.ranges, both.poses, both.images, params, ctx).files
+    files = mesh_textured(both.ranges, None, None, both.poses, both.images, params, ctx).files
     assert sorted(files) == [
         "mesh_textured.glb",
         "mesh_textured_1.glb",
@@ -143,12 +134,12 @@ def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -
         "mesh_textured_seen.png",
     ]
     assert files["mesh_textured.glb"].read_bytes() == files["mesh_textured_1.glb"].read_bytes()
-    assert ctx.notes[0].startswith("no mesh_textured_2.glb: 5 of 5 points are left")
+    assert ctx.notes[0].startswith("no mesh_textured_2.glb: no panorama measured a surface")
 
 
-def test_a_mesh_that_no_panorama_sees_is_refused(inputs: Inputs, tmp_path: Path) -> None:
+def test_panoramas_without_valid_pixels_are_refused(inputs: Inputs, tmp_path: Path) -> None:
     masked = dict(inputs.images)
     for name, image in inputs.images.items():
         masked[name] = image.with_mask(np.zeros(image.size_hw, np.bool_), tmp_path)
-    with pytest.raises(InputError, match="no panorama sees the mesh"):
-        run(Inputs(inputs.cloud, inputs.ranges, inputs.poses, masked), tmp_path / "dark")
+    with pytest.raises(InputError, match="the mesh has no faces"):
+        run(Inputs(inputs.ranges, inputs.poses, masked), tmp_path / "dark")

@@ -1,10 +1,10 @@
 """How a mesh looks where no panorama was used.
 
 Leaves out one panorama of a rendered capture with true poses, computes ranges of the others by the dense stages of a
-workflow, and makes the mesh with coloured vertices (`export.mesh`) and the textured one (`export.mesh_textured`).
-Both are rendered at the pose of the panorama left out and compared with it: PSNR and SSIM of all pixels in which the
-place has a surface, where holes are black, and of those that the mesh covers. The first mesh is also simplified to the
-triangles of the second, with the colours of the nearest vertices. `--out` keeps the pictures.
+workflow that finds the planes of the place, and makes the mesh with coloured vertices (`export.mesh`) and the textured
+one (`export.mesh_textured`). Both are rendered at the pose of the panorama left out and compared with it: PSNR and SSIM
+of all pixels in which the place has a surface, where holes are black, and of those that the mesh covers. The first mesh
+is also simplified to the triangles of the second, with the colours of the nearest vertices. `--out` keeps the pictures.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.mesh.surface import Mesh, decimated
 from pano_mvs.algorithms.mesh.texture import TexturedMesh
-from pano_mvs.stages.exports.mesh import MeshParams, TexturedParams, solved_mesh, textured_mesh
+from pano_mvs.algorithms.mesh.volume import most_certain
+from pano_mvs.scene.surfaces import Structure
+from pano_mvs.stages.exports.mesh import MeshParams, MeshView, TexturedParams, solved_mesh, textured_mesh
 from tests.evaluation.held_out_meshes import HeldOutScores, held_out_scores
 from tools.benchmarks.captures import Capture, read_capture
-from tools.benchmarks.dense_chain import DenseChain, context, true_poses
+from tools.benchmarks.dense_chain import DenseChain, context
 
 
 def meshes(capture: Capture, workflow: str, folder: Path, triangles: int) -> tuple[Mesh, TexturedMesh]:
@@ -31,17 +33,19 @@ def meshes(capture: Capture, workflow: str, folder: Path, triangles: int) -> tup
     chain = DenseChain(workflow)
     started = time.process_time()
     run = chain.run(capture)
-    last = list(run.range_maps.values())[-1]
-    poses = true_poses(capture)
+    checked, last = run.range_maps["checked"], list(run.range_maps.values())[-1]
+    structure = run.results["scene_planes"][""]
+    assert isinstance(structure, Structure)
     cloud = chain.fused(capture, run)
     print(f"  ranges and fusion: {time.process_time() - started:.0f} s, {len(cloud)} points", flush=True)
-    for name in ("plain", "textured"):
-        (folder / name).mkdir()
-    plain, _ = solved_mesh(cloud, MeshParams(), folder / "plain")
+    plain, _ = solved_mesh(cloud, MeshParams(), folder)
     started = time.process_time()
-    params, inputs = TexturedParams(triangles=triangles), (poses, capture.panoramas, last)
-    made = textured_mesh(cloud, inputs, params, folder=folder / "textured", ctx=context(folder))
-    print(f"  texture: {time.process_time() - started:.0f} s without the solver", flush=True)
+    views = [
+        MeshView(capture.poses[name], capture.panoramas[name], most_certain(last[name], checked[name])) for name in last
+    ]
+    planes = structure.normals_in_world, structure.offsets
+    made = textured_mesh(views, planes, TexturedParams(triangles=triangles), ctx=context(folder))
+    print(f"  textured mesh: {time.process_time() - started:.0f} s", flush=True)
     return plain, made
 
 

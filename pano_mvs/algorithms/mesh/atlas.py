@@ -47,18 +47,31 @@ class Texels:
     weights: NDArray[np.float32]
 
 
-def unwrapped(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, texels_per_unit: float, max_px: int) -> Atlas:
+def unwrapped(
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    *,
+    texels_per_unit: float,
+    max_px: int,
+    region: NDArray[np.int64] | None = None,
+) -> Atlas:
     """Return the charts of a mesh in one texture.
 
     `vertices`: (V, 3). `faces`: (F, 3), at least one. `texels_per_unit`: resolution of the texture: texels per scene
-    unit. `max_px`: largest width and height of the texture; it lowers the resolution.
+    unit. `max_px`: largest width and height of the texture; it lowers the resolution. `region`: (F,) number of the
+    plane on which each triangle lies, −1 for none; None: none does. No chart contains triangles of several planes.
     """
     xatlas = import_module("xatlas")
     corners = vertices.astype(np.float64)[faces]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     most = max_px * np.sqrt(0.75 / max(area / 2, 1e-30))  # three quarters of a texture are used
     atlas = xatlas.Atlas()
-    parts = [(part, *np.unique(faces[part], return_inverse=True)) for part in _parts(corners.mean(axis=1))]
+    parts = []
+    for number in np.unique(region) if region is not None else [-1]:
+        own = np.flatnonzero(region == number) if region is not None else np.arange(len(faces))
+        # A plane is one chart, however many triangles it has.
+        divided = _parts(corners[own].mean(axis=1)) if number < 0 else [np.arange(len(own))]
+        parts += [(own[part], *np.unique(faces[own[part]], return_inverse=True)) for part in divided]
     for part, used, local in parts:
         atlas.add_mesh(vertices[used].astype(np.float32), local.reshape(len(part), 3).astype(np.uint32))
     options = xatlas.PackOptions()

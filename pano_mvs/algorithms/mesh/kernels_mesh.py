@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.kernels import inlined, kernel
-from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_from_ray
+from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, fast_azimuth, fast_dip, pixel_from_ray
 
 Vector = tuple[float, float, float]
 Targets = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]
@@ -154,6 +154,65 @@ def draw_charts(uv_px: FloatArray, triangle: NDArray[np.int32], weights: NDArray
                     weights[row, column, 0], weights[row, column, 1] = of_b, of_c
 
 
+Grid = tuple[FloatArray, float, float]
+Measured = tuple[FloatImage, FloatImage, FloatImage, FloatImage, FloatImage]
+
+
+@kernel
+def add_distances(
+    grid: Grid, pose: FloatArray, view: Measured, span: tuple[int, int], out: tuple[FloatImage, FloatImage, FloatImage]
+) -> None:
+    """Add the signed distances that a panorama measured to the cells [first, end) of a grid.
+
+    `grid` holds the centre of the first cell, the width of the cells, and the distance from the surface within which a
+    panorama measures. `pose` is cam_from_world (3, 4). `view` holds for each pixel its range, the least range around,
+    its weight, 0 without a range, how much it counts as support, and its plane (H, W, 4), normal and offset in camera
+    coordinates. `out` are the mean distances (X, Y, Z), the sums of the weights, and the support by panoramas that
+    measured a surface here less that by panoramas that see something farther away. Weights are half as large again just
+    behind a surface and fall to 0, so that a layer of cells remains of a board that is seen from both sides.
+    """
+    origin, cell, limit = grid
+    ranges, nearest, weights, worth, planes = view
+    distances, totals, support = out
+    height, width = ranges.shape
+    for i in range(span[0], span[1]):
+        world_x = origin[0] + cell * i
+        for j in range(distances.shape[1]):
+            world_y = origin[1] + cell * j
+            start_x = pose[0, 0] * world_x + pose[0, 1] * world_y + pose[0, 3]
+            start_y = pose[1, 0] * world_x + pose[1, 1] * world_y + pose[1, 3]
+            start_z = pose[2, 0] * world_x + pose[2, 1] * world_y + pose[2, 3]
+            for k in range(distances.shape[2]):
+                world_z = origin[2] + cell * k
+                x, y, z = start_x + pose[0, 2] * world_z, start_y + pose[1, 2] * world_z, start_z + pose[2, 2] * world_z
+                level = np.float32(math.sqrt(x * x + z * z))
+                column = math.floor((fast_azimuth(np.float32(x), np.float32(z)) / (2 * math.pi) + 0.5) * width)
+                row = math.floor((0.5 + fast_dip(np.float32(y), level) / math.pi) * height)
+                row, column = min(max(row, 0), height - 1), column % width
+                weight = weights[row, column]
+                if not weight > 0:
+                    continue
+                r = math.sqrt(x * x + y * y + z * z)
+                along = ranges[row, column] - r
+                if along < -8 * limit:
+                    continue
+                distance = planes[row, column, 0] * x + planes[row, column, 1] * y + planes[row, column, 2] * z
+                distance -= planes[row, column, 3]
+                if abs(along) < abs(distance):
+                    distance = along
+                if distance <= -limit:
+                    continue
+                if distance > limit:
+                    if nearest[row, column] - r > limit:
+                        support[i, j, k] -= worth[row, column]
+                    continue
+                share = 1.0 if distance >= 0 else 1.5 + 1.5 * distance / limit
+                support[i, j, k] += worth[row, column]
+                total = totals[i, j, k] + weight * share
+                distances[i, j, k] += (distance - distances[i, j, k]) * weight * share / total
+                totals[i, j, k] = total
+
+
 TexelArrays = tuple[NDArray[np.int32], NDArray[np.float32]]
 MeshArrays = tuple[FloatArray, FloatArray, NDArray[np.int32]]
 ViewArrays = tuple[FloatImage, FloatImage, NDArray[np.uint8], FloatImage]
@@ -168,11 +227,11 @@ SLOPE_PX = 2.0
 def look_at_texels(texels: TexelArrays, mesh: MeshArrays, view: ViewArrays, span: tuple[int, int], out: Looks) -> None:
     """Write the weight and the colours that a panorama gives to the texels of `span`, [first, end).
 
-    `texels` holds the triangle and the weights of its second and third corner; `mesh` the vertices and unit normals
-    (V, 3) in camera coordinates, and the triangles. `view` holds the ranges of the mesh in the panorama, the quality of
-    each pixel, the picture (H, W, 3) and the picture without its detail. `out`, whose rows count from the start of the
-    span: weight (n,), which is quality × cosine / range², 0 where the texel is hidden, seen from behind or edge-on; the
-    colour without detail (n, 3), and the detail (n, 3), both bilinear.
+    `texels` holds the triangle and the weights of its second and third corner; `mesh` the vertices (V, 3) and the unit
+    normals (F, 3) of the triangles in camera coordinates, and the triangles. `view` holds the ranges of the mesh in the
+    panorama, the quality of each pixel, the picture (H, W, 3) and the picture without its detail. `out`, whose rows
+    count from the start of the span: weight (n,), which is quality × cosine / range², 0 where the texel is hidden, seen
+    from behind or edge-on; the colour without detail (n, 3), and the detail (n, 3), both bilinear.
     """
     triangle, weights = texels
     vertices, normals, faces = mesh
@@ -189,12 +248,9 @@ def look_at_texels(texels: TexelArrays, mesh: MeshArrays, view: ViewArrays, span
         x = of_i * vertices[i, 0] + of_j * vertices[j, 0] + of_k * vertices[k, 0]
         y = of_i * vertices[i, 1] + of_j * vertices[j, 1] + of_k * vertices[k, 1]
         z = of_i * vertices[i, 2] + of_j * vertices[j, 2] + of_k * vertices[k, 2]
-        nx = of_i * normals[i, 0] + of_j * normals[j, 0] + of_k * normals[k, 0]
-        ny = of_i * normals[i, 1] + of_j * normals[j, 1] + of_k * normals[k, 1]
-        nz = of_i * normals[i, 2] + of_j * normals[j, 2] + of_k * normals[k, 2]
-        length = math.sqrt(nx * nx + ny * ny + nz * nz)
         r = math.sqrt(x * x + y * y + z * z)
-        cosine = -(x * nx + y * ny + z * nz) / (r * length)
+        normal = normals[triangle[texel]]
+        cosine = -(x * normal[0] + y * normal[1] + z * normal[2]) / r
         if not cosine >= MIN_COSINE:
             continue
         px, py = pixel_from_ray(x, y, z, height, width)

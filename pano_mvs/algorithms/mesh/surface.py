@@ -14,12 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.ranges.agreement import pixels_containing
-from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.algorithms.mesh.view_quality import face_normals
+from pano_mvs.algorithms.mesh.volume import Surface
+from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
-from pano_mvs.geometry import Rigid3
-from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 _NEIGHBOURS = 6
 
@@ -77,10 +75,6 @@ def used_part(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
     return Mesh(mesh.vertices_in_world[used], mesh.colors_rgb[used], renumbered)
 
 
-Surface = tuple[NDArray[np.float32], NDArray[np.int32]]
-"""Vertices (V, 3) and triangles (F, 3)."""
-
-
 def decimated(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, triangles: int) -> Surface:
     """Return a mesh with about a given number of triangles; as it is if it has no more than that.
 
@@ -94,9 +88,7 @@ def decimated(vertices: NDArray[np.float32], faces: NDArray[np.int32], *, triang
             np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32), target_count=triangles
         )
         vertices, faces = np.asarray(points, np.float32), np.asarray(corners, np.int32)
-    edges = vertices[faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0]), axis=1)
-    faces = faces[areas > 0]
+    faces = faces[face_normals(vertices, faces).any(axis=1)]
     used, positions = np.unique(faces, return_inverse=True)
     return vertices[used], positions.reshape(faces.shape).astype(np.int32)
 
@@ -146,43 +138,3 @@ def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: f
             f"points by `max_points`. Its message: {said or 'none'}"
         )
     return target
-
-
-# Ranges of one surface differ by less than this share; beyond the second share, the panorama sees something behind it.
-_CONFIRMS, _SEES_THROUGH = 0.03, 0.08
-
-
-class FreeSpace:
-    """Counts how many panoramas confirm each vertex of a mesh, and how many look through it."""
-
-    def __init__(self, vertices_in_world: NDArray[np.float32]) -> None:
-        self._vertices = vertices_in_world
-        self._confirmed = np.zeros(len(vertices_in_world), np.uint8)
-        self._through = np.zeros(len(vertices_in_world), np.uint8)
-        self._sky = np.zeros(len(vertices_in_world), np.bool_)
-
-    def add(self, range_map: RangeMap, cam_from_world: Rigid3, valid: NDArray[np.bool_]) -> None:
-        """Compare the vertices with the ranges of a panorama, without masked pixels.
-
-        `range_map`: (H, W) ranges; weak and filled ones confirm vertices but do not contradict them. `cam_from_world`:
-        pose of the panorama. `valid`: (H, W) pixels that are not masked.
-
-        Raises:
-            UsageError: if the sizes differ.
-        """
-        if valid.shape != range_map.range.shape:
-            raise UsageError(f"a mask of {valid.shape} for ranges of {range_map.range.shape}")
-        points = cam_from_world.apply(self._vertices)
-        row, column = pixels_containing(points, range_map.range.shape)
-        ratio = range_map.range[row, column] / np.linalg.norm(points, axis=1)
-        shown = valid[row, column]
-        sure = shown & (range_map.confidence[row, column] >= CONSISTENT_CONFIDENCE[0])
-        with np.errstate(invalid="ignore"):
-            self._confirmed += shown & (np.abs(ratio - 1) <= _CONFIRMS) & (self._confirmed < 255)
-            self._through += sure & (ratio > 1 + _SEES_THROUGH) & (self._through < 255)
-        if range_map.sky is not None:
-            self._sky |= shown & range_map.sky[row, column]
-
-    def free(self) -> NDArray[np.bool_]:
-        """Return the vertices (V,) that no panorama confirms, and that two look through or one sees as sky."""
-        return np.asarray((self._confirmed == 0) & ((self._through >= 2) | self._sky))

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.mesh.atlas import Atlas, Texels, texels_of
-from pano_mvs.algorithms.mesh.view_quality import PaintView, pixel_quality, surface_view, vertex_normals
+from pano_mvs.algorithms.mesh.view_quality import PaintView, face_normals, pixel_quality, surface_view
 from pano_mvs.algorithms.panoramas import filtered, sharpness
 from pano_mvs.core.arrays import FloatArray, FloatImage
 from pano_mvs.core.bands import for_bands
@@ -26,35 +24,32 @@ from pano_mvs.core.bands import for_bands
 _TEXELS_OF_PART = 1 << 20  # bounds the memory
 
 
-def vertex_colors(
-    colors: FloatImage, seen: NDArray[np.bool_], texels: Texels, *, faces: NDArray[np.int32], vertices: int
-) -> FloatImage:
-    """Return the colour of each vertex, (V, 3): the mean of the texels around it that are seen, by their weights.
+Places = Callable[[NDArray[np.intp]], FloatArray]
 
-    A vertex without such texels has the mean of its neighbours along the edges, as have those in turn (the discrete
-    Laplace equation). A part of the mesh that nobody sees has the mean of all colours.
+_SAMPLES, _NEIGHBOURS = 20_000, 8
 
-    `colors`: (T, 3) colours of the texels. `seen`: (T,) the texels whose colours are known. `texels`: the texels.
-    `faces`: (F, 3) triangles of the mesh. `vertices`: the number V of vertices.
+
+def filled_colors(colors: FloatImage, seen: NDArray[np.bool_], places: Places) -> None:
+    """Give texels that nobody sees the mean colour of the nearest ones that are seen, by inverse distance, in place.
+
+    Without any, all are grey.
+
+    `colors`: (T, 3) colours of the texels. `seen`: (T,) the texels whose colours are known. `places`: returns the
+    places (N, D) of some texels, between which distances are measured.
     """
-    sums, totals = np.zeros((vertices, 3)), np.zeros(vertices)
-    for first in range(0, len(seen), _TEXELS_OF_PART):
-        part = slice(first, first + _TEXELS_OF_PART)
-        shown = seen[part]
-        triangle, weights = texels.triangle[part][shown], texels.weights[part][shown].astype(np.float64)
-        for corner, weight in enumerate((1 - weights.sum(axis=1), weights[:, 0], weights[:, 1])):
-            vertex = faces[triangle, corner]
-            totals += np.bincount(vertex, weight, vertices)
-            for channel in range(3):
-                sums[:, channel] += np.bincount(vertex, weight * colors[part][shown, channel], vertices)
-    known = totals > 1e-3
-    result = np.full((vertices, 3), 128.0 if not known.any() else 0.0)
-    if not known.any():
-        return result.astype(np.float32)
-    result[known] = sums[known] / totals[known, None]
-    result[~known] = result[known].mean(axis=0)
-    _diffuse(result, known, faces)
-    return result.astype(np.float32)
+    known = np.flatnonzero(seen)
+    if not len(known):
+        colors[:] = 128.0
+        return
+    known = known[:: -(-len(known) // _SAMPLES)]
+    tree = cKDTree(places(known))
+    hidden = np.flatnonzero(~seen)
+    for first in range(0, len(hidden), _TEXELS_OF_PART):
+        part = hidden[first : first + _TEXELS_OF_PART]
+        distances, nearest = tree.query(places(part), k=range(1, min(_NEIGHBOURS, len(known)) + 1), eps=0.5)
+        weights = 1 / np.maximum(distances, 1e-9)
+        weights /= weights.sum(axis=1, keepdims=True)
+        colors[part] = np.einsum("nk,nkc->nc", weights, colors[known[nearest]])
 
 
 def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -72,30 +67,6 @@ def spread_over_gaps(texture: NDArray[np.uint8], filled: NDArray[np.bool_]) -> N
     source[labels[filled]] = np.flatnonzero(filled)
     flat = texture.reshape(filled.size, -1)
     return np.asarray(flat[source[labels.ravel()]].reshape(texture.shape))
-
-
-def _diffuse(colors: NDArray[np.float64], known: NDArray[np.bool_], faces: NDArray[np.int32]) -> None:
-    """Solve the Laplace equation for the vertices whose colours are not known, in place."""
-    links = _links(faces, len(colors))
-    _, part = connected_components(links, directed=False)
-    reached = np.isin(part, np.unique(part[known]))
-    wanted = np.flatnonzero(~known & reached)
-    if not len(wanted):
-        return
-    degrees = np.asarray(links.sum(axis=1)).ravel()
-    rows = links[wanted]
-    system = (diags_array(degrees[wanted]) - rows[:, wanted]).tocsc()
-    right = rows[:, np.flatnonzero(known)] @ colors[known]
-    colors[wanted] = np.asarray(spsolve(system, right)).reshape(-1, 3)
-
-
-def _links(faces: NDArray[np.int32], count: int) -> csr_array:
-    """Return the adjacency of vertices, (count, count), 1 for an edge."""
-    starts, ends = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    both = np.concatenate([starts, ends]), np.concatenate([ends, starts])
-    links = coo_array((np.ones(2 * len(starts)), both), shape=(count, count)).tocsr()
-    links.data[:] = 1
-    return links
 
 
 _GAIN_LIMITS = 0.4, 2.5
@@ -176,7 +147,15 @@ class Surface:
 
     def __init__(self, vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
         self.vertices_in_world, self.faces = vertices_in_world, faces
-        self.normals = vertex_normals(vertices_in_world, faces)
+        self.normals = face_normals(vertices_in_world, faces)
+        self._size = float(np.ptp(vertices_in_world, axis=0).max()) if len(vertices_in_world) else 1.0
+
+    def places(self, texels: Texels, chosen: NDArray[np.intp]) -> FloatArray:
+        """Return positions and scaled normals of texels, (N, 6), so that a floor is far from what stands on it."""
+        triangle, weights = texels.triangle[chosen], texels.weights[chosen].astype(np.float64)
+        shares = np.stack([1 - weights.sum(axis=1), weights[:, 0], weights[:, 1]], axis=1)
+        positions = np.einsum("nc,nci->ni", shares, self.vertices_in_world[self.faces[triangle]])
+        return np.concatenate([positions, 0.1 * self._size * self.normals[triangle]], axis=1)
 
     def looks(
         self, texels: Texels, view: PaintView, *, worth: float, threads: int
@@ -221,13 +200,19 @@ def balanced_views(
     one at a time. `views`: number of panoramas. `threads`: number of threads; the result does not depend on it.
     """
     surface = Surface(vertices_in_world, faces)
-    count = len(faces)
-    triangle = np.unique(np.linspace(0, count - 1, min(count, 20_000)).astype(np.int32))
-    centers = Texels(np.arange(len(triangle), dtype=np.int32), triangle, np.full((len(triangle), 2), 1 / 3, np.float32))
+    corners = vertices_in_world.astype(np.float64)[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    # Points that are evenly distributed over the surface.
+    count = 20_000
+    wanted = (np.arange(count) + 0.5) / count * areas.sum()
+    triangle = np.searchsorted(np.cumsum(areas), wanted).clip(0, len(faces) - 1).astype(np.int32)
+    first, second = np.random.default_rng(0).random((2, count))
+    weights_at = np.stack([1 - np.sqrt(first), np.sqrt(first) * second], axis=1).astype(np.float32)
+    centers = Texels(np.arange(count, dtype=np.int32), triangle, weights_at)
     colors = np.zeros((views, len(centers.triangle), 3), np.float32)
     weights = np.zeros((views, len(centers.triangle)), np.float32)
     density, sharp = np.zeros(len(centers.triangle)), np.zeros(views)
-    middles = vertices_in_world[faces[centers.triangle]].mean(axis=1, dtype=np.float64)
+    middles = surface.places(centers, np.arange(count))[:, :3]
     for idx in range(views):
         view = load(idx)
         sharp[idx] = sharpness(view.picture)
@@ -275,14 +260,7 @@ def _painted(
         look = surface.looks(texels, load(idx), worth=float(worth), threads=threads)
         painting.add(look, gain.astype(np.float32), threads=threads)
     colors, seen = painting.colors()
-    of_vertices = vertex_colors(colors, seen, texels, faces=surface.faces, vertices=len(surface.vertices_in_world))
-    for first in range(0, len(seen), _TEXELS_OF_PART):
-        part = slice(first, first + _TEXELS_OF_PART)
-        hidden = ~seen[part]
-        triangle, weights = texels.triangle[part][hidden], texels.weights[part][hidden]
-        second, third = weights[:, :1], weights[:, 1:]
-        corners = of_vertices[surface.faces[triangle]]
-        colors[part][hidden] = (1 - second - third) * corners[:, 0] + second * corners[:, 1] + third * corners[:, 2]
+    filled_colors(colors, seen, lambda chosen: surface.places(texels, chosen))
     np.clip(np.rint(colors, out=colors), 0, 255, out=colors)
     return colors.astype(np.uint8), seen
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.panoramas import filtered
-from pano_mvs.core.arrays import FloatImage, Mask
+from pano_mvs.core.arrays import FloatArray, FloatImage, Mask
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama
@@ -150,18 +150,8 @@ def surface_view(
     return SurfaceView(*targets)
 
 
-def vertex_normals(vertices_in_world: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Return the unit normal at each vertex, (V, 3): the mean of its triangles' normals, weighted by area.
-
-    The normal of a vertex without a triangle with an area is 0.
-    """
-    corners = vertices_in_world.astype(np.float64)[faces]
+def face_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> FloatArray:
+    """Return the unit normals of triangles, (F, 3); 0 for one without an area."""
+    corners = vertices.astype(np.float64)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    count = len(vertices_in_world)
-    sums = np.stack(
-        [sum(np.bincount(faces[:, corner], normals[:, axis], count) for corner in range(3)) for axis in range(3)],
-        axis=-1,
-    )
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    unit: NDArray[np.float32] = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).astype(np.float32)
-    return unit
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,20 +14,29 @@ from pydantic import Field
 from pano_mvs.algorithms.mesh.atlas import unwrapped
 from pano_mvs.algorithms.mesh.surface import (
     MIN_POINTS,
-    FreeSpace,
     Mesh,
     decimated,
     point_spacings,
     poisson_depth,
     solve_poisson,
     trimmed_mesh,
-    used_part,
     without_crumbs,
 )
 from pano_mvs.algorithms.mesh.texture import TexturedMesh, balanced_views, textured
 from pano_mvs.algorithms.mesh.view_quality import PaintView
+from pano_mvs.algorithms.mesh.volume import (
+    MAX_CELLS,
+    NO_PLANES,
+    Planes,
+    empty_volume,
+    most_certain,
+    on_planes,
+    plane_of_faces,
+    seen_triangles,
+)
 from pano_mvs.api import All, Context, Files, InputError, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.core.text import plural
+from pano_mvs.geometry import Rigid3
 from pano_mvs.io.meshes import (
     SUFFIXES,
     TexturedArrays,
@@ -42,6 +52,7 @@ from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import world_up, y_up_from_world
 from pano_mvs.stages.exports.files import FrameParams, files_from_world
 
@@ -100,10 +111,10 @@ def mesh(cloud: One[PointCloud], poses: One[Poses] | None, params: MeshParams, c
     return Files(files)
 
 
-def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest: int = 14) -> tuple[Mesh, int]:
+def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
     """Return the mesh of one group, and the depth of its octree.
 
-    That is the depth of the settings, or one by point spacing, at most `deepest`.
+    That is the depth of the settings, or one by point spacing.
 
     Raises:
         InputError: if too few points are left, or they have no common surface.
@@ -118,7 +129,7 @@ def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest:
             "are needed. Lower `min_views` or `min_confidence`, or find out why the cloud is empty"
         )
     spacing = float(np.median(point_spacings(points)))
-    depth = params.depth or min(poisson_depth(points, spacing), deepest)
+    depth = params.depth or poisson_depth(points, spacing)
     solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))
     if params.trim:
         solved = trimmed_mesh(solved, points, max_spacings=params.trim)
@@ -131,19 +142,17 @@ def solved_mesh(cloud: PointCloud, params: MeshParams, folder: Path, *, deepest:
 NAME = "mesh_textured"
 
 
-class TexturedParams(MeshParams):
+class TexturedParams(Params):
     """Settings of export.mesh_textured."""
 
-    depth: int = Field(
-        default=0,
+    cell: float = Field(
+        default=0.0,
         ge=0,
-        le=14,
-        description="depth of the octree: cells are extent / 2^depth wide; 0: by point spacing, at most 9",
+        description="width of the cells of the surface in scene units; 0: by the spacing of pixels. At most 8 million "
+        "cells are used",
     )
-    trim: float = Field(
-        default=12.0,
-        ge=0,
-        description="cut off parts farther from the points than this times their spacing; 0: keep all",
+    smallest_part: float = Field(
+        default=0.001, ge=0, le=1, description="remove loose parts with less than this share of the triangles"
     )
     triangles: int = Field(default=100_000, ge=100, description="number of triangles after simplification")
     texture_px: int = Field(default=4096, ge=64, le=16384, description="largest width and height of the texture")
@@ -167,10 +176,9 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
     for name in images:
         height, width = images[name].size_hw
         pixels = max(pixels, height * width)
-    # Measured: of each texel and of each pixel of a panorama while the texture is painted, of the mesh before it is
-    # simplified, and of the solver.
+    # Measured: of each texel and of each pixel of a panorama while the texture is painted, and of each cell.
     painting = params.texture_px**2 * 60 + pixels * 120 + 400_000_000
-    return max(1_000_000_000, painting)
+    return max(MAX_CELLS * 85, painting)
 
 
 @stage(
@@ -179,25 +187,37 @@ def _memory(params: Params, inputs: Mapping[str, Any]) -> int:
     needs={"fast_simplification": "fast-simplification", "xatlas": "xatlas"},
 )
 def mesh_textured(
-    cloud: One[PointCloud],
     ranges: All[RangeMap],
+    measured: All[RangeMap] | None,
+    planes: One[Structure] | None,
     poses: One[Poses],
     images: All[Panorama],
     params: TexturedParams,
     ctx: Context,
 ) -> Files:
-    """Write the surface of the fused cloud with a texture from the panoramas, as mesh_textured.glb and .obj.
+    """Write the surface in the range maps with a texture from the panoramas, as mesh_textured.glb and .obj.
 
-    The surface of `export.mesh` is simplified and unwrapped. Each panorama gives its colours to the texels that it
-    sees; masked pixels never do. Texels that no panorama sees are filled with the colours around them, and are black in
+    The surface is the zero of the signed distances of all panoramas, weighted by their accuracy; where ranges of
+    `measured` are confirmed and more accurate, they are used instead. It lies on the planes of `planes`, which continue
+    where nobody looked. It is simplified and unwrapped. Each panorama gives its colours to the texels that it sees;
+    masked pixels never do. Texels that no panorama sees are filled with the colours around them, and are black in
     mesh_textured_seen.png. Further groups of poses, each in its own frame, are mesh_textured_1.glb …
     """
     files: dict[str, Path] = {}
-    for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
+    for number, own in enumerate(split_groups(poses)):
         folder = ctx.scratch / str(number)
         folder.mkdir()
+        views = []
+        for idx, name in enumerate(own.names):
+            if name not in images or name not in ranges:
+                continue
+            accurate = measured.get(name) if measured is not None else None
+            best = ranges[name] if accurate is None else most_certain(ranges[name], accurate)
+            views.append(MeshView(own.cam_from_world(idx), images[name], best))
+        chosen = np.flatnonzero(planes.group_idx == number) if planes is not None else np.zeros(0, np.intp)
+        found = (planes.normals_in_world[chosen], planes.offsets[chosen]) if planes is not None else NO_PLANES
         try:
-            made = textured_mesh(group, (own, images, ranges), params, folder=folder, ctx=ctx)
+            made = textured_mesh(views, found, params, ctx=ctx)
         except InputError as error:
             if not number:
                 raise
@@ -215,45 +235,50 @@ def mesh_textured(
     return Files(files)
 
 
-def textured_mesh(
-    cloud: PointCloud,
-    views: tuple[Poses, Mapping[str, Panorama], Mapping[str, RangeMap]],
-    params: TexturedParams,
-    *,
-    folder: Path,
-    ctx: Context,
-) -> TexturedMesh:
-    """Return the textured surface of the cloud of one group of panoramas."""
-    # Finer cells are noise: the mesh is simplified afterwards. They make many small charts, which take long to unwrap.
-    solved, _ = solved_mesh(cloud, params, folder, deepest=9)
-    poses, images, ranges = views
-    names = [name for name in poses.names if name in images]
+@dataclass(frozen=True, eq=False)
+class MeshView:
+    """A panorama with its ranges."""
+
+    cam_from_world: Rigid3
+    image: Panorama
+    range_map: RangeMap
+
+    def load(self) -> PaintView:
+        """Return the panorama with its pixels."""
+        fits = self.range_map.range.shape == self.image.size_hw
+        return PaintView(
+            self.cam_from_world, self.image.load(), self.image.load_mask(), self.range_map if fits else None
+        )
+
+
+def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedParams, *, ctx: Context) -> TexturedMesh:
+    """Return the textured surface that one group of panoramas shows."""
+    volume = empty_volume([(view.range_map, view.cam_from_world) for view in views], cell=params.cell)
+    for view in views:
+        size = view.range_map.range.shape
+        valid = view.image.load_mask() if view.image.size_hw == size else np.ones(size, np.bool_)
+        volume.add(view.range_map, view.cam_from_world, valid, threads=ctx.threads)
+    volume.carve()
+    volume.continue_planes(planes)
+    volume.close_gaps()
+    vertices, faces = volume.surface()
+    vertices, moved = on_planes((vertices, faces), planes, reach=0.75 * volume.cell)
+    faces = seen_triangles((vertices, faces), [view.cam_from_world for view in views], moved, threads=ctx.threads)
+    whole = Mesh(vertices, np.zeros(vertices.shape, np.uint8), faces)
+    whole = without_crumbs(whole, smallest_share=params.smallest_part)
+    if not len(whole.faces):
+        raise InputError("the mesh has no faces: the range maps show no common surface. Check the poses and ranges")
+    vertices, faces = decimated(whole.vertices_in_world, whole.faces, triangles=params.triangles)
 
     def load(idx: int) -> PaintView:
-        name = names[idx]
-        image, range_map = images[name], ranges.get(name)
-        if range_map is not None and range_map.range.shape != image.size_hw:
-            range_map = None
-        pose = poses.cam_from_world(poses.names.index(name))
-        return PaintView(pose, image.load(), image.load_mask(), range_map)
+        return views[idx].load()
 
-    space = FreeSpace(solved.vertices_in_world)
-    for name in names:
-        if name in ranges:
-            space.add(ranges[name], poses.cam_from_world(poses.names.index(name)), images[name].load_mask())
-    free = space.free()
-    solved = used_part(solved, solved.faces[~free[solved.faces].any(axis=1)])
-    solved = without_crumbs(solved, smallest_share=params.smallest_part)
-    if not len(solved.faces):
-        raise InputError("the mesh has no faces: the panoramas look through all of them. Check the poses and ranges")
-    vertices, faces = decimated(solved.vertices_in_world, solved.faces, triangles=params.triangles)
-
-    balance = balanced_views(vertices, faces, load, views=len(names), threads=ctx.threads)
+    balance = balanced_views(vertices, faces, load, views=len(views), threads=ctx.threads)
     if not balance.density > 0:
-        raise InputError(
-            "no panorama sees the mesh, so it has no texture. Check the masks and the poses, or lower `trim`"
-        )
-    atlas = unwrapped(vertices, faces, texels_per_unit=balance.density * params.detail, max_px=params.texture_px)
+        raise InputError("no panorama sees the mesh, so it has no texture. Check the masks and the poses")
+    region = plane_of_faces((vertices, faces), planes, tolerance=0.05 * volume.cell)
+    density = balance.density * params.detail
+    atlas = unwrapped(vertices, faces, texels_per_unit=density, max_px=params.texture_px, region=region)
     return textured(vertices, faces, atlas, load=load, balance=balance, threads=ctx.threads)
 
 
