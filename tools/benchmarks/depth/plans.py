@@ -37,7 +37,7 @@ from pano_mvs.scene import Files, PointCloud, RangeMap
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.exports.floor_plan import FloorPlanParams, floor_plan
 from tools.benchmarks.captures import SCRATCH, Capture, read_capture
-from tools.benchmarks.dense_chain import DenseChain, context, true_poses
+from tools.benchmarks.dense_chain import DenseChain, context, true_poses, with_true_points
 from tools.benchmarks.depth.houses import read_house
 from tools.benchmarks.poses.tours.houses import HOUSES
 from tools.benchmarks.poses.tours.plan import WALL, rooms_of
@@ -186,9 +186,9 @@ class Dense:
 
 def dense(chain: DenseChain, capture: Capture, *, width: int) -> Dense:
     """Return what the dense stages make of a capture, from a file if they have run before."""
-    path = SCRATCH / "plans" / f"{capture.name}_{width}_{chain.key()}.pkl"
+    path = SCRATCH / "plans" / f"{capture.name}_{width}_{chain.key()}_points.pkl"
     if not path.is_file():
-        run = chain.run(capture)
+        run = chain.run(capture, poses=with_true_points(true_poses(capture), capture.ranges))
         planes = next(
             (item for items in run.results.values() for item in items.values() if isinstance(item, Structure)), None
         )
