@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, range_view
+from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
 from pano_mvs.algorithms.floor_plan.storey_plan import StoreyPlan, plan_storey
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.scene import RangeMap
 from tests.algorithms.floor_plan_rooms import (
     DOOR,
     HEIGHT,
@@ -26,6 +30,10 @@ from tests.algorithms.floor_plan_rooms import (
 ROOM = Storey(0.0, HEIGHT, (0,))
 EXTENT = Extent(-0.2, 5.2, 0.01, (540, 640))
 CAM_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def pixel_at(x: float, y: float) -> tuple[int, int]:
+    return int((EXTENT.top - y) / EXTENT.pixel), int((x - EXTENT.left) / EXTENT.pixel)
 
 
 def camera(center: FloatArray, turn_deg: float = 0.0) -> Rigid3:
@@ -61,20 +69,27 @@ def plan_of_cloud(cloud: RoomCloud, *places: FloatArray) -> StoreyPlan:
     cameras = np.array([(*place, 1.5) for place in places])
     views = CloudViews([camera(center) for center in cameras])
     views.add(cloud.points, cloud.normals)
-    evidence = evidence_around(cloud.points[:, :2])
-    for number in range(len(cameras)):
-        evidence.add(views.view(number))
-    return plan_storey(evidence, [], cameras=cameras[:, :2], min_share=0.4)
+    return planned([views.view(number) for number in range(len(cameras))], cloud.points[:, :2], cameras[:, :2])
 
 
-def plan_of_flat(angle_deg: float, cameras: FloatArray | None = None) -> tuple[StoreyPlan, FloatArray]:
+def planned(views: Sequence[PlanView], xy: FloatArray, cameras: FloatArray) -> StoreyPlan:
+    evidence = evidence_around(xy)
+    for view in views:
+        evidence.add(view)
+    return plan_storey(evidence, [], views=lambda: views, cameras=cameras, min_share=0.4)
+
+
+def plan_of_flat(
+    angle_deg: float,
+    cameras: FloatArray | None = None,
+    change: Callable[[RangeMap], RangeMap] = lambda range_map: range_map,
+) -> tuple[StoreyPlan, FloatArray]:
     turn = rotation(angle_deg)
     places = np.array([(1.0, 1.5), (3.0, 2.2), (5.5, 1.0)]) @ turn.T
-    evidence = evidence_around(np.array([(0.0, -1.0), (7.2, 3), (0, 3), (7.2, -1)]) @ turn.T)
-    for number, place in enumerate(places):
-        cam = camera(np.array([*place, 1.5]), 70.0 * number)
-        evidence.add(range_view(flat_ranges(cam, turn=turn), cam))
-    return plan_storey(evidence, [], cameras=places if cameras is None else cameras, min_share=0.4), turn
+    cams = [camera(np.array([*place, 1.5]), 70.0 * number) for number, place in enumerate(places)]
+    views = [range_view(change(flat_ranges(cam, turn=turn)), cam) for cam in cams]
+    corners = np.array([(0.0, -1.0), (7.2, 3), (0, 3), (7.2, -1)]) @ turn.T
+    return planned(views, corners, places if cameras is None else cameras), turn
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 31.0])
@@ -130,6 +145,25 @@ def test_a_window_does_not_reach_the_floor() -> None:
     assert np.sort(window.ends[:, 0]) == pytest.approx(WINDOW, abs=0.15)
 
 
+def test_a_window_that_shows_the_sky_is_a_window() -> None:
+    def with_sky(range_map: RangeMap) -> RangeMap:
+        far = range_map.range > 6.5
+        return replace(range_map, range=np.where(far, np.nan, range_map.range).astype(np.float32),
+                       confidence=np.where(far, 0, range_map.confidence).astype(np.uint8), sky=far)  # fmt: skip
+
+    plan, _ = plan_of_flat(0.0, change=with_sky)
+    assert sorted(one.kind for one in plan.openings) == ["door", "window"]
+
+
+def test_what_was_filled_shows_no_opening() -> None:
+    def filled(range_map: RangeMap) -> RangeMap:
+        return replace(range_map, confidence=np.full(range_map.range.shape, 60, np.uint8))
+
+    plan, _ = plan_of_flat(0.0, change=filled)
+    assert len(plan.rooms) == 2
+    assert not plan.openings
+
+
 def test_furniture_is_not_a_wall() -> None:
     """A cupboard that ends below the ceiling."""
     cloud = room_cloud()
@@ -144,12 +178,26 @@ def test_furniture_is_not_a_wall() -> None:
     assert len(plan.walls) == 6
 
 
+def test_one_view_does_not_see_through_a_wall_that_two_see() -> None:
+    cams = [camera(np.array([*place, 1.5])) for place in ((1.0, 1.5), (3.0, 2.2), (2.0, 1.0))]
+    maps = [flat_ranges(cam, turn=np.eye(2)) for cam in cams]
+    maps[2] = replace(maps[2], range=3 * maps[2].range)
+    views = [range_view(one, cam) for one, cam in zip(maps, cams, strict=True)]
+    evidence = evidence_around(np.array([(-2.0, -1), (7.2, 3)]))
+    for view in views:
+        evidence.add(view)
+    (inside, outside), _ = evidence.extent.cells(np.array([(0.5, 1.5), (-1.0, 1.5)]))
+    assert evidence.free[[inside, outside]].tolist() == [6, 2]
+    evidence.recount(views)
+    assert evidence.free[[inside, outside]].tolist() == [6, 0]
+
+
 def test_what_no_camera_stands_in_is_no_room() -> None:
     assert len(plan_of_flat(0.0, cameras=np.array([[1.0, 1.5]]))[0].rooms) == 1
 
 
 def test_without_views_there_is_no_plan() -> None:
-    plan = plan_storey(evidence_around(np.array([(0.0, 0), (1, 1)])), [], cameras=np.zeros((1, 2)), min_share=0.4)
+    plan = planned([], np.array([(0.0, 0), (1, 1)]), np.zeros((1, 2)))
     assert not any((plan.rooms, plan.walls, plan.openings, plan.solids))
 
 
@@ -170,12 +218,9 @@ def test_the_order_and_the_parts_of_the_cloud_do_not_matter() -> None:
 
 def test_the_orthophoto_shows_what_is_highest_below_the_cut() -> None:
     photo, known = orthophoto(room_cloud(density=3000)).picture()
-    column, row = (EXTENT.pixels_from_xy(np.array([1.6, 1.4]))).astype(int)
-    assert photo[row, column].tolist() == [30, 30, 220]  # the table
-    column, row = (EXTENT.pixels_from_xy(np.array([5.0, 1.5]))).astype(int)
-    assert photo[row, column].tolist() == [90, 120, 90]  # the floor, not the ceiling
-    column, row = (EXTENT.pixels_from_xy(np.array([5.0, 4.0]))).astype(int)
-    assert not known[row, column]  # outside of the L
+    assert photo[pixel_at(1.6, 1.4)].tolist() == [30, 30, 220]  # the table
+    assert photo[pixel_at(5.0, 1.5)].tolist() == [90, 120, 90]  # the floor, not the ceiling
+    assert not known[pixel_at(5.0, 4.0)]  # outside of the L
 
 
 def test_one_storey_with_its_cameras() -> None:

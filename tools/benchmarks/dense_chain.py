@@ -9,13 +9,15 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.stage import INDEX_PORT, Cardinality, Port
@@ -185,6 +187,38 @@ def true_poses(capture: Capture) -> Poses:
     """Return the true poses of a capture, without points; the worlds of all captures with truth have y down."""
     return Poses.without_points(
         capture.poses, frame="the truth's, y down along gravity", scale="the truth's", metric=True
+    )
+
+
+def with_true_points(poses: Poses, ranges: Mapping[str, NDArray[np.float32]], *, points: int = 400) -> Poses:
+    """Return poses with true surface points and the views that see them: as many random ones of each view, if two do.
+
+    Without points, sources are chosen by distance, and may be behind walls and floors.
+    """
+    places, bearings, seen = [np.zeros((0, 3))], [np.zeros((0, 3))], []
+    for name, pose in poses.cameras.items():
+        rays = np.random.default_rng([0xB1, len(places)]).normal(size=(points, 3))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        distance = ranges[name][pixels_containing(rays, ranges[name].shape)].astype(np.float64)
+        places.append(pose.inverse().apply(rays[distance > 0] * distance[distance > 0, None]))
+    world = np.concatenate(places)
+    for idx, (name, pose) in enumerate(poses.cameras.items()):
+        in_cam = pose.apply(world)
+        away = np.linalg.norm(in_cam, axis=1)
+        visible = np.abs(ranges[name][pixels_containing(in_cam, ranges[name].shape)] / away - 1) < 0.02
+        bearings.append(in_cam[visible] / away[visible, None])
+        seen.append(np.column_stack([np.flatnonzero(visible), np.full(visible.sum(), idx)]))
+    tracks = np.concatenate(seen).astype(np.int32)
+    kept = np.bincount(tracks[:, 0], minlength=len(world)) > 1
+    used = kept[tracks[:, 0]]
+    return replace(
+        poses,
+        points_in_world=world[kept],
+        point_colors_rgb=np.zeros((kept.sum(), 3), np.uint8),
+        point_errors_rad=np.zeros(kept.sum(), np.float32),
+        track_point_idx=(np.cumsum(kept, dtype=np.int32) - 1)[tracks[used, 0]],
+        track_image_idx=tracks[used, 1],
+        track_bearings=np.concatenate(bearings)[used],
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,19 @@ from pano_mvs.algorithms.structure.view import on_grid, stride_of
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 _CLOUD_SIZE = 90, 180
+_TURNS = 720
+
+SURE = UNCONFIRMED_UNCERTAINTY / 3
+"""Relative standard deviation up to which ranges count that no view confirms."""
+
 LAYERS = 16
 """Number of layers between floor and ceiling."""
+
+TOP = slice(LAYERS - 2, LAYERS)
+"""The layers above doors and windows, in which rooms are told apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +37,28 @@ class PlanView:
     """The ranges of a view with z up.
 
     `center`: (3,). `cam_from_plan`: (3, 3). `free`: (h, w) ranges up to which nothing is in the way, NaN where unknown.
-    `points`: (N, 3) places on surfaces. `normals`: (N, 3) of the surfaces, NaN where unknown.
+    `seen`: (h, w) ranges that were seen, not filled, infinite in the sky, NaN elsewhere. `errors`: (h, w) their
+    relative standard deviations. `points`: (N, 3) places on surfaces. `normals`: (N, 3) of the surfaces, NaN where
+    unknown.
     """
 
     center: FloatArray
     cam_from_plan: FloatArray
     free: FloatArray
+    seen: FloatArray
+    errors: FloatArray
     points: FloatArray
     normals: FloatArray
+
+    def pixels_of(self, places: FloatArray) -> tuple[FloatArray, tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Return the distances of places (..., 3), and the rows and columns where they are seen, (...,) each."""
+        way = places - self.center
+        return np.linalg.norm(way, axis=-1), pixels_containing(way @ self.cam_from_plan.T, self.free.shape)
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lower and the upper corner (2,) of what it sees, except what is far from the rest."""
+        low, high = np.quantile(self.points[:, :2], [0.005, 0.995], axis=0)
+        return low, high
 
 
 def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
@@ -44,22 +66,26 @@ def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
     height, width = range_map.range.shape
     stride = stride_of((height, width))
     given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
-    ranges, confidence = on_grid(range_map.range, stride).astype(np.float64), on_grid(range_map.confidence, stride)
+    every, confidence = on_grid(range_map.range, stride).astype(np.float64), on_grid(range_map.confidence, stride)
     error = np.where(confidence >= CONSISTENT_CONFIDENCE[0], 0.0, UNCONFIRMED_UNCERTAINTY)
     if range_map.uncertainty is not None:
-        known = on_grid(range_map.uncertainty, stride).astype(np.float64)
-        error = np.where(np.isnan(known), UNCONFIRMED_UNCERTAINTY, known)
+        given_error = on_grid(range_map.uncertainty, stride).astype(np.float64)
+        error = np.where(np.isnan(given_error), UNCONFIRMED_UNCERTAINTY, given_error)
     # Confirmed neither by views nor by planes.
-    ranges[(error > UNCONFIRMED_UNCERTAINTY / 3) & (confidence < CONSISTENT_CONFIDENCE[0])] = np.nan
+    uncertain = (error > SURE) & (confidence < CONSISTENT_CONFIDENCE[0])
+    ranges = np.where(uncertain, np.nan, every)
     normals = on_grid(normals_from_range(range_map, given=given), stride)
-    seen = np.isfinite(ranges)
+    known = np.isfinite(ranges)
     rays = on_grid(ray_grid((height, width)), stride)
+    sky = np.zeros_like(known) if range_map.sky is None else on_grid(range_map.sky, stride)
     return PlanView(
         cam_from_plan.center,
         cam_from_plan.rotation,
         ranges * (1 - 2 * error),
-        cam_from_plan.inverse().apply(rays[seen] * ranges[seen][:, None]),
-        normals[seen] @ cam_from_plan.rotation,
+        np.where(sky, np.inf, np.where(confidence < WEAK_CONFIDENCE[0], np.nan, every)),
+        np.where(sky, 0.0, error),
+        cam_from_plan.inverse().apply(rays[known] * ranges[known][:, None]),
+        normals[known] @ cam_from_plan.rotation,
     )
 
 
@@ -93,7 +119,8 @@ class CloudViews:
         seen = self._seen[number].astype(np.float64)
         ranges = np.where(np.isinf(seen[..., 6]), np.nan, seen[..., 6])
         known = seen[np.isfinite(ranges)]
-        return PlanView(self._cams[number].center, self._cams[number].rotation, ranges, known[:, :3], known[:, 3:6])
+        cam, exact = self._cams[number], np.zeros_like(ranges)
+        return PlanView(cam.center, cam.rotation, ranges, ranges, exact, known[:, :3], known[:, 3:6])
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +142,12 @@ class WallCells:
 
 
 class Evidence:
-    """How many views see through each cell of each layer, and how many see a vertical surface there."""
+    """How many views see a vertical surface in each cell of each layer, and how many see through the top layers."""
 
     def __init__(self, storey: Storey, extent: Extent) -> None:
         self.storey, self.extent = storey, extent
         count = extent.size_hw[0] * extent.size_hw[1]
-        self.free, self.hits = (np.zeros((count, LAYERS), np.uint16) for _ in range(2))
+        self.free, self.hits = np.zeros(count, np.int32), np.zeros((count, LAYERS), np.uint16)
         self._sums = np.zeros((count, 5))  # x, y, their normal's, number
 
     def add(self, view: PlanView) -> None:
@@ -136,19 +163,32 @@ class Evidence:
         values = np.column_stack([view.points[inside, :2], view.normals[inside, :2], np.ones(len(chosen))])
         for column in range(5):
             self._sums[:, column] += np.bincount(chosen, values[:, column], len(self._sums))
-        self._add_free(view)
+        self._add_free(view, None)
 
-    def _add_free(self, view: PlanView) -> None:
-        centers = self.extent.centers()
-        low, high = np.quantile(view.points[:, :2], [0.01, 0.99], axis=0)
+    def recount(self, views: Iterable[PlanView]) -> None:
+        """Count again what the views see through, but not beyond walls that more of them see than see through."""
+        walls = np.flatnonzero(self.hits[:, TOP].sum(axis=1) >= np.maximum(self.free, 1))
+        self.free[:] = 0
+        for view in views:
+            self._add_free(view, walls)
+
+    def _add_free(self, view: PlanView, walls: NDArray[np.intp] | None) -> None:
+        """Count the cells of top layers that a view sees through, before walls."""
+        if not len(view.points):
+            return
+        centers, (low, high) = self.extent.centers(), view.box()
         near = np.flatnonzero(((centers >= low) & (centers <= high)).all(axis=1))
-        for layer in range(LAYERS):
-            height = self.storey.floor + (layer + 0.5) * self._layer
-            way = np.column_stack([centers[near], np.full(len(near), height)]) - view.center
-            row, column = pixels_containing(way @ view.cam_from_plan.T, view.free.shape)
-            beyond = view.free[row, column] - np.linalg.norm(way, axis=1)
+        if walls is not None:
+            until, (turn, away) = np.full(_TURNS, np.inf), _polar(centers[walls] - view.center[:2])
+            np.minimum.at(until, turn, away)
+            until = np.min([np.roll(until, step) for step in (-1, 0, 1)], axis=0)  # gaps between near cells
+            turn, away = _polar(centers[near] - view.center[:2])
+            near = near[away < until[turn]]
+        for top in range(LAYERS)[TOP]:
+            height = self.storey.floor + (top + 0.5) * self._layer
+            away, pixels = view.pixels_of(np.column_stack([centers[near], np.full(len(near), height)]))
             with np.errstate(invalid="ignore"):
-                self.free[near[beyond > 1.5 * self.extent.pixel], layer] += 1
+                self.free[near[view.free[pixels] - away > 1.5 * self.extent.pixel]] += 1
 
     @property
     def _layer(self) -> float:
@@ -162,3 +202,9 @@ class Evidence:
         return WallCells(
             sums[:, :2] / sums[:, 4:], sums[:, 2:4] / lengths[:, None], self.hits[used] > 0, self.extent.pixel
         )
+
+
+def _polar(way: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the directions of ways (N, 2), in parts of a turn, and their lengths."""
+    turn = np.arctan2(way[:, 1], way[:, 0]) / (2 * np.pi)
+    return np.floor(turn * _TURNS).astype(np.int64) % _TURNS, np.hypot(way[:, 0], way[:, 1])

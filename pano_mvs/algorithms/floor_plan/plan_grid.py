@@ -142,10 +142,6 @@ class Extent:
         x, y = self.left + (np.arange(columns) + 0.5) * self.pixel, self.top - (np.arange(rows) + 0.5) * self.pixel
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
-    def pixels_from_xy(self, xy: FloatArray) -> FloatArray:
-        """Return positions (..., 2) as column and row; (0, 0) is the upper left corner of the grid."""
-        return np.stack([xy[..., 0] - self.left, self.top - xy[..., 1]], axis=-1) / self.pixel
-
 
 class Orthophoto:
     """The highest point below a cut in each pixel of one storey.

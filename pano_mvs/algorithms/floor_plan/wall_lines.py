@@ -50,24 +50,24 @@ def wall_lines(cells: WallCells, known: Sequence[Line], *, min_area: float) -> l
     found: list[Line] = []
     held: list[WallCells] = []
 
-    def take(line: Line) -> bool:
+    def take(line: Line) -> None:
         nonlocal cells
         near = cells.only(line.holds(cells, within=_NEAR_CELLS))
-        taken = line.holds(cells, within=_TAKEN_CELLS)
         if near.layers.sum() >= max(min_area, 1):
             found.append(line)
             held.append(near)
-        elif line in known:
-            return False
-        cells = cells.only(~taken)
-        return bool(taken.any())
+            cells = cells.only(~line.holds(cells, within=_TAKEN_CELLS))
 
     for line in known:
         take(line)
-    while len(cells.xy):
-        line, support = _strongest(cells)
-        if support < min_area or not take(_fitted(line, cells)):
-            break
+    left = 0
+    while len(cells.xy) != left:
+        left = len(cells.xy)
+        if left:
+            line, support = _strongest(cells)
+            if support >= min_area:
+                take(_fitted(line, cells))
+                cells = cells.only(~line.holds(cells, within=_TAKEN_CELLS))
     return _aligned(found, held)
 
 
@@ -78,7 +78,9 @@ def _aligned(lines: Sequence[Line], held: Sequence[WallCells]) -> list[Line]:
     result = []
     for line, cells, angle in zip(lines, held, angles, strict=True):
         turns = (angles - angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
-        near = weights * (1 - (turns / np.radians(1.0)) ** 2).clip(0) ** 2
+        across, along = (float(np.std(cells.xy @ one)) for one in (line.normal, line.along))
+        within = max(np.radians(1.0), 3 * across / max(along, cells.cell))
+        near = weights * (1 - (turns / within) ** 2).clip(0) ** 2
         turn = angle + float(near @ turns / near.sum())
         normal = np.array([np.cos(turn), np.sin(turn)])
         middle = np.average(cells.xy, axis=0, weights=cells.layers.sum(axis=1))

@@ -39,7 +39,7 @@ from pano_mvs.scene.upright import world_up, z_up_from_world
 
 Points = tuple[FloatArray, FloatArray, NDArray[np.uint8]]
 
-_EDGE_QUANTILE = 0.02
+_EDGE_QUANTILE = 0.01
 _MARGIN = 0.03
 _MAX_SIDE_PX = 4096
 
@@ -71,9 +71,13 @@ class FloorPlanParams(Params):
         return tuple(dict.fromkeys(formats))
 
 
-def plan_memory_bytes(params: FloorPlanParams, _: Mapping[str, Any]) -> int:
-    """Return the memory for the grids of one storey, 40 bytes a pixel, and for parts of the cloud."""
-    return 500_000_000 + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+def plan_memory_bytes(params: FloorPlanParams, inputs: Mapping[str, Any]) -> int:
+    """Return the memory for the grids of one storey, 40 bytes a pixel, for what cameras see, and parts of the cloud."""
+    return (
+        500_000_000
+        + 500_000 * len(inputs["poses"].names)
+        + 40 * (_MAX_SIDE_PX if params.pixel else params.width_px) ** 2
+    )
 
 
 @stage("export.floor_plan", memory=plan_memory_bytes)
@@ -168,7 +172,7 @@ class _GroupPlan:
         plan_from_world = Rigid3(self.turn, np.zeros(3))
         cams = [self.poses.cam_from_world(idx) @ plan_from_world.inverse() for idx in range(len(self.poses.names))]
         if ranges:
-            empty = PlanView(np.zeros(3), np.eye(3), np.full((1, 2), np.nan), np.zeros((0, 3)), np.zeros((0, 3)))
+            empty = PlanView(np.zeros(3), np.eye(3), *np.full((3, 1, 2), np.nan), *np.zeros((2, 0, 3)))
             names = self.poses.names
             return lambda idx: range_view(ranges[names[idx]], cams[idx]) if names[idx] in ranges else empty
         views = CloudViews(cams)
@@ -210,7 +214,13 @@ class _GroupPlan:
         for idx in storey.cameras:
             evidence.add(self.view(idx))
         cameras = self.centers[list(storey.cameras), :2]
-        plan = plan_storey(evidence, self.known, cameras=cameras, min_share=self.params.min_wall_share)
+        plan = plan_storey(
+            evidence,
+            self.known,
+            views=lambda: map(self.view, storey.cameras),
+            cameras=cameras,
+            min_share=self.params.min_wall_share,
+        )
         places = self.centers[:, :2].tolist()
         names = {self.poses.names[idx]: (places[idx][0], places[idx][1]) for idx in storey.cameras}
         rows, columns = extent.size_hw

@@ -9,7 +9,9 @@ so that another run measures a change of the plan alone.
 * false: share of the drawn length without a true wall within 30 cm and 5°;
 * rooms: those whose drawn outline overlaps with the true one by 90 %, of all that have a camera, and the median error
   of their areas;
-* doors: openings of the true plan that are drawn, within 30 cm, of all, and how many others are drawn.
+* doors: openings of the true plan that are drawn, within 30 cm, of all, and how many others are drawn, at no door or
+  glass door within 60 cm;
+* windows: the same of windows.
 
 The walls of a house are those of the rooms in which a camera stands. Those of a capture are the places where its true
 ranges show vertical surfaces at 40 % of the height of the storey; their angle is not compared.
@@ -37,7 +39,7 @@ from pano_mvs.scene import Files, PointCloud, RangeMap
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.stages.exports.floor_plan import FloorPlanParams, floor_plan
 from tools.benchmarks.captures import SCRATCH, Capture, read_capture
-from tools.benchmarks.dense_chain import DenseChain, context, true_poses
+from tools.benchmarks.dense_chain import DenseChain, context, true_poses, with_true_points
 from tools.benchmarks.depth.houses import read_house
 from tools.benchmarks.poses.tours.houses import HOUSES
 from tools.benchmarks.poses.tours.plan import WALL, rooms_of
@@ -90,6 +92,7 @@ class TrueStorey:
     walls: Samples
     rooms: list[tuple[float, float, float, float]]
     doors: list[FloatArray]  # (2, 2) ends, in the middle of the wall
+    windows: list[FloatArray]
     parallel: bool = True
 
 
@@ -112,10 +115,13 @@ def true_storeys(name: str) -> list[TrueStorey]:
                     if b - a > _STEP and a < end and b > start:
                         ends = np.array([[a, line], [b, line]])
                         segments.append(ends if axis == 0 else ends[:, ::-1])
-        middles = [
-            np.array([[one.start, one.line], [one.end, one.line]])[:, :: 1 if one.axis == 0 else -1] for one in doors
-        ]
-        result.append(TrueStorey(floor, Samples.of(segments), rectangles, middles))
+        middles = {
+            kind: [
+                np.array([[one.start, one.line], [one.end, one.line]])[:, :: 1 if one.axis == 0 else -1] for one in ones
+            ]
+            for kind, ones in (("doors", doors), ("windows", [one for one in own if one not in doors]))
+        }
+        result.append(TrueStorey(floor, Samples.of(segments), rectangles, middles["doors"], middles["windows"]))
     return result
 
 
@@ -136,7 +142,7 @@ def shown_storey(capture: Capture, storey: dict[str, Any], turn: FloatArray) -> 
         cells |= set(map(tuple, np.column_stack([columns, layers]).tolist()))
     columns, counts = np.unique(np.array(sorted(cells))[:, :2], axis=0, return_counts=True)
     xy = (columns[counts >= 0.4 * 32] + 0.5) * 2 * _STEP
-    return TrueStorey(low, Samples(xy, np.zeros_like(xy)), [], [], parallel=False)
+    return TrueStorey(low, Samples(xy, np.zeros_like(xy)), [], [], [], parallel=False)
 
 
 def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[str, FloatArray]:
@@ -149,18 +155,21 @@ def compared(true: TrueStorey, walls: Samples, drawn: dict[str, Any]) -> dict[st
         best = max((_overlap(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), one) for one in outlines), default=0)
         matched += best > 0.9
         areas += [abs(best - 1)] if best > 0.9 else []
-    centers = [np.mean(door, axis=0) for door in true.doors]
-    found = [np.mean(one["ends"], axis=0) for one in drawn.get("openings", []) if one["kind"] != "window"]
-    hit = [any(np.linalg.norm(one - other) < _NEAR for other in found) for one in centers]
-    wrong = [not any(np.linalg.norm(one - other) < 2 * _NEAR for other in centers) for one in found]
+    openings = {}
+    for kind, those in (("door", true.doors), ("window", true.windows)):
+        # A glass door to a balcony may be drawn as either.
+        every = [np.mean(one, axis=0) for one in ([*those, *true.windows] if kind == "door" else those)]
+        found = [np.mean(one["ends"], axis=0) for one in drawn.get("openings", []) if one["kind"] == kind]
+        hit = [any(np.linalg.norm(one - other) < _NEAR for other in found) for one in every[: len(those)]]
+        wrong = [not any(np.linalg.norm(one - other) < 2 * _NEAR for other in every) for one in found]
+        openings[f"{kind}s"] = np.array([sum(hit), len(those), sum(wrong)])
     return {
         "found": np.isfinite(from_true),
         "errors": to_true[np.isfinite(to_true)],
         "false": ~np.isfinite(to_true),
         "rooms": np.array([matched, len(true.rooms)]),
         "areas": np.array(areas),
-        "doors": np.array([sum(hit), len(centers), sum(wrong)]),
-    }
+    } | openings
 
 
 def _overlap(first: FloatArray, second: FloatArray) -> float:
@@ -186,9 +195,9 @@ class Dense:
 
 def dense(chain: DenseChain, capture: Capture, *, width: int) -> Dense:
     """Return what the dense stages make of a capture, from a file if they have run before."""
-    path = SCRATCH / "plans" / f"{capture.name}_{width}_{chain.key()}.pkl"
+    path = SCRATCH / "plans" / f"{capture.name}_{width}_{chain.key()}_points.pkl"
     if not path.is_file():
-        run = chain.run(capture)
+        run = chain.run(capture, poses=with_true_points(true_poses(capture), capture.ranges))
         planes = next(
             (item for items in run.results.values() for item in items.values() if isinstance(item, Structure)), None
         )
@@ -224,7 +233,7 @@ def measured(capture: Capture, files: Files) -> dict[str, NDArray[Any]]:
     for missing in [one for one in true or [] if not any(one is shown for shown, _ in rows)]:
         rows.append((missing, compared(missing, Samples.of([]), {})))
     return {
-        key: np.sum(parts, axis=0) if key in ("rooms", "doors") else np.concatenate(parts)
+        key: np.sum(parts, axis=0) if key in ("rooms", "doors", "windows") else np.concatenate(parts)
         for key in rows[0][1]
         if (parts := [row[key] for _, row in rows])
     }
@@ -234,7 +243,7 @@ def figures(found: dict[str, NDArray[Any]]) -> tuple[str, ...]:
     """Return the columns of the table."""
     median, most = np.quantile(found["errors"], [0.5, 0.9]) * 100 if len(found["errors"]) else (np.nan, np.nan)
     area = 100 * np.median(found["areas"]) if len(found["areas"]) else np.nan
-    rooms, doors = found["rooms"], found["doors"]
+    rooms = found["rooms"]
     return (
         f"{100 * found['found'].mean():.1f} %",
         f"{median:.1f} cm",
@@ -242,7 +251,7 @@ def figures(found: dict[str, NDArray[Any]]) -> tuple[str, ...]:
         f"{100 * found['false'].mean():.1f} %",
         f"{rooms[0]} of {rooms[1]}",
         f"{area:.1f} %",
-        f"{doors[0]} of {doors[1]}, {doors[2]} wrong",
+        *("{} of {}, {} wrong".format(*found[kind]) for kind in ("doors", "windows")),
     )
 
 
@@ -264,4 +273,4 @@ def main() -> None:
         made = dense(chain, capture, width=given.width)
         files = planned(capture, made, settings, folder=SCRATCH / "plans" / capture.name)
         rows.append((capture.name, *figures(measured(capture, files))))
-    print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors"], rows)
+    print_table(["place", "found", "error", "90 %", "false", "rooms", "area", "doors", "windows"], rows)
