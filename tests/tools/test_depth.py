@@ -325,7 +325,7 @@ def test_the_true_plan_of_a_house_has_no_errors() -> None:
         assert count > 3
         assert figures(compared(storey, storey.walls, drawn)) == (
             *("100.0 %", "0.0 cm", "0.0 cm", "0.0 %"),
-            *(f"{count} of {count}", "0.0 %", f"{doors} of {doors}, 0 wrong"),
+            *(f"{count} of {count}", "0.0 %", f"{doors} of {doors}, 0 wrong", f"0 of {len(storey.windows)}, 0 wrong"),
         )
 
 
