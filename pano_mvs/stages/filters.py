@@ -158,7 +158,10 @@ def structure(
             image.load(),
             planes,
             cam_from_world=pose.cam_from_world,
-            sources=[OtherView(ranges, other.cam_from_world, source.load()) for ranges, other, source in used],
+            sources=[
+                OtherView(ranges, other.cam_from_world, source.load(), source.load_mask())
+                for ranges, other, source in used
+            ],
             group=pose.group,
             valid=image.load_mask(),
             **arguments_from(lay_structure, params),

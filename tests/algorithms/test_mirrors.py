@@ -90,6 +90,15 @@ def test_things_before_a_mirror_keep_their_ranges() -> None:
     np.testing.assert_array_equal(with_mirrors(own, structure(), scene.poses[1]).range[mirror], own.range[mirror])
     filled = replace(own, confidence=np.full(SIZE, 30, np.uint8))
     assert (with_mirrors(filled, structure(), scene.poses[1]).confidence == MIRROR_CONFIDENCE).any()
+    # A wall of another room that no ranges but the planes of the place show is in front of it as well.
+    wall = with_mirrors(filled, structure(), scene.poses[1], laid=np.ones(SIZE, np.bool_))
+    np.testing.assert_array_equal(wall.range[mirror], own.range[mirror])
+
+
+def test_the_sky_has_no_range_in_a_mirror() -> None:
+    sky = np.ones((8, 16), np.bool_)
+    own = replace(as_map(np.full((8, 16), np.nan)), sky=sky)
+    assert np.isnan(with_mirrors(own, structure(), Rigid3.identity()).range).all()
 
 
 def test_a_mirror_is_seen_from_its_front_alone() -> None:

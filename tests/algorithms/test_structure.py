@@ -12,12 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
-from pano_mvs.algorithms.structure.laid import OtherView
+from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.lay import lay_structure
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_of
 from pano_mvs.algorithms.structure.planes import find_structure
 from pano_mvs.algorithms.structure.skyline import Skyline
-from pano_mvs.algorithms.structure.view import HALF_DIFFERENCE, STEP_RAD, PlaneView, ScenePlane, plane_view
+from pano_mvs.algorithms.structure.view import (
+    HALF_DIFFERENCE,
+    STEP_RAD,
+    PlaneView,
+    ScenePlane,
+    grid_rows,
+    on_grid,
+    plane_view,
+)
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import Rigid3, ray_grid
@@ -244,6 +252,30 @@ def test_what_stands_before_a_wall_stays(box: Box, planes: Structure) -> None:
     area[60:70, 100:120] = True
     before = replace(own, range=np.where(area, 0.7 * own.range, own.range).astype(np.float32))
     np.testing.assert_array_equal(box.laid(planes, range_map=before).range[area], before.range[area])
+
+
+@pytest.mark.parametrize("height", [64, 256, 500, 512, 960, 1000, 1920])
+def test_the_grid_has_the_form_of_a_panorama(height: int) -> None:
+    """Every third column of 2,000 would be an odd number of columns, which no panorama has."""
+    pixels = np.arange(2 * height * height).reshape(height, 2 * height)
+    rows = grid_rows(height)
+    grid = on_grid(pixels, rows)
+    assert grid.shape == (rows, 2 * rows)
+    assert min(height, 256) <= rows < 512
+    assert rows == height or height // rows > 1
+    step = height // rows
+    if height % rows == 0:
+        np.testing.assert_array_equal(grid, pixels[step // 2 :: step, step // 2 :: step])
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_colours_of_masked_pixels_are_no_evidence(box: Box, masked: bool) -> None:
+    valid = np.full(SIZE, not masked)
+    view = OtherView(box.maps["1.png"], box.cams["1.png"], box.pictures["1.png"], valid)
+    laid = box.truth["0.png"].astype(np.float64)
+    seen = seen_by(view, box.cams["0.png"].center + ray_grid(SIZE) * laid[..., None])
+    found = laid_evidence(0.5 * laid, laid, picture=box.pictures["0.png"], views=[seen], error=0.08)["unlike"]
+    assert np.isnan(found).all() == masked
 
 
 @pytest.mark.parametrize("red", [True, False])

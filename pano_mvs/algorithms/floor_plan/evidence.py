@@ -13,7 +13,7 @@ from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Storey
 from pano_mvs.algorithms.fusion.view import normals_from_range
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
-from pano_mvs.algorithms.structure.view import on_grid, stride_of
+from pano_mvs.algorithms.structure.view import grid_rows, on_grid
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
@@ -64,20 +64,20 @@ class PlanView:
 def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
     """Return the view of a range map, on about 256 rows; ranges that nothing confirms count as unknown."""
     height, width = range_map.range.shape
-    stride = stride_of((height, width))
+    rows = grid_rows(height)
     given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
-    every, confidence = on_grid(range_map.range, stride).astype(np.float64), on_grid(range_map.confidence, stride)
+    every, confidence = on_grid(range_map.range, rows).astype(np.float64), on_grid(range_map.confidence, rows)
     error = np.where(confidence >= CONSISTENT_CONFIDENCE[0], 0.0, UNCONFIRMED_UNCERTAINTY)
     if range_map.uncertainty is not None:
-        given_error = on_grid(range_map.uncertainty, stride).astype(np.float64)
+        given_error = on_grid(range_map.uncertainty, rows).astype(np.float64)
         error = np.where(np.isnan(given_error), UNCONFIRMED_UNCERTAINTY, given_error)
     # Confirmed neither by views nor by planes.
     uncertain = (error > SURE) & (confidence < CONSISTENT_CONFIDENCE[0])
     ranges = np.where(uncertain, np.nan, every)
-    normals = on_grid(normals_from_range(range_map, given=given), stride)
+    normals = on_grid(normals_from_range(range_map, given=given), rows)
     known = np.isfinite(ranges)
-    rays = on_grid(ray_grid((height, width)), stride)
-    sky = np.zeros_like(known) if range_map.sky is None else on_grid(range_map.sky, stride)
+    rays = on_grid(ray_grid((height, width)), rows)
+    sky = np.zeros_like(known) if range_map.sky is None else on_grid(range_map.sky, rows)
     return PlanView(
         cam_from_plan.center,
         cam_from_plan.rotation,

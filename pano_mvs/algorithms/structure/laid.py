@@ -15,17 +15,22 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
+# Share of a cell of the grid that is not masked.
+_SHOWN = 0.999
+
 
 @dataclass(frozen=True, eq=False)
 class OtherView:
     """A view that planes are compared with.
 
-    `range_map`: (H, W). `cam_from_world`: its pose. `picture`: (H, W, 3) RGB.
+    `range_map`: (H, W). `cam_from_world`: its pose. `picture`: (H, W, 3) RGB. `valid`: (H, W) where it shows the place;
+    None: everywhere.
     """
 
     range_map: RangeMap
     cam_from_world: Rigid3
     picture: Picture
+    valid: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +38,7 @@ class Seen:
     """What another view shows at places, (h, w) each.
 
     `ratio`: its range there relative to the distance of the place; NaN where either is unknown. `confirmed`: whether
-    that range is confirmed. `colors`: (h, w, 3), its colours.
+    that range is confirmed. `colors`: (h, w, 3), its colours, NaN where it is masked.
     """
 
     ratio: FloatArray
@@ -49,7 +54,10 @@ def seen_by(view: OtherView, places: FloatArray) -> Seen:
     distance = np.linalg.norm(in_view, axis=-1)
     rays = in_view / distance[:, None]
     row, column = pixels_containing(rays, view.range_map.range.shape)
-    small = cv2.resize(view.picture, (width, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(view.picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float64)
+    if view.valid is not None:
+        shown = cv2.resize(view.valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        small[shown < _SHOWN] = np.nan
     ratio, confirmed = np.full(known.shape, np.nan), np.zeros(known.shape, np.bool_)
     colors = np.full(places.shape, np.nan)
     ratio[known] = view.range_map.range[row, column] / distance

@@ -7,7 +7,7 @@ range from it, which counts little where nothing was matched; the guided filter 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -22,7 +22,7 @@ from pano_mvs.algorithms.structure.laid import OtherView, Seen, laid_evidence, s
 from pano_mvs.algorithms.structure.laid_coefficients import FITTED
 from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
-from pano_mvs.algorithms.structure.view import ScenePlane, on_grid, plane_ranges, plane_view, stride_of
+from pano_mvs.algorithms.structure.view import ScenePlane, grid_rows, on_grid, plane_ranges, plane_view
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
@@ -95,7 +95,7 @@ def lay_structure(
     other[found.off] = FITTED.probabilities(evidence) < MIN_PROBABILITY
     label = _enlarged(np.where(found.seen_through | other, -1, found.label), size)
     agree = _enlarged(found.agree, size) > 0
-    laid = _chosen(found.on_planes, label)
+    laid = _chosen(found.ranges_on, label)
     with np.errstate(invalid="ignore"):
         error = np.abs(range_map.range / laid - 1)
     matched, confirmed = (range_map.confidence >= least[0] for least in (WEAK_CONFIDENCE, CONSISTENT_CONFIDENCE))
@@ -117,7 +117,7 @@ def lay_structure(
     )
     moved &= result.valid
     result = _described(result, moved, structure, planes=planes, label=label, rotation=cam_from_world.rotation)
-    return with_mirrors(result, structure, cam_from_world, group=group, valid=valid), float(
+    return with_mirrors(result, structure, cam_from_world, group=group, valid=valid, laid=moved), float(
         (moved * pixel_solid_angle(size)[:, None]).sum() / (4 * np.pi)
     )
 
@@ -128,7 +128,7 @@ class Proposal:
 
     Attributes:
         planes: positions in the structure.
-        on_planes: (H, W) range on each of them.
+        ranges_on: returns the ranges (H, W) on one of them.
         textured: (H, W) whether the picture has texture.
         explained: (H, W) relative error of the own range that its uncertainty explains.
         tolerance: (H, W) largest relative error of an own range that is on its plane.
@@ -142,7 +142,7 @@ class Proposal:
     """
 
     planes: NDArray[np.intp]
-    on_planes: Sequence[FloatArray]
+    ranges_on: Callable[[int], FloatArray]
     textured: Mask
     explained: FloatArray
     tolerance: FloatArray
@@ -169,7 +169,7 @@ def proposed_planes(
     textured_error, plain_error = errors
     planes = np.flatnonzero(structure.group_idx == group)
     size = range_map.range.shape[0], range_map.range.shape[1]
-    stride = stride_of(size)
+    rows = grid_rows(size[0])
     rays = ray_grid(size) @ cam_from_world.rotation
     textured = has_texture(guide)
     precise = textured & (range_map.confidence >= CONSISTENT_CONFIDENCE[0])
@@ -178,13 +178,14 @@ def proposed_planes(
     if range_map.uncertainty is not None:
         explained = np.maximum(3 * np.nan_to_num(range_map.uncertainty.astype(np.float64)), textured_error)
     tolerance = np.where(precise, np.minimum(explained, plain_error), plain_error)
-    on_planes = [
-        plane_ranges(
-            rays, cam_from_world.center, normal=structure.normals_in_world[idx], offset=float(structure.offsets[idx])
-        )
-        for idx in planes
-    ]
-    coarse_rays, coarse_planes = on_grid(rays, stride), [on_grid(ranges, stride) for ranges in on_planes]
+
+    def ranges_on(number: int, some: FloatArray = rays) -> FloatArray:
+        """Return the ranges of rays to a plane."""
+        normal, offset = structure.normals_in_world[planes[number]], float(structure.offsets[planes[number]])
+        return plane_ranges(some, cam_from_world.center, normal=normal, offset=offset)
+
+    coarse_rays = on_grid(rays, rows)
+    coarse_planes = [ranges_on(number, coarse_rays) for number in range(len(planes))]
     known = [
         ScenePlane(normal, float(structure.offsets[idx]), 1.0, uncertainty=1.0, is_level=abs(normal[1]) > 0.5)
         for idx, normal in zip(planes, structure.normals_in_world[planes], strict=True)
@@ -192,31 +193,31 @@ def proposed_planes(
     room = room_of(plane_view(range_map, lambda: guide, cam_from_world), known)
     label = _labels(
         coarse_planes,
-        on_grid(range_map.range, stride),
-        on_grid(range_map.confidence, stride),
+        on_grid(range_map.range, rows),
+        on_grid(range_map.confidence, rows),
         outlined=None if room is None else room_labels(room, coarse_rays, coarse_planes),
-        textured=on_grid(textured, stride),
-        tolerance=on_grid(tolerance, stride),
+        textured=on_grid(textured, rows),
+        tolerance=on_grid(tolerance, rows),
         guide=cv2.resize(guide, coarse_rays.shape[1::-1], interpolation=cv2.INTER_AREA),
     )
     sunk = np.zeros(size, np.bool_)
     floor = _floor(structure, planes)
     if floor is not None:
         sunk = _below(
-            on_planes[floor], range_map, error=plain_error, cosine=-rays @ structure.normals_in_world[planes[floor]]
+            ranges_on(floor), range_map, error=plain_error, cosine=-rays @ structure.normals_in_world[planes[floor]]
         )
-        label[on_grid(sunk, stride)] = floor
-    laid = _chosen(coarse_planes, label)
+        label[on_grid(sunk, rows)] = floor
+    laid = _chosen(coarse_planes.__getitem__, label)
     places = cam_from_world.center + coarse_rays * laid[..., None]
     views = [seen_by(view, places) for view in sources[:MAX_LAID_SOURCES]]
     agree, seen_through = _seen_by_others(views, laid.shape, error=plain_error)
-    own = on_grid(range_map.range, stride).astype(np.float64)
+    own = on_grid(range_map.range, rows).astype(np.float64)
     colors = cv2.resize(guide, laid.shape[::-1], interpolation=cv2.INTER_AREA)
     with np.errstate(invalid="ignore"):
-        off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, stride)) & ~on_grid(sunk, stride)
+        off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, rows)) & ~on_grid(sunk, rows)
     evidence = laid_evidence(own, laid, picture=colors, views=views, error=plain_error)
     return Proposal(
-        planes, on_planes, textured, explained, tolerance, sunk, label, laid, agree, seen_through, off, evidence
+        planes, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, seen_through, off, evidence
     )
 
 
@@ -278,12 +279,12 @@ def _labels(
     return label
 
 
-def _chosen(on_planes: Sequence[FloatArray], label: NDArray[np.int16]) -> FloatArray:
+def _chosen(ranges_on: Callable[[int], FloatArray], label: NDArray[np.int16]) -> FloatArray:
     """Return the range on each pixel's plane, NaN without one."""
     chosen = np.full(label.shape, np.nan)
-    for number, ranges in enumerate(on_planes):
+    for number in np.unique(label[label >= 0]).tolist():
         here = label == number
-        chosen[here] = ranges[here]
+        chosen[here] = ranges_on(number)[here]
     return chosen
 
 

@@ -68,11 +68,17 @@ def pane_ranges(rays: FloatArray, center: FloatArray, corners: FloatArray) -> Fl
 
 
 def with_mirrors(
-    range_map: RangeMap, structure: Structure, cam_from_world: Rigid3, *, group: int = 0, valid: Mask | None = None
+    range_map: RangeMap,
+    structure: Structure,
+    cam_from_world: Rigid3,
+    *,
+    group: int = 0,
+    valid: Mask | None = None,
+    laid: Mask | None = None,
 ) -> RangeMap:
     """Give what a view sees in mirrors the range of the pane, and `MIRROR_CONFIDENCE`.
 
-    Pixels with a range before the pane that was seen keep it.
+    Pixels with a range before the pane that was seen, or is on a plane, keep it, and the sky has none.
 
     Args:
         range_map: (H, W), the full sphere.
@@ -80,14 +86,17 @@ def with_mirrors(
         cam_from_world: pose of the view.
         group: of the poses of the view.
         valid: (H, W) pixels that may have a range; None: all.
+        laid: (H, W) pixels whose range is on a plane of the place; None: none is known to be.
     """
     corners = structure.mirror_corners[structure.mirror_group_idx == group]
     if not len(corners):
         return range_map
     rays = ray_grid(range_map.range.shape) @ cam_from_world.rotation
     pane = np.fmin.reduce([pane_ranges(rays, cam_from_world.center, one) for one in corners])
-    before = (range_map.confidence >= WEAK_CONFIDENCE[0]) & (range_map.range < pane * (1 - _BEFORE_PLANE))
-    shown = np.isfinite(pane) & ~before & (True if valid is None else valid)
+    known = (range_map.confidence >= WEAK_CONFIDENCE[0]) | (False if laid is None else laid)
+    shown = np.isfinite(pane) & ~(known & (range_map.range < pane * (1 - _BEFORE_PLANE)))
+    for ignored in (None if valid is None else ~valid, range_map.sky):
+        shown = shown if ignored is None else shown & ~ignored
     uncertainty, normals = range_map.uncertainty, range_map.normals_in_cam
     return replace(
         range_map,
@@ -95,7 +104,6 @@ def with_mirrors(
         confidence=np.where(shown, np.uint8(MIRROR_CONFIDENCE), range_map.confidence),
         uncertainty=None if uncertainty is None else np.where(shown, np.float16(np.nan), uncertainty),
         normals_in_cam=None if normals is None else np.where(shown[..., None], np.float16(np.nan), normals),
-        sky=None if range_map.sky is None else range_map.sky & ~shown,
     )
 
 
@@ -176,7 +184,11 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
     """Return the strength and the corners of each mirror on a plane, and the centre of a camera before it."""
     shares = [one.on(plane) for one in seen]
     least = 0.005 * seen[0].view.ranges.size / 16
-    chosen = [idx for idx in np.argsort([-len(points) for points in shares])[:_VIEWS] if len(shares[idx]) > least]
+    chosen = [
+        idx
+        for idx in np.argsort([-len(points) for points in shares], kind="stable")[:_VIEWS]
+        if len(shares[idx]) > least
+    ]
     if len(chosen) < 2:
         return []
     used = [seen[idx] for idx in chosen]

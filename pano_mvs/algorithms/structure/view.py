@@ -31,7 +31,7 @@ _ROWS = 256
 
 @dataclass(frozen=True, eq=False)
 class PlaneView:
-    """A view on every n-th row and column, so that about 256 rows remain.
+    """A view on a grid of 256 to 511 rows and twice as many columns, or of all pixels of smaller ones.
 
     `load`: returns the panorama, (H, W, 3) RGB at full resolution. `cam_from_world`: its pose. `rays`: (h, w, 3) unit
     rays in the world. `ranges`: (h, w), NaN is invalid. `confidence`: (h, w). `uncertainty`: (h, w) relative standard
@@ -47,14 +47,17 @@ class PlaneView:
     area: FloatArray
 
 
-def stride_of(size_hw: tuple[int, int]) -> int:
-    """Return n of the grid of a panorama of a size."""
-    return max(1, size_hw[0] // _ROWS)
+def grid_rows(height: int) -> int:
+    """Return the number of rows of the grid of a panorama with this height: all, or some from 256 to 511."""
+    return height // max(1, height // _ROWS)
 
 
-def on_grid(pixels: NDArray[Value], stride: int) -> NDArray[Value]:
-    """Return the pixels of the grid, (h, w, ...), of (H, W, ...)."""
-    return pixels[stride // 2 :: stride, stride // 2 :: stride]
+def on_grid(pixels: NDArray[Value], rows: int) -> NDArray[Value]:
+    """Return the pixels of the grid, (rows, 2 rows, ...), of a full sphere (H, W, ...)."""
+    height, width = pixels.shape[:2]
+    row = (2 * np.arange(rows) + 1) * height // (2 * rows)
+    column = (2 * np.arange(2 * rows) + 1) * width // (4 * rows)
+    return np.asarray(pixels[row[:, None], column])
 
 
 def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world: Rigid3) -> PlaneView:
@@ -62,25 +65,25 @@ def plane_view(range_map: RangeMap, load: Callable[[], Picture], cam_from_world:
 
     `range_map`: (H, W), the full sphere. `load`: returns the panorama, (H, W, 3) RGB. `cam_from_world`: its pose.
     """
-    size = range_map.range.shape
-    stride = stride_of((size[0], size[1]))
-    rays = on_grid(ray_grid((size[0], size[1])), stride) @ cam_from_world.rotation
-    confidence = on_grid(range_map.confidence, stride)
+    size = range_map.range.shape[0], range_map.range.shape[1]
+    rows = grid_rows(size[0])
+    rays = on_grid(ray_grid(size), rows) @ cam_from_world.rotation
+    confidence = on_grid(range_map.confidence, rows)
     confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
-    supposed = np.where(on_grid(has_texture(load()), stride), 0.003, 0.02)
+    supposed = np.where(on_grid(has_texture(load()), rows), 0.003, 0.02)
     uncertainty = np.where(confirmed, supposed, UNCONFIRMED_UNCERTAINTY)
     if range_map.uncertainty is not None:
-        known = on_grid(range_map.uncertainty, stride).astype(np.float64)
+        known = on_grid(range_map.uncertainty, rows).astype(np.float64)
         uncertainty = np.where(np.isnan(known), uncertainty, known)
-    area = np.broadcast_to(pixel_solid_angle((size[0], size[1]))[:, None] * stride**2, size)
+    area = np.broadcast_to(pixel_solid_angle((rows, 2 * rows))[:, None], (rows, 2 * rows))
     return PlaneView(
         load,
         cam_from_world,
         rays,
-        on_grid(range_map.range, stride).astype(np.float64),
+        on_grid(range_map.range, rows).astype(np.float64),
         confidence,
         uncertainty,
-        on_grid(area, stride),
+        area,
     )
 
 

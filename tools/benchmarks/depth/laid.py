@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.logistic import Model
 from pano_mvs.algorithms.structure import lay
 from pano_mvs.algorithms.structure.lay import proposed_planes
-from pano_mvs.algorithms.structure.view import on_grid, stride_of
+from pano_mvs.algorithms.structure.view import grid_rows, on_grid
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
@@ -99,9 +99,9 @@ def measured(chain: DenseChain, capture: Capture) -> list[list[str]]:
         before = done.results["planes"][image]
         assert isinstance(before, RangeMap)
         for proposal in proposals:
-            stride = stride_of((before.range.shape[0], before.range.shape[1]))
-            own, true = (on_grid(ranges, stride) for ranges in (before.range, capture.ranges[image]))
-            unsure = on_grid(before.confidence, stride) < CONSISTENT_CONFIDENCE[0]
+            count = grid_rows(before.range.shape[0])
+            own, true = (on_grid(ranges, count) for ranges in (before.range, capture.ranges[image]))
+            unsure = on_grid(before.confidence, count) < CONSISTENT_CONFIDENCE[0]
             with np.errstate(invalid="ignore", divide="ignore"):
                 on_plane, by_own = (np.abs(np.log(ranges / true)) for ranges in (proposal.laid, own))
             areas = pixel_solid_angle((own.shape[0], own.shape[1]))
