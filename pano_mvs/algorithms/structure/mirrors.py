@@ -225,9 +225,10 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
         is_clear = mean >= _LEAST_MEAN and sums.explained(inside) >= _LEAST_LEVELS
         if area >= _LEAST_AREA and is_clear and not is_surface and around.size and around.mean() >= _LEAST_AROUND:
             left, right, top, bottom = _outlined(inside, np.mean(pictures, axis=0))
-            # Mirrors are rectangles: this one and the area have most of their cells in common.
+            # Mirrors are rectangles. Of those that were measured, all but a hundredth of the area lay in this one and
+            # filled .46 to .81 of it; of an area on a wall without a mirror, .43 lay in it.
             common = int(inside[top:bottom, left:right].sum())
-            if common > 0.5 * max(int(inside.sum()), (right - left) * (bottom - top)):
+            if common > 0.8 * inside.sum() and 3 * common > (right - left) * (bottom - top):
                 columns, rows = np.array([left, right, right, left], np.float64), np.array([top, top, bottom, bottom])
                 found.append((mean * float(area), grid.at(columns, rows), used[0].center))
     return found
