@@ -1,7 +1,7 @@
-"""Put a finished run into metres: the same workflow with stages that multiply poses, ranges and clouds by a factor.
+"""Put a finished run into metres: the same workflow with stages that multiply poses, ranges, … by a factor.
 
-Range maps and clouds of scaled poses are the scaled range maps and clouds, so nothing dense is computed again: the
-cached results are multiplied, and only exports, scores and other stages that read them run again.
+Range maps, planes and clouds of scaled poses are the scaled ones, so nothing dense is computed again: the cached
+results are multiplied, and only exports, scores and other stages that read them run again.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from pano_mvs.results.run_output import RunOutput
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record, TwoView, TwoViews
 from pano_mvs.scene.panorama import StaticMasks
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.two_view import Pairs, Views
 from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import chain_of
@@ -38,6 +39,7 @@ _PREFIX = "metres_"
 _SCALED: Mapping[type[Record], tuple[str, str]] = {
     Poses: ("poses.scale", "poses"),
     RangeMap: ("filters.scale", "range_map"),
+    Structure: ("depth.scale_planes", "planes"),
     PointCloud: ("fusion.scale", "cloud"),
 }
 _WITHOUT_LENGTHS = (Panorama, Pairs, Views, TwoView, TwoViews, StaticMasks)
@@ -162,7 +164,7 @@ def scaled_session(run: RunOutput, known: Measurement, *, cache: Path | None = N
     """Return the session that puts a run into metres, and write its workflow to metres.yaml in the output folder.
 
     The workflow is that of the run, with all its settings, and the stages metres_…, which multiply the final poses,
-    ranges and clouds. A run that is in metres already is corrected: its factor changes.
+    ranges, planes and clouds. A run that is in metres already is corrected: its factor changes.
 
     Args:
         cache: folder of the cache; None for that of the run.
@@ -241,7 +243,7 @@ class _Rewiring:
                 inputs = {port: self._source(name, edge) for port, edge in self.graph.edges[name].items()}
                 changed[name] = replace(entry, policy=entry.policy.model_copy(update={"inputs": inputs}))
         # Final values that nothing reads are scaled, too: run.json and the viewer show them.
-        for kind in _SCALED:
+        for kind in (Poses, RangeMap, PointCloud):
             chain = chain_of(self.session.workflow, self.graph, kind)
             if chain:
                 self._scaled(chain[-1])

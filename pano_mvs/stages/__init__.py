@@ -24,6 +24,7 @@ from pano_mvs.stages.filters import (
     median,
     planes,
     prior,
+    scale_planes,
     scale_ranges,
     scene_planes,
     sky,

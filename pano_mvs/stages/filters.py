@@ -310,10 +310,10 @@ def free_space(
 
 
 class ScaleRangesParams(Params):
-    """Settings of filters.scale."""
+    """Settings of filters.scale and depth.scale_planes."""
 
-    factor: float = Field(default=1.0, gt=0, description="new units per unit of the range map, such as metres")
-    group: int = Field(default=0, ge=0, description="group of the poses whose views are scaled; 0 is the largest")
+    factor: float = Field(default=1.0, gt=0, description="new units per unit before, such as metres")
+    group: int = Field(default=0, ge=0, description="group of the poses that is scaled; 0 is the largest")
 
 
 @stage("filters.scale", memory=bytes_per_pixel(30))
@@ -322,6 +322,19 @@ def scale_ranges(range_map: Each[RangeMap], pose: Each[Pose], params: ScaleRange
     if pose.group != params.group:
         return _measured(range_map, ctx)
     return _measured(replace(range_map, range=range_map.range * np.float32(params.factor)), ctx)
+
+
+@stage("depth.scale_planes")
+def scale_planes(planes: One[Structure], params: ScaleRangesParams, ctx: Context) -> Structure:
+    """Multiply planes and mirrors by a factor, for results whose scale is known only later; see `pano-mvs scale`."""
+    scaled, mirrors = (groups == params.group for groups in (planes.group_idx, planes.mirror_group_idx))
+    ctx.metric("planes", len(planes))
+    ctx.metric("mirrors", len(planes.mirror_corners))
+    return replace(
+        planes,
+        offsets=np.where(scaled, params.factor, 1.0) * planes.offsets,
+        mirror_corners=np.where(mirrors, params.factor, 1.0)[:, None, None] * planes.mirror_corners,
+    )
 
 
 @stage("filters.fast_bilateral_solver", settings=fast_bilateral_solver, memory=bytes_per_pixel(190))

@@ -272,9 +272,11 @@ class TinyCapture:
         )
 
     def _structure(self) -> Structure:
-        """Return the floor and one wall."""
+        """Return the floor, and one wall with a mirror."""
         normals, offsets = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]]), np.array([-1.3, -3.0])
-        return frozen(Structure(normals, offsets, np.full(2, 0.004), np.zeros(2, np.int32)))
+        mirror = np.array([[(3.0, -0.6, 0.5), (3.0, -0.6, -0.5), (3.0, 0.4, -0.5), (3.0, 0.4, 0.5)]])
+        groups = np.zeros(2, np.int32)
+        return frozen(Structure(normals, offsets, np.full(2, 0.004), groups, mirror, groups[:1].copy()))
 
     def _cloud(self) -> PointCloud:
         points = self.points_in_world[: 0 if self.variant.blank else None]

@@ -10,7 +10,8 @@ import pytest
 
 from pano_mvs.algorithms.floor_plan.evidence import CloudViews, Evidence, PlanView, range_view
 from pano_mvs.algorithms.floor_plan.plan_grid import Extent, Orthophoto, Storey, bar_length, find_storeys
-from pano_mvs.algorithms.floor_plan.storey_plan import StoreyPlan, plan_storey
+from pano_mvs.algorithms.floor_plan.rooms import Side
+from pano_mvs.algorithms.floor_plan.storey_plan import StoreyPlan, _Frame, plan_storey
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
@@ -143,6 +144,14 @@ def test_a_window_does_not_reach_the_floor() -> None:
     (window,) = [one for one in plan.openings if one.kind == "window"]
     assert window.ends[:, 1] == pytest.approx([0, 0], abs=0.02)
     assert np.sort(window.ends[:, 0]) == pytest.approx(WINDOW, abs=0.15)
+
+
+@pytest.mark.parametrize(("start", "behind"), [(-3.0, False), (2.0, True), (11.0, False)])
+def test_only_a_side_that_is_behind_another_is_its_back(start: float, behind: bool) -> None:
+    evidence = evidence_around(np.array([(-6.0, -1), (12, 2)]))
+    own = _Frame(Side(np.array([(0.0, 0), (8, 0)]), 0, 0), evidence)
+    back = np.array([(start, 0.2 * own.back[1]), (start - 2, 0.2 * own.back[1])])
+    assert (own.behind(_Frame(Side(back, 1, 1), evidence), 0.5) is not None) == behind
 
 
 def test_a_window_that_shows_the_sky_is_a_window() -> None:

@@ -108,7 +108,8 @@ def test_a_mirror_is_seen_from_its_front_alone() -> None:
     assert np.isnan(pane_ranges(ahead, np.array([0.5, 0.0, 0.5]), corners))
 
 
-def test_a_cloud_has_nothing_of_the_room_behind_a_mirror() -> None:
+@pytest.mark.parametrize("min_confidence", [64, 1])
+def test_a_cloud_has_nothing_of_a_mirror_or_of_the_room_behind_it(min_confidence: int) -> None:
     scene = mirror_room(seed=0, views=2, turned=False)
 
     def fused(given: Structure) -> FloatArray:
@@ -119,11 +120,14 @@ def test_a_cloud_has_nothing_of_the_room_behind_a_mirror() -> None:
             behind = pane_ranges(ray_grid(SIZE) @ pose.rotation, pose.center, CORNERS[0] + (0.0, 0.0, 1.0))
             seen = as_map(np.where(shows_mirror(scene, idx, ranges), behind, ranges), TRUSTED)
             views.append(FusionView(with_mirrors(seen, given, pose), pose, picture, np.ones(SIZE, np.bool_)))
-        cloud = fuse_stream(scene.poses, views.__getitem__, FusionSettings(min_views=2))
+        cloud = fuse_stream(scene.poses, views.__getitem__, FusionSettings(min_views=2, min_confidence=min_confidence))
         return np.asarray(cloud.points_in_world, np.float64)
 
     assert (fused(structure(CORNERS[:0]))[:, 2] > 3).any()
-    assert not (fused(structure())[:, 2] > 2.6).any()
+    without = fused(structure())
+    assert not (without[:, 2] > 2.6).any()
+    low, high = CORNERS[0].min(axis=0) + 0.1, CORNERS[0].max(axis=0) - 0.1
+    assert not ((without > low) & (without < high))[:, :2].all(axis=1)[without[:, 2] > 2.4].any()
 
 
 def test_range_maps_without_optional_parts_have_mirrors() -> None:

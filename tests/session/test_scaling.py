@@ -19,6 +19,7 @@ from pano_mvs.results.run_output import load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Pose, RangeMap
 from pano_mvs.scene.pose_groups import join_groups
+from pano_mvs.scene.surfaces import Structure
 from pano_mvs.session.running import Execution, run_session
 from pano_mvs.session.scaling import (
     lost_scale,
@@ -29,7 +30,7 @@ from pano_mvs.session.scaling import (
 )
 from pano_mvs.session.session import Session, open_session
 from pano_mvs.session.summarise import _scale_notes, camera_height, height_note
-from pano_mvs.stages.filters import ScaleRangesParams, scale_ranges
+from pano_mvs.stages.filters import ScaleRangesParams, scale_planes, scale_ranges
 from pano_mvs.stages.frame import ScaleParams, scale
 from pano_mvs.stages.fusion import ScaleCloudParams, scale_cloud
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
@@ -159,6 +160,18 @@ def test_the_command_takes_points_and_lengths(
             scale_output(run.out, known, camera_height=height, group=7, cache=None, console=Console())
 
 
+@pytest.mark.parametrize("preset", ["colmap_dense", "mesh", "quality", "quickstart"])
+def test_what_reads_planes_after_the_cloud_gets_scaled_ones(run: pano_mvs.RunOutput, preset: str) -> None:
+    workflow = run.summary.workflow.model_copy(update={"path": f"workflows/{preset}.yaml", "overrides": ()})
+    moved = pano_mvs.RunOutput(run.out, run.summary.model_copy(update={"workflow": workflow}), run.values)
+    session = scaled_session(moved, measured_between(run, "000", "001", metres=5.0))
+    made = {name: entry.spec.output for name, entry in session.workflow.stages.items()}
+    readers = [name for name, edges in session.graph.edges.items() for edge in edges.values()
+               if edge.producer == "metres_scene_planes"]  # fmt: skip
+    assert readers == (["textured"] if preset == "mesh" else [])
+    assert ("metres_scene_planes" in made) == bool(readers)
+
+
 def test_a_run_whose_workflow_is_gone_names_it(run: pano_mvs.RunOutput) -> None:
     gone = run.summary.workflow.model_copy(update={"path": "gone/tiny.yaml"})
     moved = pano_mvs.RunOutput(run.out, run.summary.model_copy(update={"workflow": gone}), run.values)
@@ -228,6 +241,12 @@ def test_only_the_chosen_group_is_scaled(tmp_path: Path) -> None:
     settings = ScaleRangesParams(factor=3, group=1)
     assert scale_ranges(ranges, Pose(Rigid3.identity(), 0), settings, ctx).range.max() == 2
     assert scale_ranges(ranges, Pose(Rigid3.identity(), 1), settings, ctx).range.min() == 6
+    planes = Structure(np.eye(3)[:2], np.array([1.0, 2.0]), np.full(2, 0.1), np.array([0, 1], np.int32),
+                       np.ones((2, 4, 3)), np.array([1, 0], np.int32))  # fmt: skip
+    changed = scale_planes(planes, settings, ctx)
+    changed.check()
+    assert changed.offsets.tolist() == [1, 6]
+    assert changed.mirror_corners[:, 0, 0].tolist() == [3, 1]
     one = the_cloud(room_cloud(density=20))
     one = replace(one, uncertainty=np.full(len(one), 0.1, np.float32))
     first, second = scale_cloud(PointCloud.of_groups([one, one]), ScaleCloudParams(factor=3, group=1), ctx).groups()

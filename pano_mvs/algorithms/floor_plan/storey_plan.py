@@ -168,7 +168,8 @@ class _Frame:
         depth = float(((other.side.ends - self.side.ends[0]) @ self.back).mean())
         first, last = self.along_of(other.side.ends)
         opposite = self.along @ other.along < -np.cos(np.deg2rad(5.0))
-        return (first, last, depth) if opposite and 0 < depth < thickest and min(last, self.length) > first else None
+        beside = min(last, self.length) <= max(first, 0.0)
+        return (first, last, depth) if opposite and 0 < depth < thickest and not beside else None
 
     def open_spans(self, others: Sequence[_Frame]) -> list[Span]:
         """Return where views see through the side or through others behind it."""

@@ -18,6 +18,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import check_settings, setting
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ def held_rays(size_hw: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
-    """Return the data of a view with at least the given confidence and outside of its mask.
+    """Return the data of a view with at least the given confidence, outside of its mask and of mirrors.
 
     Raises:
         UsageError: if its arrays disagree in size.
@@ -106,7 +107,7 @@ def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
             f"a view's image must be (H, W, 3) uint8 in the size of its range map {ranges.shape}, got "
             f"{view.image.shape} {view.image.dtype}"
         )
-    good = confidence >= min_confidence
+    good = (confidence >= min_confidence) & (confidence != MIRROR_CONFIDENCE)
     if view.mask is not None:
         if view.mask.shape != ranges.shape:
             raise UsageError(f"a view's mask must have the size of its range map {ranges.shape}, got {view.mask.shape}")

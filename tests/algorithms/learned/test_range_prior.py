@@ -14,6 +14,7 @@ from pano_mvs.algorithms.learned.range_prior import fill_from_prior, network_val
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
 from tests.algorithms.learned.grey_network import GREY_NETWORK
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, box_range
 
@@ -75,6 +76,14 @@ def test_no_range_is_extrapolated() -> None:
     prior = np.where(HOLE, 100.0, TRUTH).astype(np.float32)
     found, _ = fill_from_prior(measured(), GUIDE, prior, output="range")
     np.testing.assert_array_equal(found.range, measured().range)
+
+
+def test_mirrors_keep_the_range_of_their_pane() -> None:
+    given = measured()
+    given = replace(given, confidence=np.where(HOLE, np.uint8(MIRROR_CONFIDENCE), given.confidence))
+    found, _ = fill_from_prior(given, GUIDE, TRUTH, output="range")
+    np.testing.assert_array_equal(found.range, given.range)
+    np.testing.assert_array_equal(found.confidence, given.confidence)
 
 
 def test_masked_pixels_and_the_sky_get_no_range() -> None:
