@@ -27,7 +27,7 @@ from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
 
 Surface = tuple[NDArray[np.float32], NDArray[np.int32]]
 """Vertices (V, 3) and triangles (F, 3), counter-clockwise as seen from the side that was seen."""
@@ -52,12 +52,16 @@ _LIMIT_CELLS = 2.0
 def most_certain(range_map: RangeMap, measured: RangeMap) -> RangeMap:
     """Return a range map with the measured ranges where they are confirmed and more accurate than planes of the place.
 
+    Panes of mirrors stay: what was measured there is a reflection.
+
     `range_map`: completed and laid on planes. `measured`: the same view before.
     """
     if measured.uncertainty is None or range_map.uncertainty is None or measured.range.shape != range_map.range.shape:
         return range_map
-    precise = (measured.confidence >= CONSISTENT_CONFIDENCE[0]) & (
-        measured.uncertainty < np.fmax(range_map.uncertainty, _PLANE_UNCERTAINTY)
+    precise = (
+        (measured.confidence >= CONSISTENT_CONFIDENCE[0])
+        & (measured.uncertainty < np.fmax(range_map.uncertainty, _PLANE_UNCERTAINTY))
+        & (range_map.confidence != MIRROR_CONFIDENCE)
     )
     normals = range_map.normals_in_cam
     if normals is not None and measured.normals_in_cam is not None:

@@ -21,6 +21,7 @@ from pano_mvs.algorithms.mesh.volume import (
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
 from tests.algorithms.mesh.box import HALF, Capture, box, capture, poses
 from tests.oracles.surfaces import mean_distances
 
@@ -163,6 +164,21 @@ def test_accurate_measured_ranges_replace_those_on_planes() -> None:
     measured = RangeMap(np.full(shape, 2.1, np.float32), confidence, uncertainty=uncertainty)
     np.testing.assert_allclose(most_certain(laid, measured).range[:, 0], [2.0, 2.0, 2.1, 2.1])
     assert most_certain(laid, replace(measured, uncertainty=None)) is laid
+
+
+def test_reflections_do_not_replace_panes_of_mirrors() -> None:
+    shape = (4, 8)
+    pane = RangeMap(
+        np.full(shape, 2.0, np.float32),
+        np.full(shape, MIRROR_CONFIDENCE, np.uint8),
+        uncertainty=np.full(shape, np.nan, np.float16),
+    )
+    reflection = RangeMap(
+        np.full(shape, 5.0, np.float32), np.full(shape, 200, np.uint8), uncertainty=np.full(shape, 0.005, np.float16)
+    )
+    best = most_certain(pane, reflection)
+    np.testing.assert_array_equal(best.range, pane.range)
+    np.testing.assert_array_equal(best.confidence, pane.confidence)
 
 
 def test_without_ranges_there_is_no_surface() -> None:
