@@ -9,7 +9,7 @@ place continue where nobody looked, and vertices near them move onto them, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -216,7 +216,7 @@ class Volume:
         return vertices.astype(np.float32), _quads(inside, number)
 
 
-def empty_volume(maps: Sequence[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, max_cells: int = MAX_CELLS) -> Volume:
+def empty_volume(maps: Iterable[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, max_cells: int = MAX_CELLS) -> Volume:
     """Return an empty grid around what panoramas measured.
 
     `maps`: range maps with their poses. `cell`: width of the cells; 0: the spacing of pixels at the median range, but
