@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -78,6 +79,32 @@ def test_vertices_move_onto_walls_edges_and_corners() -> None:
     same, unmoved = on_planes(surface, NO_PLANES, reach=0.15)
     np.testing.assert_array_equal(same, surface[0])
     assert not unmoved.any()
+
+
+def test_memory_does_not_grow_with_the_number_of_planes() -> None:
+    surface = filled(capture(poses(3))).surface()
+    away = np.tile(AXES, (20, 1)), np.repeat(np.arange(20.0) + 9, 6)
+    many = np.concatenate([WALLS[0], away[0]]), np.concatenate([WALLS[1], away[1]])
+    peaks, results = [], []
+    for planes in (WALLS, many):
+        tracemalloc.start()
+        moved = on_planes(surface, planes, reach=0.15)
+        results.append((*moved, plane_of_faces((moved[0], surface[1]), planes, tolerance=1e-3)))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+    for few, same in zip(*results, strict=True):
+        np.testing.assert_array_equal(few, same)
+
+
+def test_a_long_thin_place_has_no_more_cells_than_allowed() -> None:
+    """Two corridors that form an L, of which rounding up adds a large share."""
+    maps = []
+    for half, center in (((20, 1.3, 1), (20, 0, 0)), ((1, 1.3, 20), (0, 0, 20))):
+        ranges = (np.array(half) / np.abs(ray_grid((32, 64)))).min(axis=-1).astype(np.float32)
+        pose = Rigid3.from_center(np.eye(3), np.array(center, float))
+        maps.append((RangeMap(ranges, np.full(ranges.shape, 200, np.uint8)), pose))
+    assert 0.5 * 5000 < empty_volume(maps, max_cells=5000).distances.size <= 5000
 
 
 def test_planes_continue_behind_a_board_and_not_beyond_the_walls() -> None:
