@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,27 @@ def test_each_group_of_poses_has_its_own_files(inputs: Inputs, tmp_path: Path) -
     ]
     assert files["mesh_textured.glb"].read_bytes() == files["mesh_textured_1.glb"].read_bytes()
     assert ctx.notes[0].startswith("no mesh_textured_2.glb: no panorama measured a surface")
+
+
+def test_few_range_maps_are_in_memory_at_once(inputs: Inputs, tmp_path: Path) -> None:
+    """The two panoramas three times."""
+    alive: weakref.WeakSet[RangeMap] = weakref.WeakSet()
+    most = 0
+
+    class Stored(dict[str, RangeMap]):
+        def __getitem__(self, name: str) -> RangeMap:
+            nonlocal most
+            loaded = replace(super().__getitem__(name))
+            alive.add(loaded)
+            most = max(most, len(alive))
+            return loaded
+
+    names = {f"{number}-{name}": name for number in range(3) for name in inputs.images}
+    cams = {name: inputs.poses.cam_from_world(inputs.poses.names.index(own)) for name, own in names.items()}
+    found = Poses.without_points(cams, frame="the box's", scale="metres", metric=True)
+    ranges = Stored({name: inputs.ranges[own] for name, own in names.items()})
+    run(Inputs(ranges, found, {name: inputs.images[own] for name, own in names.items()}), tmp_path / "x")
+    assert most <= 3
 
 
 def test_panoramas_without_valid_pixels_are_refused(inputs: Inputs, tmp_path: Path) -> None:

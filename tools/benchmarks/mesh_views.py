@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -41,7 +42,8 @@ def meshes(capture: Capture, workflow: str, folder: Path, triangles: int) -> tup
     plain, _ = solved_mesh(cloud, MeshParams(), folder)
     started = time.process_time()
     views = [
-        MeshView(capture.poses[name], capture.panoramas[name], most_certain(last[name], checked[name])) for name in last
+        MeshView(capture.poses[name], capture.panoramas[name], partial(most_certain, last[name], checked[name]))
+        for name in last
     ]
     planes = structure.normals_in_world, structure.offsets
     made = textured_mesh(views, planes, TexturedParams(triangles=triangles), ctx=context(folder))

@@ -65,6 +65,9 @@ def unwrapped(
     corners = vertices.astype(np.float64)[faces]
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     most = max_px * np.sqrt(0.75 / max(area / 2, 1e-30))  # three quarters of a texture are used
+    texels = float(min(texels_per_unit, most))
+    # xatlas takes triangles for empty whose area is a small number. A power of 2 changes no digits.
+    scale = 2.0 ** np.round(np.log2(texels))
     atlas = xatlas.Atlas()
     parts = []
     for number in np.unique(region) if region is not None else [-1]:
@@ -73,10 +76,10 @@ def unwrapped(
         divided = _parts(corners[own].mean(axis=1)) if number < 0 else [np.arange(len(own))]
         parts += [(own[part], *np.unique(faces[own[part]], return_inverse=True)) for part in divided]
     for part, used, local in parts:
-        atlas.add_mesh(vertices[used].astype(np.float32), local.reshape(len(part), 3).astype(np.uint32))
+        atlas.add_mesh((scale * vertices[used]).astype(np.float32), local.reshape(len(part), 3).astype(np.uint32))
     options = xatlas.PackOptions()
     # Texels between charts: half of them belong to each of two neighbours, enough for two levels of a mipmap.
-    options.padding, options.texels_per_unit = 4, float(min(texels_per_unit, most))
+    options.padding, options.texels_per_unit = 4, float(texels / scale)
     atlas.generate(pack_options=options)
     made = [atlas.get_mesh(number) for number in range(len(parts))]
     of_atlas, first = np.empty_like(faces, np.int32), 0

@@ -9,7 +9,7 @@ place continue where nobody looked, and vertices near them move onto them, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -27,7 +27,7 @@ from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
 
 Surface = tuple[NDArray[np.float32], NDArray[np.int32]]
 """Vertices (V, 3) and triangles (F, 3), counter-clockwise as seen from the side that was seen."""
@@ -52,12 +52,16 @@ _LIMIT_CELLS = 2.0
 def most_certain(range_map: RangeMap, measured: RangeMap) -> RangeMap:
     """Return a range map with the measured ranges where they are confirmed and more accurate than planes of the place.
 
+    Panes of mirrors stay: what was measured there is a reflection.
+
     `range_map`: completed and laid on planes. `measured`: the same view before.
     """
     if measured.uncertainty is None or range_map.uncertainty is None or measured.range.shape != range_map.range.shape:
         return range_map
-    precise = (measured.confidence >= CONSISTENT_CONFIDENCE[0]) & (
-        measured.uncertainty < np.fmax(range_map.uncertainty, _PLANE_UNCERTAINTY)
+    precise = (
+        (measured.confidence >= CONSISTENT_CONFIDENCE[0])
+        & (measured.uncertainty < np.fmax(range_map.uncertainty, _PLANE_UNCERTAINTY))
+        & (range_map.confidence != MIRROR_CONFIDENCE)
     )
     normals = range_map.normals_in_cam
     if normals is not None and measured.normals_in_cam is not None:
@@ -212,7 +216,7 @@ class Volume:
         return vertices.astype(np.float32), _quads(inside, number)
 
 
-def empty_volume(maps: Sequence[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, max_cells: int = MAX_CELLS) -> Volume:
+def empty_volume(maps: Iterable[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, max_cells: int = MAX_CELLS) -> Volume:
     """Return an empty grid around what panoramas measured.
 
     `maps`: range maps with their poses. `cell`: width of the cells; 0: the spacing of pixels at the median range, but
@@ -235,8 +239,9 @@ def empty_volume(maps: Sequence[tuple[RangeMap, Rigid3]], *, cell: float = 0.0, 
     margin = 0.02 * (upper - lower) + 0.1 * middle
     lower, upper = lower - margin, upper + margin
     width = max(cell or np.pi / height * middle, float(np.prod(upper - lower) / max_cells) ** (1 / 3))
-    shape = np.ceil((upper - lower) / width).astype(int) + 1
-    distances, weights, support = np.zeros((3, *shape), np.float32)
+    while np.prod(shape := np.ceil((upper - lower) / width) + 1) > max_cells:
+        width *= 1.002
+    distances, weights, support = np.zeros((3, *shape.astype(int)), np.float32)
     return Volume(lower, width, distances, weights, support, middle)
 
 
@@ -257,21 +262,26 @@ def on_planes(surface: Surface, planes: Planes, *, reach: float) -> tuple[NDArra
     for _ in range(3):
         normals = normals + links @ normals
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    distances = vertices @ planes[0].T - planes[1]
-    facing = (np.abs(distances) < reach) & (normals @ planes[0].T > 0.9)
-    around = facing.astype(np.float32)
-    for _ in range(4):
-        around = around + links @ around
-    near = (around >= 3) & (np.abs(distances) < np.where(facing, reach, 2 / 3 * reach))
-    distances = np.where(near, distances, np.inf)
-    order = np.argsort(np.abs(distances), axis=1)[:, :3]
-    system, wanted = np.zeros((count, order.shape[1], 3)), np.zeros((count, order.shape[1]))
-    for rank in range(order.shape[1]):
+    found, order = np.full((count, 3), np.inf), np.zeros((count, 3), np.intp)  # the three nearest planes
+    for number, (normal, offset) in enumerate(zip(*planes, strict=True)):
+        distance = vertices @ normal - offset
+        facing = (np.abs(distance) < reach) & (normals @ normal > 0.9)
+        around = facing.astype(np.float32)
+        for _ in range(4):
+            around = around + links @ around
+        near = np.flatnonzero((around >= 3) & (np.abs(distance) < np.where(facing, reach, 2 / 3 * reach)))
+        farthest = np.argmax(np.abs(found[near]), axis=1)
+        nearer = np.abs(distance[near]) < np.abs(found[near, farthest])
+        place = near[nearer], farthest[nearer]
+        found[place], order[place] = distance[place[0]], number
+    ranks = np.argsort(np.abs(found), axis=1)
+    found, order = (np.take_along_axis(array, ranks, axis=1) for array in (found, order))
+    system, wanted = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for rank in range(3):
         own = planes[0][order[:, rank]]
-        distance = distances[np.arange(count), order[:, rank]]
         # Of planes that are nearly parallel, the nearest one counts.
-        alone = np.isfinite(distance) & (np.abs(np.einsum("vri,vi->vr", system, own)) < 0.8).all(axis=1)
-        system[alone, rank], wanted[alone, rank] = own[alone], -distance[alone]
+        alone = np.isfinite(found[:, rank]) & (np.abs(np.einsum("vri,vi->vr", system, own)) < 0.8).all(axis=1)
+        system[alone, rank], wanted[alone, rank] = own[alone], -found[alone, rank]
     moved = system.any(axis=(1, 2))
     vertices[moved] += np.einsum("vir,vr->vi", np.linalg.pinv(system[moved], rcond=1e-3), wanted[moved])
     return vertices.astype(np.float32), np.asarray(moved)
@@ -298,11 +308,13 @@ def seen_triangles(surface: Surface, poses: Sequence[Rigid3], kept: Mask, *, thr
 
 def plane_of_faces(surface: Surface, planes: Planes, *, tolerance: float) -> NDArray[np.int64]:
     """Return the number of the plane on which all corners of each triangle lie, (F,), −1 for none."""
-    off = (np.abs(surface[0].astype(np.float64) @ planes[0].T - planes[1]) > tolerance)[surface[1]].any(axis=1)
-    off |= face_normals(*surface) @ planes[0].T < 0.9
-    alone = np.concatenate([off, np.zeros((len(off), 1), np.bool_)], axis=1)
-    nearest = np.argmin(alone, axis=1)
-    return np.where(nearest < len(planes[1]), nearest, -1)
+    vertices, faces = surface[0].astype(np.float64), surface[1]
+    normals = face_normals(*surface)
+    found = np.full(len(faces), -1, np.int64)
+    for number, (normal, offset) in enumerate(zip(*planes, strict=True)):
+        on = (np.abs(vertices @ normal - offset) <= tolerance)[faces].all(axis=1) & (normals @ normal >= 0.9)
+        found[on & (found < 0)] = number
+    return found
 
 
 def adjacency(faces: NDArray[np.int32], count: int) -> csr_array:

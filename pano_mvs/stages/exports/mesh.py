@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -204,16 +205,19 @@ def mesh_textured(
     mesh_textured_seen.png. Further groups of poses, each in its own frame, are mesh_textured_1.glb …
     """
     files: dict[str, Path] = {}
+
+    def best(name: str) -> RangeMap:
+        accurate = measured.get(name) if measured is not None else None
+        return ranges[name] if accurate is None else most_certain(ranges[name], accurate)
+
     for number, own in enumerate(split_groups(poses)):
         folder = ctx.scratch / str(number)
         folder.mkdir()
-        views = []
-        for idx, name in enumerate(own.names):
-            if name not in images or name not in ranges:
-                continue
-            accurate = measured.get(name) if measured is not None else None
-            best = ranges[name] if accurate is None else most_certain(ranges[name], accurate)
-            views.append(MeshView(own.cam_from_world(idx), images[name], best))
+        views = [
+            MeshView(own.cam_from_world(idx), images[name], partial(best, name))
+            for idx, name in enumerate(own.names)
+            if name in images and name in ranges
+        ]
         chosen = np.flatnonzero(planes.group_idx == number) if planes is not None else np.zeros(0, np.intp)
         found = (planes.normals_in_world[chosen], planes.offsets[chosen]) if planes is not None else NO_PLANES
         try:
@@ -237,27 +241,27 @@ def mesh_textured(
 
 @dataclass(frozen=True, eq=False)
 class MeshView:
-    """A panorama with its ranges."""
+    """A panorama, and a function that returns its ranges, so that those of all panoramas are not in memory at once."""
 
     cam_from_world: Rigid3
     image: Panorama
-    range_map: RangeMap
+    range_map: Callable[[], RangeMap]
 
     def load(self) -> PaintView:
         """Return the panorama with its pixels."""
-        fits = self.range_map.range.shape == self.image.size_hw
-        return PaintView(
-            self.cam_from_world, self.image.load(), self.image.load_mask(), self.range_map if fits else None
-        )
+        range_map = self.range_map()
+        fits = range_map.range.shape == self.image.size_hw
+        return PaintView(self.cam_from_world, self.image.load(), self.image.load_mask(), range_map if fits else None)
 
 
 def textured_mesh(views: Sequence[MeshView], planes: Planes, params: TexturedParams, *, ctx: Context) -> TexturedMesh:
     """Return the textured surface that one group of panoramas shows."""
-    volume = empty_volume([(view.range_map, view.cam_from_world) for view in views], cell=params.cell)
+    volume = empty_volume(((view.range_map(), view.cam_from_world) for view in views), cell=params.cell)
     for view in views:
-        size = view.range_map.range.shape
+        range_map = view.range_map()
+        size = range_map.range.shape
         valid = view.image.load_mask() if view.image.size_hw == size else np.ones(size, np.bool_)
-        volume.add(view.range_map, view.cam_from_world, valid, threads=ctx.threads)
+        volume.add(range_map, view.cam_from_world, valid, threads=ctx.threads)
     volume.carve()
     volume.continue_planes(planes)
     volume.close_gaps()

@@ -224,6 +224,16 @@ def test_gaps_between_charts_continue_the_charts() -> None:
     assert {tuple(color) for color in mesh.texture.reshape(-1, 3).tolist()} == known
 
 
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_atlas_does_not_depend_on_the_unit(scale: float) -> None:
+    """Surfaces in small units once had a texture of one texel."""
+    vertices, faces, _ = capture([]).surface
+    expected = unwrapped(vertices, faces, texels_per_unit=TEXELS_PER_UNIT, max_px=512)
+    atlas = unwrapped(vertices * np.float32(scale), faces, texels_per_unit=TEXELS_PER_UNIT / scale, max_px=512)
+    assert max(expected.size_hw) > 100
+    np.testing.assert_allclose(atlas.size_hw, expected.size_hw, rtol=0.1)
+
+
 @pytest.mark.parametrize("triangles_of_part", [50, 1000])
 def test_the_atlas_keeps_the_triangles_and_its_limit(monkeypatch: pytest.MonkeyPatch, triangles_of_part: int) -> None:
     monkeypatch.setattr(atlas_module, "_TRIANGLES_OF_PART", triangles_of_part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from pano_mvs.algorithms.mesh.volume import (
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import MIRROR_CONFIDENCE
 from tests.algorithms.mesh.box import HALF, Capture, box, capture, poses
 from tests.oracles.surfaces import mean_distances
 
@@ -77,6 +79,32 @@ def test_vertices_move_onto_walls_edges_and_corners() -> None:
     same, unmoved = on_planes(surface, NO_PLANES, reach=0.15)
     np.testing.assert_array_equal(same, surface[0])
     assert not unmoved.any()
+
+
+def test_memory_does_not_grow_with_the_number_of_planes() -> None:
+    surface = filled(capture(poses(3))).surface()
+    away = np.tile(AXES, (20, 1)), np.repeat(np.arange(20.0) + 9, 6)
+    many = np.concatenate([WALLS[0], away[0]]), np.concatenate([WALLS[1], away[1]])
+    peaks, results = [], []
+    for planes in (WALLS, many):
+        tracemalloc.start()
+        moved = on_planes(surface, planes, reach=0.15)
+        results.append((*moved, plane_of_faces((moved[0], surface[1]), planes, tolerance=1e-3)))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+    for few, same in zip(*results, strict=True):
+        np.testing.assert_array_equal(few, same)
+
+
+def test_a_long_thin_place_has_no_more_cells_than_allowed() -> None:
+    """Two corridors that form an L, of which rounding up adds a large share."""
+    maps = []
+    for half, center in (((20, 1.3, 1), (20, 0, 0)), ((1, 1.3, 20), (0, 0, 20))):
+        ranges = (np.array(half) / np.abs(ray_grid((32, 64)))).min(axis=-1).astype(np.float32)
+        pose = Rigid3.from_center(np.eye(3), np.array(center, float))
+        maps.append((RangeMap(ranges, np.full(ranges.shape, 200, np.uint8)), pose))
+    assert 0.5 * 5000 < empty_volume(maps, max_cells=5000).distances.size <= 5000
 
 
 def test_planes_continue_behind_a_board_and_not_beyond_the_walls() -> None:
@@ -163,6 +191,21 @@ def test_accurate_measured_ranges_replace_those_on_planes() -> None:
     measured = RangeMap(np.full(shape, 2.1, np.float32), confidence, uncertainty=uncertainty)
     np.testing.assert_allclose(most_certain(laid, measured).range[:, 0], [2.0, 2.0, 2.1, 2.1])
     assert most_certain(laid, replace(measured, uncertainty=None)) is laid
+
+
+def test_reflections_do_not_replace_panes_of_mirrors() -> None:
+    shape = (4, 8)
+    pane = RangeMap(
+        np.full(shape, 2.0, np.float32),
+        np.full(shape, MIRROR_CONFIDENCE, np.uint8),
+        uncertainty=np.full(shape, np.nan, np.float16),
+    )
+    reflection = RangeMap(
+        np.full(shape, 5.0, np.float32), np.full(shape, 200, np.uint8), uncertainty=np.full(shape, 0.005, np.float16)
+    )
+    best = most_certain(pane, reflection)
+    np.testing.assert_array_equal(best.range, pane.range)
+    np.testing.assert_array_equal(best.confidence, pane.confidence)
 
 
 def test_without_ranges_there_is_no_surface() -> None:
