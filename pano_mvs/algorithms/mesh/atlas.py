@@ -66,8 +66,10 @@ def unwrapped(
     area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
     most = max_px * np.sqrt(0.75 / max(area / 2, 1e-30))  # three quarters of a texture are used
     texels = float(min(texels_per_unit, most))
-    # xatlas takes triangles for empty whose area is a small number. A power of 2 changes no digits.
-    scale = 2.0 ** np.round(np.log2(texels))
+    # xatlas takes triangles of less than 1e-7 for empty: in small units all of them, in large ones not even slivers,
+    # whose charts become very long. So triangles have 1/500 on average, as those of a room in metres. A power of 2
+    # changes no digits.
+    scale = 2.0 ** np.round(np.log2(len(faces) / max(area / 2, 1e-30) / 500) / 2)
     atlas = xatlas.Atlas()
     parts = []
     for number in np.unique(region) if region is not None else [-1]:
