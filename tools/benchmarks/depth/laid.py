@@ -2,9 +2,10 @@
 
 `laid.csv` holds such pixels of rendered captures and houses and of synthetic scenes with true poses, drawn by solid
 angle: whether the plane is nearer to the true range than the pixel's own range, and what `laid_evidence` measured.
-Prints, with each place left out in turn, how many of the better planes are laid, and of the worse ones. `--data`,
-`--scene` and `--house` measure places again with the preset quality; rows of other places stay as they are. With
-`--coefficients pano_mvs/algorithms/structure/laid_coefficients.py`, the model replaces the one in use.
+Names that end in “b” are the fifth to ninth view of a capture. Prints, with each place left out in turn, how many of
+the better planes are laid, and of the worse ones. `--data`, `--scene` and `--house` measure places again with the
+preset quality; rows of other places stay as they are. With `--coefficients
+pano_mvs/algorithms/structure/laid_coefficients.py`, the model replaces the one in use.
 """
 
 from __future__ import annotations
