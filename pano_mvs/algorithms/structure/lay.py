@@ -34,8 +34,8 @@ from pano_mvs.scene.surfaces import Structure
 # texture, weak ranges are right no more often than filled ones.
 _WEIGHTS = 1.0, 0.5, 0.3, 0.03
 MIN_PROBABILITY = 1 / 3
-"""A plane is laid above this: a right one that is missing costs twice as much as a wrong one, which has no more errors
-than what it replaces in plain places."""
+"""A plane is laid from this probability on: one that is missing costs twice as much as one too many, since plain pixels
+without a plane are mostly wrong."""
 
 MAX_LAID_SOURCES = 4
 """More sources than this are not compared with planes."""
