@@ -63,7 +63,8 @@ def test_each_layout_gives_the_same_panoramas_with_their_rig(tmp_path: Path, lay
     panorama = found["000.png"]
     assert panorama.size_hw == (32, 64)
     assert panorama.load_mask().all()
-    assert np.array_equal(panorama.load(), tiny_rig_panorama().load())
+    # The poses of rig.yaml may differ in their last bits, and OpenCV looks places up in steps of 1/32 pixel.
+    assert np.abs(panorama.load().astype(int) - tiny_rig_panorama().load()).mean() < 0.1
     assert panorama.rig is not None
     assert panorama.rig.centers == pytest.approx(tiny_rig().centers)
     assert panorama.rig.stitch_distance_m == 3.0
