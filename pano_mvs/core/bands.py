@@ -1,9 +1,13 @@
-"""Process the rows of an image in bands, in threads."""
+"""Process the rows of an image in bands, or a few things, in threads."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _BAND_ROWS = 32
 
@@ -20,10 +24,12 @@ def for_bands(work: Callable[[int, int], object], height: int, *, threads: int, 
         band_rows: number of rows of a band; a call costs about 0.1 ms, which matters if rows are short.
     """
     firsts = range(0, height, band_rows)
+    mapped(lambda first: work(first, min(band_rows, height - first)), firsts, threads=threads)
+
+
+def mapped(work: Callable[[Item], Result], items: Iterable[Item], *, threads: int) -> list[Result]:
+    """Return `work(item)` of each item, in their order, of as many at a time as there are threads."""
     if threads <= 1:
-        for first in firsts:
-            work(first, min(band_rows, height - first))
-        return
+        return [work(item) for item in items]
     with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(lambda first: work(first, min(band_rows, height - first)), firsts):
-            pass
+        return list(pool.map(work, items))

@@ -118,6 +118,7 @@ def scene_planes(
         ranges,
         lambda name: images[name].load(),
         rng=ctx.rng,
+        threads=ctx.threads,
         **arguments_from(find_structure, params),
     )
     ctx.metric("planes", len(found))

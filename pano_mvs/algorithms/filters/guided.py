@@ -56,7 +56,8 @@ def guided_range(
     if not valid.any():
         return range_map
     target, weight = data_term(range_map, domain)
-    smooth, support = guided_values(target, weight, guide.astype(np.float64), radius=radius, epsilon=epsilon)
+    guided = GuidedFilter(weight, guide.astype(np.float64), radius=radius, epsilon=epsilon)
+    smooth, support = guided.values(target), guided.support
     kept = support > 0 if fill else valid & (support > 0)
     smooth = np.clip(smooth, target[valid].min(), target[valid].max())
     ranges = np.full((height, width), np.nan, np.float32)
@@ -67,51 +68,58 @@ def guided_range(
     return with_ranges(range_map, ranges, np.where(valid, range_map.confidence, filled))
 
 
-def guided_values(
-    target: FloatArray, weight: FloatArray, guide: FloatArray, *, radius: int, epsilon: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the filtered values and the mean weight within reach, (H, W) each; there is no value if the weight is 0.
+class GuidedFilter:
+    """The guided filter with a guide and weights, for any number of targets."""
 
-    `target`: (H, W) values, any finite value where the weight is 0. `weight`: (H, W) in [0, 1]. `guide`: (H, W, 3)
-    colours. `radius`: radius of the windows. `epsilon`: ε.
-    """
-    # Colours centred on the middle of their scale lose no digits in the differences of sums below.
-    colors = guide - 128.0
-    area = box_sum(np.ones_like(target), radius)
-    total = box_sum(weight, radius)
-    sure = total > _MIN_SUPPORT * area
-    share = 1 / np.where(sure, total, 1)
-    mean_color = share[..., None] * box_sum(weight[..., None] * colors, radius)
-    mean = share * box_sum(weight * target, radius)
-    covariance = (
-        share[..., None] * box_sum((weight * target)[..., None] * colors, radius) - mean[..., None] * mean_color
-    )
-    slope = _solve_symmetric(
-        _color_covariance(colors, weight, mean_color, share=share, radius=radius), epsilon**2, covariance
-    )
-    offset = mean - np.sum(slope * mean_color, axis=-1)
-    lines = np.concatenate([slope, offset[..., None]], axis=-1)
-    counted = np.where(sure, total / area, 0)
-    averaged = box_spread(counted[..., None] * lines, radius)
-    reach = box_spread(counted, radius)
-    known = reach > _MIN_SUPPORT * area
-    averaged /= np.where(known, reach, 1)[..., None]
-    values = np.sum(averaged[..., :3] * colors, axis=-1) + averaged[..., 3]
-    return values, np.where(known, reach / np.maximum(box_spread(np.ones_like(target), radius), 1), 0)
+    def __init__(self, weight: FloatArray, guide: FloatArray, *, radius: int, epsilon: float) -> None:
+        """Measure the windows.
+
+        `weight`: (H, W) in [0, 1]. `guide`: (H, W, 3) colours. `radius`: radius of the windows. `epsilon`: ε.
+        """
+        self._weight, self._radius = weight[..., None], radius
+        # Colours centred on the middle of their scale lose no digits in the differences of sums below.
+        self._colors = guide - 128.0
+        area, total = box_sum(np.ones_like(weight), radius), box_sum(weight, radius)
+        sure = total > _MIN_SUPPORT * area
+        self._share = 1 / np.where(sure, total, 1)[..., None]
+        self._mean_color = self._share * box_sum(self._weight * self._colors, radius)
+        self._cofactors, self._determinant = _cofactors(self._color_covariance(), epsilon**2)
+        self._counted = np.where(sure, total / area, 0)
+        reach = box_spread(self._counted, radius)
+        known = reach > _MIN_SUPPORT * area
+        self._reach = np.where(known, reach, 1)[..., None]
+        self.support = np.where(known, reach / np.maximum(box_spread(np.ones_like(weight), radius), 1), 0)
+        """The mean weight within reach, (H, W)."""
+
+    def values(self, target: FloatArray) -> FloatArray:
+        """Return the filtered values, (H, W), arbitrary where there is no support.
+
+        `target`: (H, W) values, any finite value where the weight is 0.
+        """
+        known = np.concatenate([np.ones_like(self._weight), self._colors], axis=-1) * (self._weight * target[..., None])
+        mean, products = np.split(self._share * box_sum(known, self._radius), [1], axis=-1)
+        slope = self._solved(products - mean * self._mean_color)
+        offset = mean - np.sum(slope * self._mean_color, axis=-1, keepdims=True)
+        lines = self._counted[..., None] * np.concatenate([slope, offset], axis=-1)
+        averaged = box_spread(lines, self._radius) / self._reach
+        return np.asarray(np.sum(averaged[..., :3] * self._colors, axis=-1) + averaged[..., 3])
+
+    def _color_covariance(self) -> FloatArray:
+        """Return the weighted covariance of the colours in each window, (H, W, 6): rr, rg, rb, gg, gb, bb."""
+        first, second = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+        products = box_sum(self._weight * self._colors[..., first] * self._colors[..., second], self._radius)
+        return np.asarray(self._share * products - self._mean_color[..., first] * self._mean_color[..., second])
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        """Return x of (covariance + ε²) x = right, (H, W, 3)."""
+        x, y, z = np.moveaxis(right, -1, 0)
+        a, b, c, d, e, f = self._cofactors
+        solved = np.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], axis=-1)
+        return np.asarray(solved / self._determinant, np.float64)
 
 
-def _color_covariance(
-    colors: FloatArray, weight: FloatArray, mean: FloatArray, *, share: FloatArray, radius: int
-) -> FloatArray:
-    """Return the weighted covariance of the colours in each window, (H, W, 6): rr, rg, rb, gg, gb, bb."""
-    first, second = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-    products = box_sum(weight[..., None] * colors[..., first] * colors[..., second], radius)
-    covariance: FloatArray = share[..., None] * products - mean[..., first] * mean[..., second]
-    return covariance
-
-
-def _solve_symmetric(matrix: FloatArray, ridge: float, right: FloatArray) -> FloatArray:
-    """Return (matrix + ridge) x = right by cofactors, for (…, 6) upper triangles and (…, 3) right sides."""
+def _cofactors(matrix: FloatArray, ridge: float) -> tuple[tuple[FloatArray, ...], FloatArray]:
+    """Return the cofactors, six of (...,), and the determinant, (..., 1), of (..., 6) upper triangles + ridge."""
     rr, rg, rb, gg, gb, bb = np.moveaxis(matrix, -1, 0)
     rr, gg, bb = rr + ridge, gg + ridge, bb + ridge
     cofactors = (
@@ -122,8 +130,4 @@ def _solve_symmetric(matrix: FloatArray, ridge: float, right: FloatArray) -> Flo
         rb * rg - rr * gb,
         rr * gg - rg * rg,
     )
-    determinant = rr * cofactors[0] + rg * cofactors[1] + rb * cofactors[2]
-    x, y, z = np.moveaxis(right, -1, 0)
-    a, b, c, d, e, f = cofactors
-    solved = np.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], axis=-1)
-    return np.asarray(solved / determinant[..., None], np.float64)
+    return cofactors, (rr * cofactors[0] + rg * cofactors[1] + rb * cofactors[2])[..., None]

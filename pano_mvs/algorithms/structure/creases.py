@@ -31,6 +31,7 @@ from pano_mvs.algorithms.structure.view import (
     world_rays,
 )
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.bands import mapped
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Profiles across a crease: steps to either side.
@@ -57,14 +58,14 @@ _PIECE, _PIECE_RAD, _SCALES_RAD = 12, np.radians(0.05), np.radians([0.2, 0.14, 0
 
 
 def placed_by_creases(
-    views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, max_relative_error: float
+    views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, max_relative_error: float, threads: int = 1
 ) -> list[ScenePlane]:
     """Return the planes moved to where the pictures show their creases; level planes first.
 
     Planes without support that show no clear ones are left out. `views`: of one group, in whose world y points down
     along gravity. `planes`: found in ranges and outlines. `max_relative_error`: of ranges on a plane.
     """
-    creases = _creases(views, planes, max_relative_error)
+    creases = _creases(views, planes, max_relative_error, threads=threads)
     level_distances = [_level_distance(plane, views) if plane.is_level else 0.0 for plane in planes]
     heights = np.array([plane.y if plane.is_level else np.nan for plane in planes])
     placed = {idx: _Placement(planes[idx], of_plane) for idx, of_plane in sorted(creases.items())}
@@ -326,21 +327,33 @@ def _reliability(residual: FloatArray, weight: FloatArray, scale: float) -> Floa
     return np.asarray(alike / (1 + (weight * alike).sum() * variance))
 
 
-def _creases(views: Sequence[PlaneView], planes: Sequence[ScenePlane], tolerance: float) -> dict[int, _Creases]:
+def _creases(
+    views: Sequence[PlaneView], planes: Sequence[ScenePlane], tolerance: float, *, threads: int
+) -> dict[int, _Creases]:
     """Return the creases of each upright plane that has any."""
+    pairs = [
+        (idx, level)
+        for idx, upright in enumerate(planes)
+        for level, other in enumerate(planes)
+        if other.is_level and not upright.is_level
+    ]
+
+    def seen_in(view: PlaneView) -> list[tuple[int, tuple[FloatArray, ...]]]:
+        labels, picture = _shown_planes(view, planes, tolerance), blurred(view.load())
+        found: list[tuple[int, tuple[FloatArray, ...]]] = []
+        for idx, level in pairs:
+            sides = labels == idx, labels == level
+            profiles = _profiles(view, planes[idx], planes[level].y, picture=picture, sides=sides)
+            if profiles is not None:
+                azimuth, dip, differences = profiles
+                center = np.broadcast_to(view.cam_from_world.center, (len(azimuth), 3))
+                found.append((idx, (azimuth, dip, center, np.full(len(azimuth), level), differences)))
+        return found
+
     parts: dict[int, list[tuple[FloatArray, ...]]] = {}
-    for view in views:
-        labels = _shown_planes(view, planes, tolerance)
-        picture = blurred(view.load())
-        for idx, upright in enumerate(planes):
-            for level, other in enumerate(planes):
-                if upright.is_level or not other.is_level:
-                    continue
-                found = _profiles(view, upright, other.y, picture=picture, sides=(labels == idx, labels == level))
-                if found is not None:
-                    azimuth, dip, differences = found
-                    center = np.broadcast_to(view.cam_from_world.center, (len(azimuth), 3))
-                    parts.setdefault(idx, []).append((azimuth, dip, center, np.full(len(azimuth), level), differences))
+    for of_view in mapped(seen_in, views, threads=threads):
+        for idx, part in of_view:
+            parts.setdefault(idx, []).append(part)
     return {idx: _joined(of_plane) for idx, of_plane in parts.items()}
 
 

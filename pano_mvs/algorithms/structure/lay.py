@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.guided import guided_values
+from pano_mvs.algorithms.filters.guided import GuidedFilter
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
 from pano_mvs.algorithms.structure.laid import OtherView, Seen, laid_evidence, seen_by
@@ -261,6 +261,7 @@ def _labels(
     # The weight of the outline of the room where nothing is confirmed.
     prior = np.zeros(ranges.shape) if outlined is None else 0.2 * ((outlined >= 0) & ~confirmed)
     area = pixel_solid_angle(confidence.shape[:2])[:, None] / (4 * np.pi)
+    guided = GuidedFilter(weight + prior, guide.astype(np.float64), radius=8, epsilon=8.0)
     # What a pixel without a plane costs, where 1 is a range that is not on the plane.
     best, label = np.full(ranges.shape, 0.6), np.full(ranges.shape, -1, np.int16)
     for number, on_plane in enumerate(on_planes):
@@ -273,7 +274,7 @@ def _labels(
         unknown = np.isfinite(on_plane) & ~np.isfinite(ranges)
         cost = np.where(unknown, 0.5, np.minimum(np.nan_to_num(error, nan=1.0), 1.0))
         cost = (weight * cost + prior * ~shown) / (weight + prior)
-        filtered, _ = guided_values(cost, weight + prior, guide.astype(np.float64), radius=8, epsilon=8.0)
+        filtered = guided.values(cost)
         better = (filtered < best) & np.isfinite(on_plane)
         best[better], label[better] = filtered[better], number
     return label

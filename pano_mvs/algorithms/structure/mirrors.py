@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_ranges
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
+from pano_mvs.core.bands import mapped
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
@@ -40,13 +41,14 @@ _NOISE_LEVELS = 3.0
 _DOWN = np.array([0.0, 1.0, 0.0])
 
 
-def find_mirrors(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[FloatArray]:
+def find_mirrors(views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, threads: int = 1) -> list[FloatArray]:
     """Return the corners (4, 3) in the world of the mirrors on upright planes, rectangles with level edges.
 
     `views`: of one group; at least two must see a mirror. `planes`: of the place.
     """
     seen = [_Seen.of(view) for view in views]
-    found = [one for plane in planes if not plane.is_level for one in _mirrors_on(plane, seen)]
+    walls = [plane for plane in planes if not plane.is_level]
+    found = [one for of_wall in mapped(lambda wall: _mirrors_on(wall, seen), walls, threads=threads) for one in of_wall]
     kept: list[FloatArray] = []
     for _, corners, center in sorted(found, key=lambda one: -one[0]):
         middle = corners.mean(axis=0) - center

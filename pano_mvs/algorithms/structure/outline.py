@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.structure.skyline import (
-    AZIMUTHS,
     DISTANCES,
     LEAST_COSINE,
     TURN_VIEWS,
@@ -27,8 +26,9 @@ from pano_mvs.algorithms.structure.skyline import (
     room_heights,
     search_walls,
 )
-from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, plane_ranges
+from pano_mvs.algorithms.structure.view import AZIMUTHS, PlaneView, ScenePlane, azimuths_of, plane_ranges
 from pano_mvs.core.arrays import FloatArray
+from pano_mvs.core.bands import mapped
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 Labels = NDArray[np.int64]
@@ -107,15 +107,15 @@ def room_labels(room: Room, rays: FloatArray, ranges: Sequence[FloatArray]) -> L
     return np.where(wall >= 0, label, -1)
 
 
-def outline_planes(views: Sequence[PlaneView], planes: Sequence[ScenePlane]) -> list[ScenePlane]:
+def outline_planes(views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, threads: int = 1) -> list[ScenePlane]:
     """Return upright planes that outlines show and that are not among `planes`, which have the level ones."""
     indoors = [view for view in views if possible_rooms(planes, view.cam_from_world.center)]
     if not indoors:
         return []
     turn = clearest_turn(coarsely_around(indoors, planes, TURN_VIEWS), planes)
-    walls = [wall for view in indoors for wall in _walls_of(around_view(view, planes), planes, turn)]
+    walls = mapped(lambda view: _walls_of(around_view(view, planes), planes, turn), indoors, threads=threads)
     found: list[ScenePlane] = []
-    for _, wall, center in sorted(walls, key=lambda wall: -wall[0]):
+    for _, wall, center in sorted((wall for of_view in walls for wall in of_view), key=lambda wall: -wall[0]):
         if not any(same_wall(wall, other, center[None]) for other in (*planes, *found)):
             found.append(wall)
     return found
@@ -182,17 +182,11 @@ def _confirmed(view: PlaneView, wall: ScenePlane, *, down: float, up: float) -> 
         ratio = view.ranges / on_wall
         votes = 1.0 * (np.abs(ratio - 1) < _SAME_DISTANCE) - (ratio > 1 + _SAME_DISTANCE)
     votes *= view.confidence >= CONSISTENT_CONFIDENCE[0]
-    azimuth = azimuths_of(view.rays)[between]
+    azimuth = view.azimuth[between]
     area, voted = (
         np.bincount(azimuth, weights=weight[between], minlength=AZIMUTHS) for weight in (view.area, view.area * votes)
     )
     return np.asarray(voted / np.maximum(area, 1e-12))
-
-
-def azimuths_of(rays: FloatArray) -> Labels:
-    """Return the column of an outline of rays (..., 3) in the world."""
-    azimuth = np.arctan2(rays[..., 0], rays[..., 2]) * AZIMUTHS / (2 * np.pi)
-    return np.asarray(azimuth.round().astype(np.int64) % AZIMUTHS)
 
 
 def _pieces(label: Labels) -> list[tuple[int, int]]:

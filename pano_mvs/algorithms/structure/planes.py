@@ -35,12 +35,17 @@ _PAIR_COSINES = 0.9, 0.9985
 
 
 def find_planes(
-    views: Sequence[PlaneView], *, rng: np.random.Generator, max_relative_error: float, min_share: float
+    views: Sequence[PlaneView],
+    *,
+    rng: np.random.Generator,
+    max_relative_error: float,
+    min_share: float,
+    threads: int = 1,
 ) -> list[ScenePlane]:
     """Return the planes of one group of views, whose world has y down along gravity; level planes first.
 
     `views`: of one group. `rng`: draws points and planes. `max_relative_error`: of the ranges of points on a plane.
-    `min_share`: least support of a plane, in spheres: 1 if it filled one view.
+    `min_share`: least support of a plane, in spheres: 1 if it filled one view. `threads`: number of threads.
     """
     points = _drawn_points(views, rng)
     if points is None:
@@ -54,8 +59,8 @@ def find_planes(
     planes = moved_ceilings(views, planes)
     planes += supposed_ceiling(views, planes)
     planes += _upright_planes(points, rng=rng, tolerance=max_relative_error, least=least)
-    planes += outline_planes(views, planes)
-    return placed_by_creases(views, planes, max_relative_error=max_relative_error)
+    planes += outline_planes(views, planes, threads=threads)
+    return placed_by_creases(views, planes, max_relative_error=max_relative_error, threads=threads)
 
 
 @dataclass(eq=False)
@@ -261,6 +266,7 @@ def find_structure(
     load: Callable[[str], Picture],
     *,
     rng: np.random.Generator,
+    threads: int = 1,
     max_relative_error: Annotated[float, Setting("maximum relative error of a range on a plane", gt=0, le=1)] = 0.02,
     min_share: Annotated[
         float, Setting("least extent of a plane, as a share of the sphere, in the mean over the views", gt=0, le=1)
@@ -275,6 +281,7 @@ def find_structure(
         range_maps: by name, those of all views that have one.
         load: returns the panorama of a view, (H, W, 3) RGB.
         rng: draws points and planes.
+        threads: number of threads.
     """
     planes, groups, mirrors, mirror_groups = [], [], [], []
     for number, group in enumerate(split_groups(poses)):
@@ -286,10 +293,10 @@ def find_structure(
             for idx, name in named
         ]
         share = min_share * len(views)
-        found = find_planes(views, rng=rng, max_relative_error=max_relative_error, min_share=share)
+        found = find_planes(views, rng=rng, max_relative_error=max_relative_error, min_share=share, threads=threads)
         planes += found
         groups += [number] * len(found)
-        panes = find_mirrors(views, found)
+        panes = find_mirrors(views, found, threads=threads)
         mirrors += panes
         mirror_groups += [number] * len(panes)
     return Structure(

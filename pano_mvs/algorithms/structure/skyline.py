@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.structure.kernels_creases import edge_clarities
 from pano_mvs.algorithms.structure.view import (
+    AZIMUTHS,
     HALF_DIFFERENCE,
     STEP_RAD,
     PlaneView,
@@ -27,8 +29,6 @@ from pano_mvs.algorithms.structure.view import (
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 
-AZIMUTHS = 360
-"""Azimuths of an outline, from the z axis of the world towards its x axis."""
 LEAST_COSINE = 0.1
 """Least cosine of the angle between a level ray and the normal of a wall that is seen."""
 _HALF_WINDOW = 4  # azimuths along a crease
@@ -69,32 +69,16 @@ class Skyline:
 
     def crease_clarity(self, distance: FloatArray, height: float) -> FloatArray:
         """Return how clear one crease of walls is, at a height above the camera that is negative for the floor."""
-        seen = np.isfinite(distance)
-        distance = np.where(seen, distance, 1.0)
-        clear = self._edge_clarity(distance, height, seen)
+        beside = [height * (1 + share) for share in (*_SKIRTINGS, *(-share for share in _SKIRTINGS)) if height < 0]
+        edges = np.empty((1 + len(beside), *distance.shape), np.float32)
+        edge_clarities(
+            self.differences, distance, np.array([height, *beside]), _APART_RAD, self.half_window, CLEAR_LEVELS, edges
+        )
+        clear = edges[0]
         if height < 0:
-            elevation, other = np.arctan2(height, distance), []
-            for sign in (1, -1):
-                clearest = np.zeros(clear.shape)
-                for part in _SKIRTINGS:
-                    beside = height * (1 - sign * part)
-                    apart = np.abs(np.arctan2(beside, distance) - elevation) > _APART_RAD
-                    clearest = np.maximum(clearest, self._edge_clarity(distance, beside, seen & apart))
-                other.append(clearest)
-            clear *= (1 + other[0] - other[1]).astype(np.float32)
-        return np.where(seen, clear, -np.inf)
-
-    def _edge_clarity(self, distance: FloatArray, height: float, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return how clear the edges of walls at a height are, from 0 to 1; 0 where they do not count."""
-        common = mean_along(self._at(np.arctan2(height, distance)) * counted[..., None], self.half_window)
-        return np.asarray(np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / CLEAR_LEVELS, 1.0)))
-
-    def _at(self, elevation: FloatArray) -> NDArray[np.float32]:
-        place = (elevation + np.pi / 2) / STEP_RAD
-        first = np.clip(place.astype(np.int64), 0, len(self.differences) - 2)
-        part = (place - first)[..., None].astype(np.float32)
-        column = np.arange(self.differences.shape[1])
-        return np.asarray(self.differences[first, column] * (1 - part) + self.differences[first + 1, column] * part)
+            below, above = edges[1 : 1 + len(_SKIRTINGS)].max(axis=0), edges[1 + len(_SKIRTINGS) :].max(axis=0)
+            clear = clear * (1 + above - below)
+        return np.where(np.isfinite(distance), clear, -np.inf)
 
 
 def skyline(picture: NDArray[np.float32], cam_from_world: Rigid3, step: int = 1) -> Skyline:

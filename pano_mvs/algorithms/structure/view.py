@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import cv2
@@ -29,6 +30,10 @@ LEAST_UNCERTAINTY = 0.002
 _ROWS = 256
 
 
+AZIMUTHS = 360
+"""Azimuths of an outline, from the z axis of the world towards its x axis."""
+
+
 @dataclass(frozen=True, eq=False)
 class PlaneView:
     """A view on a grid of 256 to 511 rows and twice as many columns, or of all pixels of smaller ones.
@@ -45,6 +50,17 @@ class PlaneView:
     confidence: NDArray[np.uint8]
     uncertainty: FloatArray
     area: FloatArray
+
+    @cached_property
+    def azimuth(self) -> NDArray[np.int64]:
+        """The azimuth of an outline in which each pixel lies, (h, w)."""
+        return azimuths_of(self.rays)
+
+
+def azimuths_of(rays: FloatArray) -> NDArray[np.int64]:
+    """Return the azimuth of an outline in which rays (..., 3) of the world lie."""
+    azimuth = np.arctan2(rays[..., 0], rays[..., 2]) * AZIMUTHS / (2 * np.pi)
+    return np.asarray(azimuth.round().astype(np.int64) % AZIMUTHS)
 
 
 def grid_rows(height: int) -> int:

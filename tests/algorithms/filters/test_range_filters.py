@@ -16,7 +16,7 @@ from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.consistency import checked_with_agreement
 from pano_mvs.algorithms.filters.data_term import confidence_weight, require_confidence
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours, large_holes
-from pano_mvs.algorithms.filters.guided import guided_range, guided_values
+from pano_mvs.algorithms.filters.guided import GuidedFilter, guided_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.smoothing import gaussian_range, median_range, remove_speckles
 from pano_mvs.algorithms.filters.supported import supported_pixels
@@ -175,7 +175,8 @@ def test_guided_values_are_least_squares_in_every_window() -> None:
             lines[y, x] = np.linalg.solve(normal, design.T @ (w * target[at]))
             share[y, x] = total / len(w)
     holding = {place: tuple(np.array(windows).T) for place, windows in holders.items()}
-    values, support = guided_values(target, weight, COLORS.astype(float), radius=radius, epsilon=epsilon)
+    guided = GuidedFilter(weight, COLORS.astype(float), radius=radius, epsilon=epsilon)
+    values, support = guided.values(target), guided.support
     for y, x in [(0, 0), (0, 30), (5, 47), (12, 20), (23, 3)]:
         at = holding[y, x]
         mean = (share[at][:, None] * lines[at]).sum(axis=0) / share[at].sum()
