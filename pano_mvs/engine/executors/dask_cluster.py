@@ -28,7 +28,7 @@ from pano_mvs.core.extras import import_extra, installed_version
 from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.core.paths import below, children, is_file
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code.plugin_digest import code_texts
+from pano_mvs.engine.stages.stage_code import code_texts
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads

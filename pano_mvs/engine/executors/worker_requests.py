@@ -14,7 +14,7 @@ from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import is_inside
 from pano_mvs.core.process_state import ProcessState, has_plugins, load_libraries
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code.plugin_digest import code_digest
+from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.unit_json import unit_from_json

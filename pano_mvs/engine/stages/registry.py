@@ -25,7 +25,7 @@ from pano_mvs.core.named_registry import Registration, registrations_of, set_una
 from pano_mvs.core.paths import below, children, home_folder, is_file, resolved
 from pano_mvs.core.process_state import loading_plugin
 from pano_mvs.core.text import shortened
-from pano_mvs.engine.code.plugin_digest import code_digest
+from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
 
 ENTRY_POINT_GROUP = "pano_mvs.plugins"
