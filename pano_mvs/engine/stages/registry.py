@@ -23,7 +23,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import below, children, home_folder, is_file, resolved
-from pano_mvs.core.process_state import loading_plugin
+from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
@@ -149,7 +149,7 @@ class Registry:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
         try:
             ours = entry.value.partition(".")[0] == "pano_mvs"
-            with redirect_stdout(sys.stderr), nullcontext() if ours else loading_plugin():
+            with redirect_stdout(sys.stderr), nullcontext() if ours else restored_state():
                 module = entry.load()
             if not isinstance(module, ModuleType):
                 raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
@@ -265,7 +265,7 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
-        with redirect_stdout(sys.stderr), loading_plugin():  # commands write their results to the standard output
+        with redirect_stdout(sys.stderr), restored_state():  # commands write their results to the standard output
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
