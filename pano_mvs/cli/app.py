@@ -41,7 +41,6 @@ from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
-from pano_mvs.session.sudden_exit import turn_exits_into_errors
 
 app = typer.Typer(
     name="pano-mvs",
@@ -661,7 +660,6 @@ def main() -> None:
     bound_environment(os.environ, available_threads())  # before a command loads the libraries
     output = protect_standard_streams()
     faulthandler.enable(os.dup(2))  # a stage in this process may redirect descriptor 2
-    turn_exits_into_errors()
     try:
         app()
     except SystemExit as end:

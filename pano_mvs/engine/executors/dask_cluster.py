@@ -28,11 +28,11 @@ from pano_mvs.core.extras import import_extra, installed_version
 from pano_mvs.core.files import make_folder, temporary_prefix
 from pano_mvs.core.paths import below, children, is_file
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.stages.stage_code import code_texts
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.stages.stage_code import code_texts
 
 _CONNECT_S = 20.0
 

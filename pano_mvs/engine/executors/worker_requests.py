@@ -13,12 +13,12 @@ from typing import Any
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import is_inside
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.unit_json import unit_from_json
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage_code import code_digest
 
 
 def run_request(request: Mapping[str, Any]) -> JobOutcome:

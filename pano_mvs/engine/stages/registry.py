@@ -25,8 +25,8 @@ from pano_mvs.core.named_registry import Registration, registrations_of, set_una
 from pano_mvs.core.paths import below, children, home_folder, is_file, resolved
 from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import shortened
-from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
+from pano_mvs.engine.stages.stage_code import code_digest
 
 ENTRY_POINT_GROUP = "pano_mvs.plugins"
 

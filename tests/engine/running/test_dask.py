@@ -16,10 +16,10 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.stages.stage_code import code_texts, stage_code
 from pano_mvs.engine.executors import dask_cluster
 from pano_mvs.engine.executors.choose import SerialExecutor
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
+from pano_mvs.engine.stages.stage_code import code_texts, stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
 from tests.engine.running.test_run import ALL_UNITS

@@ -153,7 +153,7 @@ _NO_NAMES = {
     *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.keyframe_file.read_times"),
     *("io.images.metadata.read_container", "io.splats.open_mask", "io.meshes.read_glb"),
     *(f"io.poses.json_files.{name}" for name in ("read_json", "read_json_value")),
-    *("report.cloud_pictures.read_pictures", "session.merging.block_runs.open_blocks", "session.session.open_session"),
+    *("session.merging.block_runs.open_blocks", "session.session.open_session"),
 }
 
 
