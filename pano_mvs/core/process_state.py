@@ -58,7 +58,7 @@ def _cv2() -> Any:
 
 def _numpy_random() -> tuple[Any, ...]:
     name, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002  # plugins may use it
-    return name, bytes(keys), *rest
+    return name, np.asarray(keys).tobytes(), *rest
 
 
 def _set_numpy_random(state: tuple[Any, ...]) -> None:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
+from pano_mvs.results.pictures import Picture
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
-
-UP = np.array([0.0, -1.0, 0.0])
 
 
 def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None) -> Page:
@@ -123,4 +125,11 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(
     assert again.notes == []
     elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
     assert "contains no run" in elsewhere.notes[0]
-    assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
+    assert StoredValues.of_folder(out_dir, RunSummary(), store).refs == {}
+
+
+def decoded(picture: Picture) -> NDArray[Any]:
+    data = base64.b64decode(picture.uri.partition(",")[2])
+    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image

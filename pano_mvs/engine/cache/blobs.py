@@ -29,6 +29,9 @@ from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
 
+FOLDER_DIGITS = 3
+"""Number of digits of a key or digest in the name of the folder of its file."""
+
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
 _MAGIC = np.lib.format.magic(1, 0)
 
@@ -78,12 +81,11 @@ class BlobStore:
     A new blob is a file. Arrays and JSON values may be moved into packs later, even while they are in use.
     """
 
-    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
+    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
         self.root = root
         self.packs = Packs(root)
         self.durable = durable
         self._folder = str(root / "blobs")
-        self._digits = folder_digits
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
@@ -117,7 +119,7 @@ class BlobStore:
         if ref.external:
             return self._external.get(ref.digest, f"unregistered/{ref.digest}")
         # A text, because creating a Path takes ten times as long.
-        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"
+        return f"{self._folder}/{ref.digest[:FOLDER_DIGITS]}/{ref.digest}{ref.suffix}"
 
     def exists(self, ref: BlobRef) -> bool:
         """Return whether a blob exists and has the right size; its bytes are checked when it is read."""
