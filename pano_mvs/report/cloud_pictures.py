@@ -37,10 +37,9 @@ def cloud_pictures(results: StoredValues, kept: EarlierPage, *, up: NDArray[np.f
     stem = f"{digest[:24]}.{results.digest('poses')[:16]}.s{VERSION}"
     known = kept.fact(stem)
     earlier = [kept.picture(f"{stem}.{number}") for number in range(3)]
-    if isinstance(known, dict) and all(earlier) and len(known.get("titles", ())) == 3:
-        titles = [str(title) for title in known["titles"]]
-        pairs = tuple((title, found) for title, found in zip(titles, earlier, strict=True) if found is not None)
-        return CloudPictures(pairs, str(known.get("note", "")))
+    if known is not None and all(earlier):
+        pairs = tuple((title, found) for title, found in zip(known["titles"], earlier, strict=True) if found)
+        return CloudPictures(pairs, known["note"])
     whole, all_poses = results.cloud, results.poses
     if whole is None or not len(whole.groups()[0]):
         return CloudPictures()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
@@ -78,6 +80,7 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(
     path.write_text(text[:facts] + "[1, {" + text[end:])
     assert_sound(reported(out_dir, summary_of(tiny), results))
     path.write_text(text.replace('"shares":', '"shares": "<b>", "other":'))
+    assert EarlierPage.of_file(path).fact(next(iter(json.loads(text[facts:end])))) is None
     page = reported(out_dir, summary_of(tiny), results)
     assert_sound(page)
     assert "<b>" not in page.words
