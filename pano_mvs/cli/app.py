@@ -197,7 +197,7 @@ def run(given: RunArguments) -> None:
     from pano_mvs.cli.blocks_command import run_decided
     from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
-    from pano_mvs.session.merging.automatic import decision_of
+    from pano_mvs.session.merging.block_runs import decision_of
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
@@ -291,7 +291,7 @@ def plan(
     from pano_mvs.cli.blocks_command import show_blocks
     from pano_mvs.cli.plan_commands import explain_unit, show_plan
     from pano_mvs.engine.planning.plan import RunOptions
-    from pano_mvs.session.merging.automatic import decide_blocks
+    from pano_mvs.session.merging.block_runs import decide_blocks
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import check_output, open_session
 
@@ -335,7 +335,7 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Write the JSON Schema of workflows, for completion and validation in editors."""
-    from pano_mvs.cli.workflow_commands import show_schema
+    from pano_mvs.cli.plan_commands import show_schema
 
     show_schema(workflow, out)
 
@@ -353,7 +353,7 @@ def show(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Print a workflow and the files that it extends, or one file with all settings."""
-    from pano_mvs.cli.workflow_commands import show_workflow
+    from pano_mvs.cli.plan_commands import show_workflow
     from pano_mvs.session.session import open_session
 
     show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
