@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -39,6 +39,7 @@ _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _DISTRIBUTIONS: Mapping[str, tuple[str, ...]] = {
     "cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "PIL": ("pillow",),
+    "ruamel": ("ruamel.yaml",),
 }
 _SHOWN_AS = {"cv2": "OpenCV"}
 _IGNORED = frozenset(
@@ -50,8 +51,8 @@ _IGNORED = frozenset(
     }
 )
 
-_Import: TypeAlias = tuple[int, str, tuple[str, ...]]  # level, module ("" for `from .`), and names
-_Parsed: TypeAlias = tuple[str, tuple[_Import, ...]]  # digest of what a module executes, and its imports
+_Import: TypeAlias = tuple[int, str, Sequence[str]]  # level, module ("" for `from .`), and names
+_Parsed: TypeAlias = tuple[str, Sequence[_Import]]  # digest of what a module executes, and its imports
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +184,7 @@ class _Roots:
     def files(self, dotted: str) -> list[Path]:
         found = [] if self.folder is None else _module_files(self.folder, dotted)
         if self.package is not None and dotted.partition(".")[0] == self.package.name:
-            found.extend(_module_files(self.package.parent, dotted))
+            found += (_our_files if self.package == _OURS else _module_files)(self.package.parent, dotted)
         return found
 
 
@@ -196,24 +197,27 @@ class _Code:
 
     def collect(self, pending: list[Path], roots: _Roots) -> None:
         """Add some files and what they import from the roots."""
+        seen: set[Path] = set()
         while pending:
             path = pending.pop()
-            name = roots.name_of(path)
-            if name in self.files or (name.startswith(_LEFT_OUT) and name != _KEPT):
+            if path in seen:
                 continue
-            self.files[name], files, outer = (_our_module if roots.package == _OURS else _module)(path, roots)
-            pending += files
-            self.outer |= outer
+            seen.add(path)
+            name = roots.name_of(path)
+            if not name.startswith(_LEFT_OUT) or name == _KEPT:
+                self.files[name], files, outer = (_our_module if roots.package == _OURS else _module)(path, roots)
+                pending += files - seen
+                self.outer |= outer
 
 
-def _module(path: Path, roots: _Roots) -> tuple[str, list[Path], set[str]]:
+def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
     """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
         digest, imports = _parsed(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         error.filename = str(path)
         raise
-    files: list[Path] = []
+    files: set[Path] = set()
     outer: set[str] = set()
     for level, module, names in imports:
         dotted = [module, *(f"{module}.{name}" if module else name for name in names)]
@@ -222,10 +226,10 @@ def _module(path: Path, roots: _Roots) -> tuple[str, list[Path], set[str]]:
             dotted = [*homes, *(f"{home}.{name}" for home, name in zip(homes, names, strict=True))]
         if level:
             base = path.parent.joinpath(*[".."] * (level - 1)).resolve()
-            files += [base / "__init__.py"] if (base / "__init__.py").is_file() else []  # the names may be its own
-            files += [file for name in dotted for file in _module_files(base, name)]
+            files.update([base / "__init__.py"] if (base / "__init__.py").is_file() else [])  # names may be its own
+            files.update(file for name in dotted for file in _module_files(base, name))
         elif found := [file for name in dotted for file in roots.files(name)]:
-            files += found
+            files.update(found)
         else:
             outer.update(dotted)
     return digest, files, outer
@@ -248,6 +252,9 @@ def _module_files(base: Path, dotted: str) -> list[Path]:
     if parts:
         candidates.append(base.joinpath(*parts).with_suffix(".py"))
     return [candidate for candidate in candidates if candidate.is_file()]
+
+
+_our_files = cache(_module_files)
 
 
 @lru_cache(maxsize=4096)
@@ -292,12 +299,8 @@ _FILE = f"{sys.version_info.major}.{sys.version_info.minor}.json"
 def _known_parsed() -> dict[str, _Parsed]:
     """Return what earlier processes have parsed; nothing if the file is missing or damaged."""
     try:
-        kept = json.loads((user_cache_folder() / "pano-mvs" / "code" / _FILE).read_bytes())
-        return {
-            str(key): (str(digest), tuple((int(level), str(module), tuple(names)) for level, module, names in imports))
-            for key, (digest, imports) in kept.items()
-        }
-    except (OSError, ValueError, TypeError, AttributeError, RuntimeError):
+        return dict(json.loads((user_cache_folder() / "pano-mvs" / "code" / _FILE).read_bytes()))
+    except (OSError, ValueError, TypeError, RuntimeError):
         return {}
 
 

@@ -179,7 +179,7 @@ def test_what_was_parsed_is_kept_for_later_processes(tmp_path: Path, monkeypatch
     before = code_digest(plugin)
     stage_code_module._keep_parsed()
     place = next((tmp_path / "kept").rglob("*.json"))
-    for damage in ("", "{", "[]", '{"a": 1}'):
+    for damage in ("", "{", "[]", "1"):
         if damage:
             place.write_text(damage)
         later_process()
