@@ -214,7 +214,7 @@ class BlobStore:
         if ref in self._verified:
             return place
         if isinstance(place, Path) and not ref.external:
-            self._refuse_link(place)
+            refuse_link(place)
         while True:
             try:
                 is_intact = _is_intact(place, ref)
@@ -280,19 +280,19 @@ class BlobStore:
 
     def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
         path = self.path(ref)
-        self._refuse_link(path)
+        refuse_link(path)
         self._verified.discard(ref)  # it is missing or damaged
         if is_folder(path):
             make_room(path)
         return replacing(path, temporary_in=self.temporary, durable=self.durable)
 
-    @staticmethod
-    def _refuse_link(path: Path) -> None:
-        if is_link(path.parent):
-            raise StoreError(
-                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
-                "with --cache DIR"
-            )
+
+def refuse_link(path: Path) -> None:
+    """Raise StoreError if the folder of a file in a cache is a link, which caches do not have."""
+    if is_link(path.parent):
+        raise StoreError(
+            f"{path.parent} is a link, but caches have no links: remove it, or choose another cache with --cache DIR"
+        )
 
 
 def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:

@@ -128,13 +128,7 @@ class RunHistory:
         Raises:
             StoreError: if it cannot be removed.
         """
-        path = self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise StoreError(
-                f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache"
-            ) from error
+        delete(self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json")
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
@@ -143,6 +137,14 @@ class RunHistory:
 
     def _paths(self, folder: str, pattern: str) -> list[Path]:
         return [path for path in children(self.root / folder, pattern) if is_file(path) and path.name[0] != "."]
+
+
+def delete(path: Path) -> None:
+    """Delete a file of a cache; raise StoreError if that is impossible."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache") from error
 
 
 def _read(path: Path) -> RunEntry | None:

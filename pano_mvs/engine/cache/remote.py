@@ -23,7 +23,7 @@ from pano_mvs.core.errors import PanoMvsError, StoreError, UsageError
 from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import CACHE_MARK, checked_body, read_regular, remove_whole, replacing
 from pano_mvs.core.paths import below, is_file, is_link
-from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, refuse_link
 from pano_mvs.engine.cache.packs import RECORD, values_of
 from pano_mvs.engine.cache.store import Store, record_from_bytes
 
@@ -111,8 +111,7 @@ class RemoteCache:
 
         def copy(name: str) -> None:
             path = store.root / name
-            if is_link(path.parent):
-                raise StoreError(f"{path.parent} is a link, but caches have no links: remove it")
+            refuse_link(path)
             with replacing(path, temporary_in=store.root / "tmp", durable=store.durable) as temporary:
                 self._files.get_file(self._path(name), str(temporary))
                 if problem := _problem(name, temporary, index=path):

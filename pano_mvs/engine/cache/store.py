@@ -38,7 +38,7 @@ from pano_mvs.core.files import (
     write_text,
 )
 from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
-from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, BlobRef, BlobStore, DamagedBlobError, PackedRefs
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, BlobRef, BlobStore, DamagedBlobError, PackedRefs, refuse_link
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packs import RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
@@ -324,11 +324,7 @@ class Store:
             self.blobs.packs.forget([packed])
         body = json.dumps(record.to_json(), sort_keys=True).encode()
         path = self.record_path(record.key)
-        if is_link(path.parent):
-            raise StoreError(
-                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
-                "with --cache DIR"
-            )
+        refuse_link(path)
         if is_folder(path):
             make_room(path)
         write_checked(path, body, temporary_in=self.blobs.temporary, durable=self.durable)
