@@ -211,16 +211,7 @@ def run(given: RunArguments) -> None:
         out=given.out,
         run_options=run_options,
     )
-    execution = Execution(
-        given.executor,
-        given.workers,
-        given.threads,
-        given.scheduler,
-        given.queue,
-        given.min_free,
-        given.durable,
-        given.otel,
-    )
+    execution = Execution(**{field.name: getattr(given, field.name) for field in fields(Execution)})
     decision = decision_of(
         session,
         execution,
