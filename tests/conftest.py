@@ -25,8 +25,6 @@ settings.register_profile("untimed", deadline=None, suppress_health_check=[Healt
 settings.load_profile("untimed")
 # A worker takes longer to start than most of the small runs in here take; tests of the executors name theirs.
 os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
-# PyVista takes seconds to start; the tests of its pictures name it.
-os.environ.setdefault("PANO_MVS_RENDERER", "software")
 # The tests write 100,000 small files. Some disks need a millisecond to delete one, and memory does not.
 MEMORY = Path("/dev/shm")
 if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4 << 30:

@@ -41,7 +41,6 @@ from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
-from pano_mvs.session.sudden_exit import turn_exits_into_errors
 
 app = typer.Typer(
     name="pano-mvs",
@@ -198,7 +197,7 @@ def run(given: RunArguments) -> None:
     from pano_mvs.cli.blocks_command import run_decided
     from pano_mvs.cli.run.ending import notified
     from pano_mvs.engine.planning.plan import RunOptions
-    from pano_mvs.session.merging.automatic import decision_of
+    from pano_mvs.session.merging.block_runs import decision_of
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
@@ -212,16 +211,7 @@ def run(given: RunArguments) -> None:
         out=given.out,
         run_options=run_options,
     )
-    execution = Execution(
-        given.executor,
-        given.workers,
-        given.threads,
-        given.scheduler,
-        given.queue,
-        given.min_free,
-        given.durable,
-        given.otel,
-    )
+    execution = Execution(**{field.name: getattr(given, field.name) for field in fields(Execution)})
     decision = decision_of(
         session,
         execution,
@@ -292,7 +282,7 @@ def plan(
     from pano_mvs.cli.blocks_command import show_blocks
     from pano_mvs.cli.plan_commands import explain_unit, show_plan
     from pano_mvs.engine.planning.plan import RunOptions
-    from pano_mvs.session.merging.automatic import decide_blocks
+    from pano_mvs.session.merging.block_runs import decide_blocks
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import check_output, open_session
 
@@ -336,7 +326,7 @@ def schema(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Write the JSON Schema of workflows, for completion and validation in editors."""
-    from pano_mvs.cli.workflow_commands import show_schema
+    from pano_mvs.cli.plan_commands import show_schema
 
     show_schema(workflow, out)
 
@@ -354,7 +344,7 @@ def show(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
     """Print a workflow and the files that it extends, or one file with all settings."""
-    from pano_mvs.cli.workflow_commands import show_workflow
+    from pano_mvs.cli.plan_commands import show_workflow
     from pano_mvs.session.session import open_session
 
     show_workflow(open_session(workflow, overrides=overrides or [], images=images), out, resolved=resolved)
@@ -661,7 +651,6 @@ def main() -> None:
     bound_environment(os.environ, available_threads())  # before a command loads the libraries
     output = protect_standard_streams()
     faulthandler.enable(os.dup(2))  # a stage in this process may redirect descriptor 2
-    turn_exits_into_errors()
     try:
         app()
     except SystemExit as end:

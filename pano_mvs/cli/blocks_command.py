@@ -20,8 +20,7 @@ from pano_mvs.engine.running.events import Warned
 from pano_mvs.results.summary import BLOCKS
 from pano_mvs.session.captures import is_early, run_blocks, run_in_blocks
 from pano_mvs.session.commands import run_command
-from pano_mvs.session.merging.automatic import BlockDecision
-from pano_mvs.session.merging.block_runs import BlockRun, Division, block_runs, divided, split_images
+from pano_mvs.session.merging.block_runs import BlockDecision, BlockRun, Division, block_runs, divided, split_images
 from pano_mvs.session.merging.merge import merge_outputs
 from pano_mvs.session.progress import Divided, Event, RunFinished
 from pano_mvs.session.running import Execution

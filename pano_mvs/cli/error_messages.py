@@ -19,7 +19,6 @@ from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import PanoMvsError, RunStoppedError, StoreError, WorkflowError
 from pano_mvs.core.memory import require_address_space
 from pano_mvs.core.paths import reason_of
-from pano_mvs.session.sudden_exit import exit_text
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -48,7 +47,7 @@ def guarded(command: Command) -> Command:
         except SystemExit as end:  # a plugin's code; ours raises typer.Exit
             traceback.print_exc()
             errors.say(
-                f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
+                f"[red]error:[/] the code above called sys.exit({escape(str(end.code))}), which a plugin must not do; "
                 "finished results are kept"
             )
             raise typer.Exit(1) from None

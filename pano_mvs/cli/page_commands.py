@@ -26,7 +26,7 @@ from pano_mvs.results.run_output import load
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.session.captures import is_early
-from pano_mvs.session.merging.automatic import decide_blocks
+from pano_mvs.session.merging.block_runs import decide_blocks
 from pano_mvs.session.running import Execution
 from pano_mvs.session.session import default_out, open_session
 from pano_mvs.share import ShareOptions, share_run

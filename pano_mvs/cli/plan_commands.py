@@ -1,7 +1,8 @@
-"""`pano-mvs plan` and `status`: what a run would compute, one unit of it, and what the latest run did."""
+"""`pano-mvs plan`, `status`, `show` and `schema`: what a run would compute and did, and its workflow."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,18 +15,25 @@ from pano_mvs.cli.cache.command import size_text
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_verdict
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import is_file, is_folder
-from pano_mvs.core.text import duration_text, plural, shortened_list
+from pano_mvs.core.files import write_given
+from pano_mvs.core.paths import exists, is_file, is_folder
+from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.queues import read_queue
 from pano_mvs.engine.planning.forecast import StageForecast
 from pano_mvs.engine.planning.plan import RunOptions, StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit, UnitInput
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.extends import read_text
+from pano_mvs.engine.workflows.resolved import resolved_yaml
+from pano_mvs.engine.workflows.schema import workflow_schema
+from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
+from pano_mvs.engine.workflows.yaml_text import Located
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 from pano_mvs.session.commands import reopen, run_command
 from pano_mvs.session.planning import RunPlan, plan_session
 from pano_mvs.session.running import Execution
-from pano_mvs.session.session import Session, check_output
+from pano_mvs.session.session import Session, check_output, presets_folder
 
 _SHOWN_REASONS = 5
 
@@ -230,3 +238,35 @@ def _print_latest(out: Path, console: Console) -> RunSummary | None:
     if latest.verdict is not None:
         print_verdict(latest.verdict, console)
     return latest
+
+
+def show_workflow(session: Session, out: Path | None, *, resolved: bool) -> None:
+    """Write the text of a workflow and of the files that it extends, or one file with all settings."""
+    text = resolved_yaml(session.workflow, session.graph) if resolved else session.workflow.text
+    text = without_controls(text).rstrip("\n")
+    if out is None:
+        print(text)
+        return
+    if exists(out):
+        raise UsageError(f"--out {out}: there is such a file already. Give a new name, or remove the file")
+    write_given(out, f"{text}\n", f"--out {out}")
+    print(f"written to {out}")
+
+
+def show_schema(workflow: str | None, out: Path | None) -> None:
+    """Write the schema of workflows to a file or to the standard output."""
+    registry = Registry.installed()
+    inherited = {} if workflow is None else _inherited(workflow, registry)
+    text = json.dumps(workflow_schema(registry, inherited), indent=1, ensure_ascii=False) + "\n"
+    if out is None:
+        print(text, end="")
+        return
+    write_given(out, text, f"--out {out}")
+    hint = f"put this line at the top of a workflow: # yaml-language-server: $schema={out.as_posix()}"
+    Console().say(escape(hint))
+
+
+def _inherited(workflow: str, registry: Registry) -> dict[str, Located]:
+    path, _ = find_workflow(workflow, presets_folder())
+    reader = WorkflowReader(str(path), path.parent, registry, presets=presets_folder())
+    return reader.inherited(read_text(path), path)

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
+from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.paths import children, exists, is_file, is_folder, is_link
 from pano_mvs.core.processes import process_place, start_of
@@ -22,16 +23,6 @@ OUTPUT_MARK = ".pano-mvs-output"
 """An empty file, written first into every output folder, so that sources do not read images from there."""
 
 CACHE_MARK = ".pano-mvs-cache"  # an empty file in every cache, so that sources do not read images from there
-_FOLDERS_OF_A_CACHE = ("blobs", "records")
-
-
-def is_cache(folder: Path) -> bool:
-    """Return whether a folder is a cache; caches of early versions have no mark and are recognised by their files."""
-    if exists(folder / CACHE_MARK):
-        return True
-    return is_file(folder / "layout.json") and all(is_folder(folder / name) for name in _FOLDERS_OF_A_CACHE)
-
-
 _UMASK = os.umask(0)  # read once, because reading it sets it for a moment, in all threads
 os.umask(_UMASK)
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
@@ -204,6 +195,25 @@ def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durab
     """Write a text file atomically (UTF-8, line ends as given); see `replacing`."""
     with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
         temporary.write_bytes(text.encode(errors="backslashreplace"))  # file names may have bytes that are not text
+
+
+def write_checked(path: Path, body: bytes, *, temporary_in: Path, durable: bool = False) -> None:
+    """Write bytes below a line with their digest, for `checked_body`; see `replacing`."""
+    with replacing(path, temporary_in=temporary_in, durable=durable) as temporary, temporary.open("wb") as stream:
+        stream.write(f"{digest_from_bytes(body)}\n".encode())
+        stream.write(body)  # up to 100 MB, so avoid copies
+
+
+def checked_body(data: bytes) -> bytes:
+    """Return the bytes below the first line of a file that `write_checked` wrote.
+
+    Raises:
+        ValueError: if they do not have the digest in that line.
+    """
+    checksum, _, body = data.partition(b"\n")
+    if checksum.decode() != digest_from_bytes(body):
+        raise ValueError("it has been changed")
+    return body
 
 
 def write_given(path: Path, text: str, what: str) -> None:

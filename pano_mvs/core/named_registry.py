@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -13,6 +13,7 @@ from pano_mvs.core.errors import PluginError, UsageError
 Value = TypeVar("Value")
 _ATTRIBUTE = "__pano_mvs_registrations__"
 _unavailable: dict[tuple[str, str], str] = {}
+_broken: list[str] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +75,22 @@ class NamedRegistry(Generic[Value]):
             raise UsageError(f"the {self.kind} {name!r} cannot be used: {why}")
         close = get_close_matches(name, self.names(), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
-        raise UsageError(
+        text = (
             f"there is no {self.kind} {name!r}; {hint}known: {', '.join(self.names())}. If it is a plugin's, install "
             "the plugin or list its file under `plugins:`"
         )
+        raise UsageError("\n".join([text, *_broken]))
 
     def code_file(self, name: str) -> Path | None:
         """Return the plugin file behind a name, or None if the value is built in."""
         return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
 
 
-def set_unavailable(reasons: Mapping[tuple[str, str], str]) -> None:
-    """Declare which names of broken plugins cannot be used: kind and name to the reason. Replaces earlier reasons."""
+def set_unavailable(reasons: Mapping[tuple[str, str], str], broken: Sequence[str]) -> None:
+    """Declare which names cannot be used, kind and name to the reason, and why plugins with others failed to load."""
     _unavailable.clear()
     _unavailable.update(reasons)
+    _broken[:] = broken
 
 
 def registrations_of(value: object) -> tuple[Registration, ...]:

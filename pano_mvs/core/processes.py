@@ -18,21 +18,10 @@ _ENDED = "ZX"
 @cache
 def process_place() -> str:
     """Return a name for the scope of process ids: the present start of this host or container."""
-    marks = [socket.gethostname(), boot_id()]
+    marks = [socket.gethostname(), _text("/proc/sys/kernel/random/boot_id")]
     with suppress(OSError):
         marks.append(str(Path("/proc/self/ns/pid").readlink()))
     return hashlib.blake2b("\n".join(filter(None, marks)).encode(), digest_size=4).hexdigest()
-
-
-def boot_id() -> str:
-    """Return a text that changes at every start of the system; empty if unknown."""
-    return _text("/proc/sys/kernel/random/boot_id")
-
-
-def machine_id() -> str:
-    """Return a text that identifies this installation across restarts; empty if unknown."""
-    text = _text("/etc/machine-id") or _text("/var/lib/dbus/machine-id")
-    return hashlib.blake2b(text.encode(), key=b"pano-mvs", digest_size=8).hexdigest() if text else ""
 
 
 def is_running(process: int) -> bool:

@@ -125,24 +125,13 @@ def write_ply_parts(
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Return the cloud in a PLY file that `write_ply` wrote, in the world frame; missing view counts are 0.
+    """Return the cloud in a PLY file, in the world frame, as far as the file states it; see `open_ply_points`.
 
     Raises:
-        InputError: if the file cannot be read, has another layout, or ends early.
+        InputError: as `open_ply_points`, or if a point has no finite position.
     """
-    head, mark, body = FilePart(path).read_bytes().partition(_MARK + b"\n")
-    counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
-    count = int(counted[1]) if counted else 0
-    plain = _without_comments(head) + mark
-    layout = next((known for known in _LAYOUTS if plain == ply_header(count, known)), None)
-    if layout is None:
-        raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
-    if len(body) != count * layout.itemsize:
-        raise InputError(
-            f"{path}: its header states {count} points, but it contains {len(body) // layout.itemsize}. Write it again"
-        )
-    vertices = np.frombuffer(body, layout)
-    cloud = PlyPoints(path, count, True, vertices, _world_from_file(head, path)).cloud(slice(0, count))
+    points = open_ply_points(path)
+    cloud = points.cloud(slice(0, points.count))
     is_known = cloud.uncertainty is not None and np.isfinite(cloud.uncertainty).all()
     return cloud if is_known else replace(cloud, uncertainty=None)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +46,7 @@ def turnable_cloud(
     key = f"{digest[:24]}.{values.digest('poses')[:16]}.p{VERSION}"
     level_from_world = level_axes(up)
     fact = earlier.fact(key)
-    if not _is_encoded(fact):
+    if fact is None:
         whole = values.cloud
         cloud = whole.groups()[0] if whole is not None else None
         if cloud is None or len(cloud) < 3:
@@ -134,13 +133,3 @@ def _first_of_voxels(shifted: FloatArray, edge: float) -> NDArray[np.intp]:
     voxels = np.floor(shifted / edge).astype(np.int64)
     _, first = np.unique(voxels @ np.array([1, 1 << 20, 1 << 40]), return_index=True)
     return np.sort(first)
-
-
-def _is_encoded(fact: Any) -> bool:
-    """Return whether a fact of an earlier page is a value of `encoded`."""
-    if not isinstance(fact, Mapping):
-        return False
-    numbers = all(isinstance(fact.get(name), int | float) for name in ("count", "total", "size", "spacing", "radius"))
-    return (
-        numbers and isinstance(fact.get("data"), str) and len(fact["data"]) == 4 * -(-fact["count"] * POINT_BYTES // 3)
-    )

@@ -21,14 +21,11 @@ from pano_mvs.report.view_cards import (
     Shares,
     ViewCard,
     chosen_views,
-    fact_of,
     key_of,
-    shares_from_fact,
     shares_of,
     view_cards,
 )
-from pano_mvs.results import coverage as view_coverage
-from pano_mvs.results.coverage import ViewCoverage, coverage, coverage_from_fact, coverage_key
+from pano_mvs.results.coverage import ViewCoverage, coverage, coverage_from_fact, coverage_key, fact_of
 from pano_mvs.results.figures import score_tables, side_by_side
 from pano_mvs.results.next_time import Suggestion, marks_of, suggestions
 from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_panels
@@ -55,11 +52,12 @@ def _coverage(values: StoredValues, earlier: EarlierPage, names: Sequence[str]) 
     if not values.digest("poses"):
         return {}
     key = coverage_key(values, names)
-    known = coverage_from_fact(earlier.fact(key))
-    if known is None:
-        known = coverage(values, names)
-        earlier.keep(key, view_coverage.fact_of(known))
-    return known
+    fact = earlier.fact(key)
+    if fact is not None:
+        return coverage_from_fact(fact)
+    found = coverage(values, names)
+    earlier.keep(key, fact_of(found))
+    return found
 
 
 # Names of folders that do not say which capture it is: the name of the folder above comes first.
@@ -163,13 +161,14 @@ def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: E
     for view in evenly_spaced(views, 1000):
         name = view.name
         key = key_of(results, name, "s", version=_VERSION)
-        shares = shares_from_fact(kept.fact(key)) if key else None
+        fact = kept.fact(key) if key else None
+        shares = Shares(*fact) if fact else None
         if shares is None and key:
             confidence = results.confidence(name)
             sky = results.sky(name)
             shares = shares_of(confidence, None if sky is None else ~sky) if confidence is not None else None
             if shares is not None:
-                kept.keep(key, fact_of(shares))
+                kept.keep(key, astuple(shares))
         if shares is not None:
             found[name] = shares
     return found
@@ -328,7 +327,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         scores=scores,
         comparison=side_by_side(scores),
         notes=tuple(sorted(set(values.notes))),
-        facts=earlier.facts,
+        facts=earlier.signed_facts(),
     )
 
 

@@ -1,7 +1,7 @@
 """Reuse the images and figures of an earlier page whose inputs are the same.
 
-Each image has a key: the digest of its inputs. A page that was edited, or written by another version, just has
-fewer of them.
+Each image has a key: the digest of its inputs. The figures are used as they are, if they have the digest that is
+written with them: a page whose figures were edited has none.
 """
 
 from __future__ import annotations
@@ -12,8 +12,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import UsageError
 from pano_mvs.results.pictures import Picture
 
+_DIGEST = "digest"
 _PICTURE = re.compile(
     r'<img data-key="([0-9a-z.]{1,80})" src="(data:image/jpeg;base64,[A-Za-z0-9+/=]+)" width="(\d{1,5})" '
     r'height="(\d{1,5})"'
@@ -55,11 +58,16 @@ class EarlierPage:
         """Keep figures for the next page."""
         self.facts[key] = fact
 
+    def signed_facts(self) -> dict[str, Any]:
+        """Return the figures that are kept, with their digest."""
+        return {**self.facts, _DIGEST: digest_from_value(self.facts)} if self.facts else {}
+
 
 def _facts(text: str) -> dict[str, Any]:
     found = _FACTS.search(text)
     try:
         facts = json.loads(found[1]) if found else {}
-    except (ValueError, RecursionError):
+        digest = facts.pop(_DIGEST, "")
+        return facts if digest == digest_from_value(facts) else {}
+    except (ValueError, RecursionError, TypeError, AttributeError, UsageError):
         return {}
-    return facts if isinstance(facts, dict) else {}

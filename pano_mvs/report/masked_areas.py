@@ -169,9 +169,8 @@ def _shares(
     """Return the share of the sphere that is masked for each reason, or None if the image cannot be examined."""
     key = _key(values, name, "k")
     fact = kept.fact(key)
-    known = {kind.name for kind in KINDS}
-    if isinstance(fact, dict) and fact.keys() <= known and all(isinstance(share, float) for share in fact.values()):
-        return fact
+    if fact is not None:
+        return dict(fact)
     found = _kinds_of(values, name, masks)
     if found is None:
         return None

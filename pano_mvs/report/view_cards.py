@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -58,17 +57,6 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
     classes[(classes == 0) & ~kept] = 4
     invalid, filled, weak, consistent, masked = np.bincount(classes.ravel(), weights.ravel(), minlength=5)
     return Shares(*(round(float(share), 6) for share in (consistent, weak, filled, invalid, masked)))
-
-
-def shares_from_fact(fact: Any) -> Shares | None:
-    """Return shares from the JSON value of `fact_of`; None for other values."""
-    valid = isinstance(fact, list) and len(fact) == 5 and all(isinstance(value, int | float) for value in fact)
-    return Shares(*map(float, fact)) if valid else None
-
-
-def fact_of(shares: Shares) -> list[float]:
-    """Return shares as a JSON value."""
-    return list(astuple(shares))
 
 
 # Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
@@ -218,7 +206,7 @@ def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits |
     """Return the limits of the colour scale of one view, rounded to four digits; None if it has no ranges."""
     key = key_of(results, name, "l", version=VERSION)
     fact = kept.fact(key) if key else None
-    if isinstance(fact, list) and len(fact) == 2 and all(isinstance(end, float) and end > 0 for end in fact):
+    if fact is not None:
         return fact[0], fact[1]
     range_map = results.range_map(name)
     if range_map is None:
@@ -234,15 +222,14 @@ def _own_limits(results: StoredValues, kept: EarlierPage, name: str) -> Limits |
 def _kept_card(results: StoredValues, kept: EarlierPage, name: str, *, scales: RangeScales) -> ViewCard | None:
     stem = key_of(results, name, "v", version=VERSION)
     fact = kept.fact(stem) if stem else None
-    parts = fact.get("parts") if isinstance(fact, dict) else None
-    if not isinstance(fact, dict) or not isinstance(parts, list):
+    if fact is None:
         return None
-    files = {part: scales.range_part if part == "range" else part for part in parts}
+    files = {part: scales.range_part if part == "range" else part for part in fact["parts"]}
     found = {part: shown for part, file in files.items() if (shown := kept.picture(f"{stem}.{file}")) is not None}
     own = kept.picture(f"{stem}.own") if scales.differ else None
-    if len(found) < len(parts) or (scales.differ and own is None):
+    if len(found) < len(files) or (scales.differ and own is None):
         return None
-    return _card(name, found, shares_from_fact(fact.get("shares")), scales=scales, own_range=own)
+    return _card(name, found, Shares(*fact["shares"]) if fact["shares"] else None, scales=scales, own_range=own)
 
 
 def _card(
@@ -272,7 +259,7 @@ def _new_card(
         pictures |= ranges
         shares = _shares(range_map, mask)
     if stem and all(part in pictures for part in _PARTS):  # a missing image may be available for the next page
-        kept.keep(stem, {"shares": fact_of(shares) if shares else None, "parts": list(pictures)})
+        kept.keep(stem, {"shares": astuple(shares) if shares else None, "parts": list(pictures)})
     panels = () if all(part in pictures for part in _PARTS) else preview_panels(out_dir, view.preview)
     for part, panel in zip(_PARTS, panels, strict=False):
         pictures.setdefault(part, _part(panel, "", part))

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from pano_mvs.core.arrays import FloatArray, Mask
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
@@ -90,12 +90,9 @@ def fact_of(found: Mapping[str, ViewCoverage]) -> dict[str, Any]:
     return {name: asdict(view) for name, view in found.items()}
 
 
-def coverage_from_fact(fact: Any) -> dict[str, ViewCoverage] | None:
-    """Return what views see from the value of `fact_of`; None for other values."""
-    try:
-        return _FACT.validate_python(fact)
-    except ValidationError:
-        return None
+def coverage_from_fact(fact: Any) -> dict[str, ViewCoverage]:
+    """Return what views see from the value of `fact_of`."""
+    return _FACT.validate_python(fact)
 
 
 def coverage_key(values: StoredValues, names: Sequence[str]) -> str:

@@ -26,10 +26,7 @@ _WORDS = {
     "of": "of panoramas with truth",
 }
 _CONSTANTS = "best_constant_", "constant_"
-_BRACKETS = (
-    "In brackets: the score of a single constant range, the best one for each score "
-    "(in runs of earlier versions the median of the true ranges)."
-)
+_BRACKETS = "In brackets: the score of a single constant range, the best one for each score."
 _MIN_SHOWN = 0.0001
 _UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
 
@@ -113,7 +110,7 @@ def words(name: str) -> str:
 def score_tables(scores: ScoresSummary) -> dict[str, Any]:
     """Return the scores of the poses as rows, and those of the views as a table with one column per metric.
 
-    The score of a constant range map (`best_constant_…`, in older runs `constant_…`) is added in brackets.
+    The score of a constant range map (`best_constant_…`) is added in brackets.
     """
     views = scores.views
     known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
@@ -152,7 +149,7 @@ def _metrics(views: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def _beside_constant(values: Mapping[str, Any], metric: str) -> str:
     """Return a score, followed by that of a constant in brackets if known."""
     found = figure(values.get(metric))
-    constant = next((values[prefix + metric] for prefix in _CONSTANTS if values.get(prefix + metric) is not None), None)
+    constant = values.get(f"best_constant_{metric}")
     return found if constant is None else f"{found} ({figure(constant)})"
 
 

@@ -64,9 +64,6 @@ class StoredValues:
         if entry is None:
             return StoredValues(notes=[f"the cache {store.root} contains no run into {out}, so images are missing"])
         stages = {role: stage for role, stage in summary.results.items() if role in ROLES}
-        if not stages:
-            note = "run.json was written by an earlier version and lists no results: run again to see images"
-            return StoredValues(notes=[note])
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
         last = summary.results.get("images")  # the source, or a stage that masks its images
         sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]

@@ -12,11 +12,12 @@ from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.events import Warned, ignore
 from pano_mvs.results.run_output import RunOutput, load
 from pano_mvs.results.summary import FAILED_ITEMS, INTERRUPTED
-from pano_mvs.session.merging.automatic import BlockDecision, decision_of
 from pano_mvs.session.merging.block_runs import (
+    BlockDecision,
     BlockRun,
     Division,
     block_runs,
+    decision_of,
     divided,
     earlier_division,
     first_poses,

@@ -31,7 +31,6 @@ from pano_mvs.session.planning import forecast_run, remember_report
 from pano_mvs.session.progress import EventLog, Progress, RunFinished, RunStarted
 from pano_mvs.session.session import Session, check_output
 from pano_mvs.session.spans import Spans
-from pano_mvs.session.sudden_exit import exit_text
 from pano_mvs.session.summarise import chain_of, latest, summarise
 from pano_mvs.session.time_estimator import EventObserver
 
@@ -230,7 +229,7 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
     if not any(stage.run + stage.cached + stage.failed for stage in run.result.stages):
         return
     interrupted = isinstance(error, KeyboardInterrupt)
-    stopped = exit_text(error) if isinstance(error, SystemExit) else str(error)
+    stopped = f"sys.exit({error.code})" if isinstance(error, SystemExit) else str(error)
     run.result.stopped = "interrupted" if interrupted else stopped
     run.result.exit_code = INTERRUPTED if interrupted else error.exit_code if isinstance(error, PanoMvsError) else 1
     try:

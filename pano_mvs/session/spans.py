@@ -10,7 +10,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from pano_mvs import __version__
@@ -41,8 +41,8 @@ class Spans:
         self._endpoint = _endpoint()
         self._trace = _import("opentelemetry.trace")
         try:
-            self._sender = _Sender(exporter or _exporter(self._endpoint))
-            self._provider = _provider(self._sender)
+            self._exporter = exporter or _exporter(self._endpoint)
+            self._provider = _provider(self._exporter)
         except PanoMvsError:
             raise
         except (ValueError, RuntimeError) as error:
@@ -54,7 +54,6 @@ class Spans:
         self._run: Any = None
         self._stages: dict[str, Any] = {}  # the spans of those that have begun and not ended
         self._failures: dict[tuple[str, str], UnitFailed] = {}
-        self._ended = 0
         self._has_warned = False
 
     def __call__(self, event: Event) -> None:
@@ -68,8 +67,7 @@ class Spans:
             return
         self._progress(event)
         self._take(event)
-        if self._sender.has_failed:
-            self._warn()
+        self._warn_of_failures()
 
     def _take(self, event: Event) -> None:
         match event:
@@ -122,28 +120,27 @@ class Spans:
 
     def _end(self, span: Any, attributes: Mapping[str, Any] | None = None, *, at_ns: int | None = None) -> None:
         span.set_attributes(attributes or {})
-        self._ended += span.get_span_context().trace_flags.sampled
         span.end(at_ns or time.time_ns())
 
     def _set_error(self, span: Any, why: str) -> None:
         span.set_status(self._trace.Status(self._trace.StatusCode.ERROR, without_controls(why)))
 
     def _close(self) -> None:
-        """Send the remaining spans; warn if some could not be sent."""
+        """Send the remaining spans; warn if that is impossible."""
         closing = threading.Thread(target=self._provider.shutdown, daemon=True)
         closing.start()
         try:
             closing.join(_WAIT_S)
             if closing.is_alive():
-                self._sender.shutdown()  # ends the pause before another attempt
+                self._exporter.shutdown()  # ends the pause before another attempt
                 closing.join(1.0)
         finally:
             self._messages.close()
-        if self._sender.sent < self._ended:
-            self._warn()
+        self._warn_of_failures(is_late=closing.is_alive())
 
-    def _warn(self) -> None:
-        if self._has_warned:
+    def _warn_of_failures(self, *, is_late: bool = False) -> None:
+        """Warn, once, if OpenTelemetry has logged that it could not send, or it is late."""
+        if self._has_warned or not (self._messages.first or is_late):
             return
         self._has_warned = True
         place = re.sub("//.*@", "//", self._endpoint)  # without a password
@@ -154,28 +151,6 @@ class Spans:
                 f"another one by OTEL_EXPORTER_OTLP_ENDPOINT. The run is not affected.{reason}"
             )
         )
-
-
-class _Sender:
-    """Passes spans on to an exporter, and counts those that it has sent."""
-
-    def __init__(self, exporter: Any) -> None:
-        self._exporter = exporter
-        self.sent = 0
-        self.has_failed = False
-
-    def export(self, spans: Sequence[Any]) -> Any:
-        is_sent = False
-        try:
-            result = self._exporter.export(spans)
-            is_sent = result.name == "SUCCESS"
-            return result
-        finally:  # some versions raise the error of the connection, which is logged
-            self.sent += len(spans) if is_sent else 0
-            self.has_failed = self.has_failed or not is_sent
-
-    def shutdown(self) -> None:
-        self._exporter.shutdown()
 
 
 class _Messages(logging.Handler):
@@ -213,12 +188,12 @@ def _exporter(endpoint: str) -> Any:
     return _import("opentelemetry.exporter.otlp.proto.http.trace_exporter").OTLPSpanExporter(endpoint)
 
 
-def _provider(sender: _Sender) -> Any:
+def _provider(exporter: Any) -> Any:
     resources = _import("opentelemetry.sdk.resources")
     own = resources.Resource.create({"service.name": "pano-mvs", "service.version": __version__})
     resource = own.merge(resources.OTELResourceDetector().detect())  # OTEL_SERVICE_NAME replaces ours
     provider = _import("opentelemetry.sdk.trace").TracerProvider(resource=resource, shutdown_on_exit=False)
-    provider.add_span_processor(_import("opentelemetry.sdk.trace.export").BatchSpanProcessor(sender))
+    provider.add_span_processor(_import("opentelemetry.sdk.trace.export").BatchSpanProcessor(exporter))
     return provider
 
 

@@ -106,19 +106,13 @@ def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
 
 def _stage(summary: StageSummary, workflow: Workflow) -> StageOutcome:
     entry = workflow.stages[summary.name]
+    same = ("name", "use", "units", "run", "cached", "failed", "blocked", "metrics")
     return StageOutcome(
-        name=summary.name,
-        use=summary.use,
+        **{name: getattr(summary, name) for name in same},
         version=entry.spec.version,
         params=entry.params.model_dump(mode="json"),
-        units=summary.units,
-        run=summary.run,
-        cached=summary.cached,
-        failed=summary.failed,
-        blocked=summary.blocked,
         seconds=round(summary.seconds, 3),
         unit_seconds=round(summary.unit_seconds, 3),
-        metrics=summary.metrics,
     )
 
 

@@ -20,9 +20,16 @@ from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Pa
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import plural
-from pano_mvs.io.images.keyframe_file import keyframe_file, read_times, store_times
 from pano_mvs.io.images.names import printable_name
-from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
+from pano_mvs.io.images.video import (
+    VideoInfo,
+    describe_video,
+    frames_between,
+    keyframe_file,
+    list_videos,
+    read_times,
+    store_times,
+)
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.stereo import StereoSetting

@@ -266,7 +266,7 @@ def _leaves_its_process(case: StageCase) -> None:
     before, threads = ProcessState.now(), set(threading.enumerate())
     case.call(case.capture)
     changes = before.restore()
-    assert not changes, f"{case.spec.name} changes {changes} in its process; runs undo this after every unit"
+    assert not changes, f"{case.spec.name} changes {', '.join(changes)} in its process; runs undo this after every unit"
     left = [thread.name for thread in threading.enumerate() if thread not in threads]
     assert not left, f"{case.spec.name} leaves the threads {', '.join(left)} running; other units run beside them"
     left = [child.name for child in multiprocessing.active_children()]

@@ -111,7 +111,7 @@ def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         whole=True,
     )
     assert unit is not None
-    limit = "pano_mvs.session.merging.automatic.total_memory_bytes"
+    limit = "pano_mvs.session.merging.block_runs.total_memory_bytes"
     monkeypatch.setattr(limit, lambda: int(12 * unit.stored_bytes) + 1)
 
 
@@ -305,7 +305,7 @@ def test_a_capture_that_cannot_be_divided_is_run_with_a_warning(
 def test_even_small_blocks_may_not_fit(
     pano_mvs: Command, runs: Runs, walk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pano_mvs.session.merging.automatic.total_memory_bytes", lambda: 1)
+    monkeypatch.setattr("pano_mvs.session.merging.block_runs.total_memory_bytes", lambda: 1)
     runs.ends["out"] = STOPPED
     result = pano_mvs("run", "quickstart", "--images", walk, "--out", "out")
     assert "even that of blocks of 7 images would not do" in result.flat

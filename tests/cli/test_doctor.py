@@ -224,7 +224,7 @@ def test_plugins_that_fail_clash_or_are_not_there(tmp_path: Path, monkeypatch: p
     found = by_what(plugin_findings(Registry.installed(), presets_folder(), environment))
     bad = found[str(folder / "bad.py")]
     assert "ZeroDivisionError" in bad.detail
-    assert "pano-mvs stage show filters.mine" in bad.remedy
+    assert "pano-mvs plugins" in bad.remedy
     assert found["PANO_MVS_PLUGINS"].detail == f"{tmp_path / 'gone'} is not a folder"
     assert found["stages"].state == found["presets"].state == "ok"
     nothing = by_what(plugin_findings(Registry(), tmp_path, {}))

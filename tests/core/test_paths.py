@@ -37,7 +37,7 @@ NOT_OF_PATHS = {
     ("engine/cache/maintenance.py", "is_file"),
     ("engine/cache/maintenance.py", "is_dir"),
 }
-EXEMPT = {"core/paths.py", "engine/code/plugin_digest.py"}
+EXEMPT = {"core/paths.py", "engine/stages/stage_code.py"}
 
 
 @pytest.fixture(params=["denied", "long", "circle", "null"])

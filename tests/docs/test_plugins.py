@@ -15,7 +15,7 @@ from pano_mvs import api
 from pano_mvs.api import Context, RunStoppedError, TwoView
 from pano_mvs.cli.app import app
 from pano_mvs.cli.plugins.new import KINDS, rendered
-from pano_mvs.engine.stages.registry import Registry, declared_names
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.scene import RangeMap, Record
 from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.room import capture_poses, default_room
@@ -35,7 +35,7 @@ def test_the_page_has_one_plugin_of_each_kind() -> None:
 def test_the_page_names_the_command_that_writes_a_plugin(kind: str) -> None:
     text, command = rendered(kind, PLUGINS[kind])[0], f"pano-mvs plugin new {kind} {PLUGINS[kind]}"
     assert f"`{command}` writes [this plugin](../pano_mvs/cli/plugins/templates/{kind}.py.jinja)" in PAGE
-    assert [given.rpartition(".")[2] for _, given in declared_names(text)] == [PLUGINS[kind]]
+    assert re.findall(r'^@\w+\(\s*"(?:\w+\.)*(\w+)"', text, re.MULTILINE) == [PLUGINS[kind]]
 
 
 def test_commands_on_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,18 +7,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors import execute
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
-from pano_mvs.engine.stages import registry
 from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 
@@ -109,32 +106,21 @@ def ran(result: RunResult) -> dict[str, int]:
 
 
 @pytest.fixture
-def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Toy:
-    """A toy capture, whose plugin is trusted: comparing the state of the process takes most of the time of a unit."""
-    trust_plugins(monkeypatch)
+def toy(tmp_path: Path) -> Toy:
     return toy_in(tmp_path)
-
-
-def trust_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not compare the state of this process before and after each unit and the import of each plugin."""
-    monkeypatch.setattr(execute, "has_plugins", lambda: False)
-    monkeypatch.setattr(registry, "loading_plugin", nullcontext)
 
 
 @pytest.fixture(scope="session")
 def finished_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a toy capture whose run has finished; not to be changed."""
     folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patched:
-        trust_plugins(patched)
-        assert toy_in(folder).run().exit_code == 0
+    assert toy_in(folder).run().exit_code == 0
     return folder
 
 
 @pytest.fixture
-def finished(finished_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Toy:
+def finished(finished_once: Path, tmp_path: Path) -> Toy:
     """A toy capture whose run has finished, to be changed: a copy, since some tests damage what is stored."""
-    trust_plugins(monkeypatch)
     return Toy(Path(shutil.copytree(finished_once, tmp_path, dirs_exist_ok=True)))
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.engine.stages.registry import Registry, declared_names, plugin_files_in, user_plugin_folders
+from pano_mvs.engine.stages.registry import Registry, plugin_files_in, user_plugin_folders
 from tests.engine.conftest import Toy, ran
 
 STAGE = """\
@@ -74,15 +74,13 @@ def test_the_users_folder_is_that_of_the_platform(tmp_path: Path) -> None:
         "raise BaseException\n" + STAGE.format(name="filters.unlucky"),
     ],
 )
-def test_a_broken_plugin_is_told_when_its_name_is_used_and_only_then(mine: Path, broken: str) -> None:
+def test_a_broken_plugin_is_told_when_a_name_is_missing(mine: Path, broken: str) -> None:
     (mine / "bad.py").write_text(broken)
     (mine / "same.py").write_text(STAGE.format(name="filters.same"))
     registry = Registry.installed()
     assert "filters.same" in registry.stages
-    assert "bad.py" not in registry.suggest("filters.medain")
-    assert "'filters.unlucky'" in registry.suggest("filters.unluky")
     told = registry.suggest("filters.unlucky")
-    assert f"{mine / 'bad.py'}, failed to load:" in told
+    assert f"{mine / 'bad.py'} failed to load:" in told
     assert any(word in told for word in ("Traceback", "SyntaxError", "SystemExit", "BaseException"))
     assert "registry.py" not in told
 
@@ -104,12 +102,12 @@ def test_a_part_of_a_broken_plugin_says_why_it_is_not_there(mine: Path) -> None:
     )
     parts: NamedRegistry[int] = NamedRegistry("toy part", {"ours": 1})
     Registry.installed()
-    with pytest.raises(UsageError, match=r"the toy part 'mine' cannot be used: .*bad\.py"):
+    with pytest.raises(UsageError, match=r"there is no toy part 'mine'.*\n.*bad\.py failed to load"):
         parts.check("mine")
     assert parts.check("ours") == "ours"
     (mine / "bad.py").unlink()
     Registry.installed()
-    with pytest.raises(UsageError, match="there is no toy part 'mine'"):
+    with pytest.raises(UsageError, match=r"there is no toy part 'mine'[^\n]*\Z"):
         parts.check("mine")
 
 
@@ -201,8 +199,9 @@ def test_plugins_are_listed_sound_or_broken(mine: Path) -> None:
     code, text = command("plugins")
     assert code == 0
     assert "pano-mvs 0" in text
-    assert "ZeroDivisionError: division by zero the whole of it: pano-mvs stage show filters.unlucky" in text
-    assert "nothing.py: PluginError" in text
+    assert "bad.py failed to load:" in text
+    assert "ZeroDivisionError: division by zero" in text
+    assert "nothing.py failed to load:" in text
     assert "defines no stage" in text
 
 
@@ -234,11 +233,6 @@ def test_what_a_plugin_prints_when_it_is_loaded_is_no_output_of_the_command(
     (mine / "chatty.py").write_text("print('hello')\n" + STAGE.format(name="filters.same"))
     assert "filters.same" in Registry.installed().stages
     assert capsys.readouterr().out == ""
-
-
-def test_names_are_told_from_the_text() -> None:
-    text = '@api.stage("a.b", version=2)\n@source(\n    "c.d",\n)\n  @register_sweep_cost(\'e\')\n# @stage("f.g")\n'
-    assert declared_names(text) == [("stage", "a.b"), ("stage", "c.d"), ("sweep cost", "e")]
 
 
 def test_a_module_that_repeats_a_name_says_both_places(toy: Toy) -> None:

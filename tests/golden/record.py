@@ -185,7 +185,7 @@ def complaint(name: str, before: Golden | None, now: Golden) -> str:
     if (before.code, before.libraries) == (now.code, now.libraries):
         return (
             f"the results of {name} have changed and its key has not: cached results would be served for it. What has "
-            "changed is not among the code that the stage reaches (pano_mvs/engine/code), or raise "
+            "changed is not among the modules that the stage imports (engine/stages/stage_code.py), or raise "
             f"KEY_SCHEMA if it is the engine: {'; '.join(changes)}"
         )
     return f"the results of {name} have changed; if they should have, run `{COMMAND}`: {'; '.join(changes)}"

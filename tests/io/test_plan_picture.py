@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from pano_mvs.io.plan_drawings import COLORS, PlanDrawing
-from pano_mvs.io.plan_picture import draw_plan
+from pano_mvs.io.plan_drawings import COLORS, PlanDrawing, draw_plan
 
 
 def test_the_picture_shows_the_plan_and_a_bar_of_its_length() -> None:

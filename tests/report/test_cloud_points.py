@@ -96,18 +96,6 @@ def test_the_page_carries_the_points_and_the_next_page_reuses_them(
     assert at * (1, -1, -1) == pytest.approx(np.array(summary.poses.centers), abs=1e-4)
 
 
-def test_a_damaged_page_is_not_reused(results: StoredValues, tiny: TinyCapture) -> None:
-    summary = RunSummary.from_json(summary_of(tiny))
-    first = EarlierPage()
-    turnable = turnable_cloud(results, summary.poses, first, up=UP)
-    assert turnable is not None
-    fact = first.facts[turnable.key]
-    for wrong in ({**fact, "data": fact["data"][:-4]}, {**fact, "size": "1"}, [1]):
-        again = EarlierPage(facts={turnable.key: wrong})
-        assert turnable_cloud(results, summary.poses, again, up=UP) == turnable
-        assert again.facts[turnable.key] == fact
-
-
 def test_without_a_cloud_there_is_no_viewer(tmp_path: Path, tiny: TinyCapture) -> None:
     assert turnable_cloud(StoredValues(), RunSummary().poses, EarlierPage(), up=UP) is None
     write_report(tmp_path, RunSummary.from_json(summary_of(tiny)))

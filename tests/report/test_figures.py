@@ -107,13 +107,13 @@ def test_the_median_leaves_out_what_is_no_number() -> None:
 def test_a_score_stands_beside_what_a_constant_scores() -> None:
     views: dict[str, dict[str, float | None]] = {
         "a": {"psnr_db": 30.0, "ause": 0.02, "constant_psnr_db": 18.0, "best_constant_psnr_db": 19.0},
-        "b": {"psnr_db": 20.0, "constant_psnr_db": 10.0},
+        "b": {"psnr_db": 20.0, "best_constant_psnr_db": 10.0},
         "c": {"psnr_db": None},
     }
     tables = score_tables(ScoresSummary(poses={"of": 3}, views=views, notes=("a note",)))
     assert tables["columns"] == ["psnr_db", "ause"]
     assert tables["views"] == [("a", ["30 (19)", "0.02"]), ("b", ["20 (10)", "–"]), ("c", ["–", "–"])]
-    assert tables["median"] == ["25 (19)", "0.02"]
+    assert tables["median"] == ["25 (14.5)", "0.02"]
     assert "best one for each score" in tables["notes"][0]
     assert tables["notes"][1:] == ["a note"]
     assert score_tables(ScoresSummary(views={"a": {"psnr_db": 1.0}})) == {

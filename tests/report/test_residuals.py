@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 
-from pano_mvs.report.view_cards import Shares, fact_of, shares_from_fact, shares_of
+from pano_mvs.report.view_cards import shares_of
 from pano_mvs.results.residuals import Histogram, histogram, reprojection_residuals
 from pano_mvs.scene import Poses
 from pano_mvs.testing.tiny_capture import TinyCapture
@@ -69,7 +68,7 @@ def test_shares_are_of_the_sphere_and_not_of_the_picture() -> None:
     cap = (1 - np.cos(np.pi / 4)) / 2
     assert (shares.invalid, shares.filled) == pytest.approx((cap, cap), abs=1e-4)
     assert shares.consistent == pytest.approx(1 - 2 * cap, abs=1e-4)
-    assert sum(fact_of(shares)) == pytest.approx(1, abs=1e-5)
+    assert sum(astuple(shares)) == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -105,12 +104,6 @@ def test_what_is_masked_is_not_missed() -> None:
     assert shares.complete == pytest.approx(0.5 / (1 - shares.masked), abs=1e-3)
     assert shares.complete == shares.confirmed
     assert shares_of(np.zeros((4, 8), np.uint8), np.zeros((4, 8), bool)).complete == 0
-
-
-@pytest.mark.parametrize("fact", [None, [], [1, 2], "abcde", [1, 2, 3, 4, None], {"a": 1}])
-def test_what_are_no_shares_are_none(fact: Any) -> None:
-    assert shares_from_fact(fact) is None
-    assert shares_from_fact(fact_of(Shares(1, 0, 0, 0, 0))) == Shares(1, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("largest", [1, 2, 3, 5, 6, 9, 10, 11, 19, 20, 21, 49, 51, 99, 101, 4321, 1_000_000])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-import sys
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
-from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture
 from pano_mvs.results.stored_values import StoredValues
@@ -24,8 +23,6 @@ from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
-
-UP = np.array([0.0, -1.0, 0.0])
 
 
 def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None) -> Page:
@@ -83,6 +80,7 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(
     path.write_text(text[:facts] + "[1, {" + text[end:])
     assert_sound(reported(out_dir, summary_of(tiny), results))
     path.write_text(text.replace('"shares":', '"shares": "<b>", "other":'))
+    assert EarlierPage.of_file(path).fact(next(iter(json.loads(text[facts:end])))) is None
     page = reported(out_dir, summary_of(tiny), results)
     assert_sound(page)
     assert "<b>" not in page.words
@@ -130,42 +128,7 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(
     assert again.notes == []
     elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
     assert "contains no run" in elsewhere.notes[0]
-    assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
-
-
-def drawing(folder: Path, body: str) -> tuple[str, ...]:
-    """Return a command that does something else than to draw."""
-    script = folder / "renderer.py"
-    script.write_text(body)
-    return sys.executable, str(script)
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        "raise SystemExit(1)",
-        "import os; os.abort()",
-        "",
-        "import numpy, sys; from pathlib import Path\n"
-        "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))",
-    ],
-    ids=["fails", "crashes", "draws nothing", "draws black"],
-)
-def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
-    tmp_path: Path, results: StoredValues, monkeypatch: pytest.MonkeyPatch, body: str
-) -> None:
-    monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, EarlierPage(), up=UP, command=drawing(tmp_path, body))
-    assert len(made.shown) == 3
-    assert "PyVista could not render" in made.note
-
-
-def test_a_missing_interpreter_is_no_reason_to_fail(
-    tmp_path: Path, results: StoredValues, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, EarlierPage(), up=UP, command=(str(tmp_path / "nowhere"),))
-    assert len(made.shown) == 3
+    assert StoredValues.of_folder(out_dir, RunSummary(), store).refs == {}
 
 
 def decoded(picture: Picture) -> NDArray[Any]:
@@ -173,19 +136,3 @@ def decoded(picture: Picture) -> NDArray[Any]:
     image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     return image
-
-
-@pytest.mark.slow
-def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(
-    results: StoredValues, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Both show the same points from the same places: their pictures agree but for the size of the points."""
-    monkeypatch.setenv(RENDERER_VARIABLE, "")
-    by_pyvista = cloud_pictures(results, EarlierPage(), up=UP)
-    monkeypatch.setenv(RENDERER_VARIABLE, "software")
-    plain = cloud_pictures(results, EarlierPage(), up=UP)
-    assert [title for title, _ in by_pyvista.shown] == [title for title, _ in plain.shown]
-    for (_, drawn), (_, expected) in zip(by_pyvista.shown, plain.shown, strict=True):
-        marks = [decoded(picture).astype(int).min(axis=-1) < 225 for picture in (drawn, expected)]
-        assert (marks[0] & marks[1]).sum() > 0.4 * min(mark.sum() for mark in marks)
-        assert marks[1].any()

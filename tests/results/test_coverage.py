@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -140,6 +139,3 @@ def test_figures_survive_a_page(results: StoredValues, tiny: TinyCapture) -> Non
     area = LonelyArea(1.0, -2.0, 0.1, 3.5, (1.0, 2.0, 3.0))
     found = {"a": ViewCoverage(2.5, 0.1, (area,)), **coverage(results, tiny.names)}
     assert coverage_from_fact(json.loads(json.dumps(fact_of(found)))) == found
-    wrong: Any
-    for wrong in (None, [], {"a": 1}, {"a": {"typical_range": "x", "alone": 1, "areas": []}}, {"a": {"areas": []}}):
-        assert coverage_from_fact(wrong) is None

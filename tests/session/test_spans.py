@@ -208,6 +208,7 @@ class Refusing:
     """Refuses everything at once, as a collector that wants another password."""
 
     def export(self, _spans: object) -> SpanExportResult:
+        logging.getLogger("opentelemetry.exporter").error("refused")
         return SpanExportResult.FAILURE
 
     def shutdown(self) -> None:

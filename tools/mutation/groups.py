@@ -40,15 +40,13 @@ GROUPS = {
     "keys": Group(
         (
             "pano_mvs/core/digest.py",
-            "pano_mvs/engine/code/*.py",
             "pano_mvs/engine/planning/resolve.py",
             "pano_mvs/engine/planning/units.py",
             "pano_mvs/engine/stages/stage_code.py",
         ),
         (
             "tests/core/test_digests.py",
-            *_engine("code/plugin_digest", "code/code_digest", "code/code_reach"),
-            *_engine("code/stage_code", "planning/resolve", "running/run"),
+            *_engine("stages/code_digest", "stages/stage_code", "planning/resolve", "running/run"),
         ),
     ),
     "store": Group(

@@ -36,10 +36,7 @@ def runs(cache: CacheOption = None) -> None:
 @cache_app.command("verify")
 @guarded
 def verify(cache: CacheOption = None) -> None:
-    """Check every file and remove damaged ones, which the next run computes again.
-
-    Results of early versions, which did not check the images that they read, are removed too.
-    """
+    """Check every file and remove damaged ones, which the next run computes again."""
     from pano_mvs.cli.cache.command import open_cache, verify_cache
 
     raise typer.Exit(verify_cache(open_cache(cache), Console()))

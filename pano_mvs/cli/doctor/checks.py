@@ -41,7 +41,7 @@ class Finding:
 
 
 KNOWN_VARIABLES = (
-    *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER"),
+    *(CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE"),
     "PANO_MVS_WORKER",  # marks what a worker starts
 )
 
@@ -230,9 +230,7 @@ def plugin_findings(
     else:
         yield Finding("plugins", "presets", "failed", f"no workflows in {presets}", _REINSTALL)
     for plugin in registry.broken:
-        stages = [name for kind, name in plugin.names if kind == "stage"]
-        command = f"pano-mvs stage show {stages[0]}" if stages else "pano-mvs plugins"
-        remedy = f"correct or remove it; `{command}` shows more"
+        remedy = "correct or remove it; `pano-mvs plugins` shows more"
         yield Finding("plugins", plugin.origin, "warning", f"failed to load: {plugin.error}", remedy)
     for (kind, name), why in registry.clashes.items():
         yield Finding("plugins", f"{kind} {name}", "warning", why, "it cannot be used until this is resolved")

@@ -41,10 +41,7 @@ def show_plugins(console: Console, *, workflow: str | None = None, files: Sequen
     for clash in registry.clashes.values():
         console.say(f"[red]twice:[/] {escape(clash)}")
     for plugin in registry.broken:
-        console.say(f"[red]broken:[/] {escape(plugin.origin)}: {escape(plugin.error)}")
-        stages = [name for kind, name in plugin.names if kind == "stage"]
-        if stages:
-            console.print(f"  the whole of it: pano-mvs stage show {escape(stages[0])}", highlight=False)
+        console.say(f"[red]broken:[/] {escape(plugin.why_broken())}")
 
 
 def show_stage(name: str, console: Console, *, workflow: str | None = None, files: Sequence[Path] = ()) -> None:

@@ -29,6 +29,9 @@ from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
 
+FOLDER_DIGITS = 3
+"""Number of digits of a key or digest in the name of the folder of its file."""
+
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
 _MAGIC = np.lib.format.magic(1, 0)
 
@@ -78,12 +81,11 @@ class BlobStore:
     A new blob is a file. Arrays and JSON values may be moved into packs later, even while they are in use.
     """
 
-    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
+    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
         self.root = root
         self.packs = Packs(root)
         self.durable = durable
         self._folder = str(root / "blobs")
-        self._digits = folder_digits
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
@@ -117,7 +119,7 @@ class BlobStore:
         if ref.external:
             return self._external.get(ref.digest, f"unregistered/{ref.digest}")
         # A text, because creating a Path takes ten times as long.
-        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"
+        return f"{self._folder}/{ref.digest[:FOLDER_DIGITS]}/{ref.digest}{ref.suffix}"
 
     def exists(self, ref: BlobRef) -> bool:
         """Return whether a blob exists and has the right size; its bytes are checked when it is read."""
@@ -212,7 +214,7 @@ class BlobStore:
         if ref in self._verified:
             return place
         if isinstance(place, Path) and not ref.external:
-            self._refuse_link(place)
+            refuse_link(place)
         while True:
             try:
                 is_intact = _is_intact(place, ref)
@@ -278,19 +280,19 @@ class BlobStore:
 
     def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
         path = self.path(ref)
-        self._refuse_link(path)
+        refuse_link(path)
         self._verified.discard(ref)  # it is missing or damaged
         if is_folder(path):
             make_room(path)
         return replacing(path, temporary_in=self.temporary, durable=self.durable)
 
-    @staticmethod
-    def _refuse_link(path: Path) -> None:
-        if is_link(path.parent):
-            raise StoreError(
-                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
-                "with --cache DIR"
-            )
+
+def refuse_link(path: Path) -> None:
+    """Raise StoreError if the folder of a file in a cache is a link, which caches do not have."""
+    if is_link(path.parent):
+        raise StoreError(
+            f"{path.parent} is a link, but caches have no links: remove it, or choose another cache with --cache DIR"
+        )
 
 
 def _is_intact(place: Path | Packed, ref: BlobRef) -> bool:

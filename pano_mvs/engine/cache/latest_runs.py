@@ -13,9 +13,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import read_regular, replacing
+from pano_mvs.core.files import checked_body, read_regular, write_checked
 from pano_mvs.core.paths import children, is_file, resolved
 
 Keys: TypeAlias = "dict[str, dict[str, str]]"  # stage to unit to cache key
@@ -128,32 +128,28 @@ class RunHistory:
         Raises:
             StoreError: if it cannot be removed.
         """
-        path = self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise StoreError(
-                f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache"
-            ) from error
+        delete(self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json")
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
-        body = json.dumps(value, sort_keys=True).encode()  # 100 MB for a million units, so avoid copies
         path = self.root / folder / f"{entry.name}.json"
-        with replacing(path, temporary_in=self.root / "tmp") as temporary, temporary.open("wb") as stream:
-            stream.write(f"{digest_from_bytes(body)}\n".encode())
-            stream.write(body)
+        write_checked(path, json.dumps(value, sort_keys=True).encode(), temporary_in=self.root / "tmp")
 
     def _paths(self, folder: str, pattern: str) -> list[Path]:
         return [path for path in children(self.root / folder, pattern) if is_file(path) and path.name[0] != "."]
 
 
+def delete(path: Path) -> None:
+    """Delete a file of a cache; raise StoreError if that is impossible."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache") from error
+
+
 def _read(path: Path) -> RunEntry | None:
     try:
-        checksum, _, body = read_regular(path).partition(b"\n")
-        if checksum.decode() != digest_from_bytes(body):
-            return None
-        value = json.loads(body)
+        value = json.loads(checked_body(read_regular(path)))
         workflow, out, when = (str(value[name]) for name in ("workflow", "out", "when"))
         if datetime.fromisoformat(when).utcoffset() is None or not "1970" < when[:4] < "9999":
             raise ValueError("not the time of a run")

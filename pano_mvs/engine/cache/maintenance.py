@@ -24,8 +24,8 @@ from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import make_room, read_regular, whose_temporary
 from pano_mvs.core.paths import is_file, is_link
-from pano_mvs.engine.cache.blobs import SUFFIX
-from pano_mvs.engine.cache.latest_runs import RunEntry
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX
+from pano_mvs.engine.cache.latest_runs import RunEntry, delete
 from pano_mvs.engine.cache.packs import ARRAY, JSON, RECORD, Packed
 from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 
@@ -121,7 +121,7 @@ def verify(store: Store) -> Verification:
     intact: set[str] = set()
     for folder, pattern in (("blobs", _BLOB_NAME), ("records", _RECORD_NAME)):
         for file in _files(store.root / folder):
-            if _own_name(store, file, pattern):
+            if _own_name(file, pattern):
                 continue
             is_special = not is_link(Path(file.path)) and not is_file(Path(file.path))
             if pattern.fullmatch(file.name) and is_special:
@@ -154,7 +154,7 @@ def _remove_damaged(store: Store, value: _Value, found: Verification) -> None:
     if isinstance(value.place, Packed):
         store.blobs.packs.forget([value.place])
     else:
-        _remove(value.place)
+        delete(value.place)
     found.removed.append(value.name)
 
 
@@ -192,7 +192,7 @@ def pack(store: Store) -> int:
     packs.add(chain(loose, ((value, None) for value in packs.each() if value.pack in small)))
     for value, path in loose:
         if packs.find(value.digest) is not None:
-            _remove(path)
+            delete(path)
     for path in small:
         packs.remove(path)
     return len(loose)
@@ -287,7 +287,7 @@ def _delete(store: Store, found: GarbageCollection, *, now: float, unused_s: flo
         for place in places:
             stat = _stat(place) if isinstance(place, Path) else None
             if stat is not None and _is_unused(stat.st_mtime, now, unused_s):
-                _remove(Path(str(place)))
+                delete(Path(str(place)))
     packs.rewrite({place.pack for place in (*found.records, *found.blobs) if isinstance(place, Packed)})
 
 
@@ -297,13 +297,6 @@ def _packed(digest: str) -> bytes:
     Even among millions of digests no two begin alike. If two did, one file too many would be kept.
     """
     return bytes.fromhex(digest[:DIGEST_BYTES]) if IS_DIGEST.fullmatch(digest) else b""
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache") from error
 
 
 def _records(store: Store) -> Iterator[_Value]:
@@ -320,7 +313,7 @@ def _blobs(store: Store) -> Iterator[_Value]:
 
 def _of_files(store: Store, folder: str, pattern: re.Pattern[str]) -> Iterator[_Value]:
     for file in _files(store.root / folder):
-        digest = _own_name(store, file, pattern)
+        digest = _own_name(file, pattern)
         stat = _stat(file.path) if digest else None
         if stat is not None:
             yield _Value(Path(file.path), digest, stat.st_size, stat.st_mtime)
@@ -340,10 +333,10 @@ def _intact_records(store: Store) -> Iterator[tuple[_Value, UnitRecord]]:
             yield value, record
 
 
-def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
+def _own_name(file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
     """Return the digest in the name of a file of the cache; empty if the file does not belong to the cache."""
     match = pattern.fullmatch(file.name)
-    if match is None or Path(file.path).parent.name != match[1][: store.folder_digits]:
+    if match is None or Path(file.path).parent.name != match[1][:FOLDER_DIGITS]:
         return ""
     return match[1] if file.is_file(follow_symlinks=False) else ""
 

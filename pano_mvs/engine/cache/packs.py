@@ -20,8 +20,8 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.digest import DIGEST_BYTES, digest_from_bytes
-from pano_mvs.core.files import read_regular, remove_whole, replacing
+from pano_mvs.core.digest import DIGEST_BYTES
+from pano_mvs.core.files import checked_body, read_regular, remove_whole, replacing, write_checked
 from pano_mvs.core.paths import children, is_file, is_link
 
 RECORD, ARRAY, JSON = "record", ".npy", ".json"
@@ -196,10 +196,7 @@ class Packs:
         return [pack for pack in children(self.folder, "*.pack") if pack not in self._indexes]
 
     def _write_index(self, pack: Path, entries: NDArray[Any]) -> None:
-        body = entries.tobytes()
-        path = pack.with_suffix(".index")
-        with replacing(path, temporary_in=self._temporary, durable=True) as temporary:
-            temporary.write_bytes(digest_from_bytes(body).encode() + b"\n" + body)
+        write_checked(pack.with_suffix(".index"), entries.tobytes(), temporary_in=self._temporary, durable=True)
 
     def _refresh(self, *, force: bool) -> None:
         """Read the indexes that other processes have written or replaced since the last time."""
@@ -257,10 +254,7 @@ def _table(indexes: list[NDArray[Any]]) -> NDArray[Any]:
 def _read_index(path: Path) -> NDArray[Any] | None:
     """Return the entries of an index, or None if it is damaged."""
     try:
-        checksum, _, body = read_regular(path).partition(b"\n")
-        if checksum.decode() != digest_from_bytes(body):
-            return None
-        entries = np.frombuffer(body, _ENTRY)
+        entries = np.frombuffer(checked_body(read_regular(path)), _ENTRY)
     except (OSError, ValueError):
         return None
     return entries if (entries["kind"] < len(_KINDS)).all() else None

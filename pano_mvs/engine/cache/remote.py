@@ -18,12 +18,12 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file
+from pano_mvs.core.digest import IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import PanoMvsError, StoreError, UsageError
 from pano_mvs.core.extras import import_extra
-from pano_mvs.core.files import CACHE_MARK, read_regular, remove_whole, replacing
+from pano_mvs.core.files import CACHE_MARK, checked_body, read_regular, remove_whole, replacing
 from pano_mvs.core.paths import below, is_file, is_link
-from pano_mvs.engine.cache.blobs import SUFFIX
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, SUFFIX, refuse_link
 from pano_mvs.engine.cache.packs import RECORD, values_of
 from pano_mvs.engine.cache.store import Store, record_from_bytes
 
@@ -111,8 +111,7 @@ class RemoteCache:
 
         def copy(name: str) -> None:
             path = store.root / name
-            if is_link(path.parent):
-                raise StoreError(f"{path.parent} is a link, but caches have no links: remove it")
+            refuse_link(path)
             with replacing(path, temporary_in=store.root / "tmp", durable=store.durable) as temporary:
                 self._files.get_file(self._path(name), str(temporary))
                 if problem := _problem(name, temporary, index=path):
@@ -123,7 +122,7 @@ class RemoteCache:
                     )
 
         own = _local_files(store, unfinished=True)
-        remote = {name: size for name, size in self._listed().items() if _belongs(name, store)}
+        remote = {name: size for name, size in self._listed().items() if _belongs(name)}
         # What this cache has under a name that may change, such as an index without damaged values, stays.
         remote = {name: size for name, size in remote.items() if not (_is_mutable(name) and name in own)}
         return self._copy(remote, own, copy, differs=None, progress=progress)
@@ -211,14 +210,14 @@ def _local_files(store: Store, *, unfinished: bool = False) -> dict[str, int]:
         if is_file(path) and not is_link(path)
     }
     left_out = set() if unfinished else set(store.blobs.packs.without_index())
-    return {name: path.stat().st_size for name, path in found.items() if _belongs(name, store) and path not in left_out}
+    return {name: path.stat().st_size for name, path in found.items() if _belongs(name) and path not in left_out}
 
 
-def _belongs(name: str, store: Store) -> bool:
+def _belongs(name: str) -> bool:
     """Return whether a file is one of a cache, and in the folder where it must be."""
     match = next(filter(None, (pattern.fullmatch(name) for pattern in _ORDER)), None)
     named = match.groupdict() if match else {}
-    return match is not None and named.get("folder", "") == named.get("name", "")[: store.folder_digits]
+    return match is not None and named.get("folder", "") == named.get("name", "")[:FOLDER_DIGITS]
 
 
 def _is_mutable(name: str) -> bool:
@@ -254,5 +253,8 @@ def _problem(name: str, path: Path, *, index: Path) -> str:
         return ""
     if folder == "packs":
         return ""  # it is checked with its index, which is copied after it
-    checksum, _, body = read_regular(path).partition(b"\n")
-    return "" if checksum.decode(errors="replace") == digest_from_bytes(body) else "is damaged"
+    try:
+        checked_body(read_regular(path))
+    except ValueError:
+        return "is damaged"
+    return ""

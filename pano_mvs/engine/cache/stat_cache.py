@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 from typing import TypeAlias
 
-from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file, digest_from_value
+from pano_mvs.core.digest import IS_DIGEST, digest_from_file, digest_from_value
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.files import CACHE_MARK, read_regular, write_text
+from pano_mvs.core.files import CACHE_MARK, checked_body, read_regular, write_checked
 from pano_mvs.core.paths import below, is_file, is_folder, reason_of, resolved
 
 # A file that changed this shortly before it was hashed may change again without a new time stamp.
@@ -68,9 +68,7 @@ class StatCache:
         if self._new:
             kept = {name: entry for name, entry in _read(self._path).items() if name not in self._new}
             entries = [*kept.items(), *self._new.items()][-_MAX_ENTRIES:]
-            body = json.dumps(dict(entries))
-            text = f"{digest_from_bytes(body.encode())}\n{body}"
-            write_text(self._path, text, temporary_in=self._path.parent / "tmp")
+            write_checked(self._path, json.dumps(dict(entries)).encode(), temporary_in=self._path.parent / "tmp")
             self._entries, self._new = dict(entries), {}
 
     def _file(self, path: Path) -> str:
@@ -100,8 +98,7 @@ def _state(stat: os.stat_result) -> State:
 def _read(path: Path) -> dict[str, Entry]:
     """Return the entries in a file; none if it is damaged."""
     try:
-        checksum, _, body = read_regular(path).partition(b"\n")
-        entries = json.loads(body) if checksum.decode() == digest_from_bytes(body) else None
+        entries = json.loads(checked_body(read_regular(path)))
     except (OSError, ValueError, RecursionError):
         return {}
     if not isinstance(entries, dict):

@@ -23,21 +23,22 @@ from pathlib import Path
 from sys import intern
 from typing import Any
 
-from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_value
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import (
     CACHE_MARK,
+    checked_body,
     clear_abandoned,
     is_full_disk,
     make_folder,
     make_room,
     read_regular,
-    replacing,
     temporary_prefix,
+    write_checked,
     write_text,
 )
 from pano_mvs.core.paths import children, exists, is_folder, is_link, reason_of
-from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError, PackedRefs
+from pano_mvs.engine.cache.blobs import FOLDER_DIGITS, BlobRef, BlobStore, DamagedBlobError, PackedRefs, refuse_link
 from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packs import RECORD, Packed
 from pano_mvs.engine.cache.stat_cache import StatCache
@@ -122,9 +123,6 @@ class DiskGuard:
 
 
 LAYOUT_VERSION = 2
-_FOLDER_DIGITS = {1: 2, 2: 3}
-"""Layout to the number of digits of a key or digest in a folder name. Older caches keep their 256 folders."""
-
 MIN_FREE_BYTES = 200_000_000
 _FOLDERS = ("blobs", "records", "packs", "runs", "pins", "tmp")
 
@@ -211,7 +209,6 @@ class UnitRecord:
             "rejected": dict(self.rejected),
             "doubts": dict(self.doubts),
             "seconds": self.seconds,
-            "checked": True,
         }
 
     @staticmethod
@@ -228,8 +225,6 @@ class UnitRecord:
         seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a metric or a time is not finite")
-        if value.get("checked") is not True:
-            raise ValueError("of an early version, which did not compare what a unit read with the digests in its key")
         return UnitRecord(
             key=str(value["key"]),
             identity=identity,
@@ -274,13 +269,12 @@ class Store:
         self.damaged: list[str] = []
         self._records = str(root / "records")
         self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
-        self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
         clear_abandoned(self.root / "tmp", "*")
         self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.unit_times = UnitTimes(root / FILE_NAME)
-        self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
+        self.blobs = BlobStore(root, self.stat_cache, durable=durable)
 
     @property
     def is_empty(self) -> bool:
@@ -296,7 +290,7 @@ class Store:
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key, whether or not its blobs exist; None if it is missing or damaged."""
-        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"  # creating a Path takes as long as the rest
+        path = f"{self._records}/{key[:FOLDER_DIGITS]}/{key}.json"  # creating a Path takes as long as the rest
         packed: Packed | None = None
         for _ in range(2):  # again, because another process may have moved it meanwhile
             if (packed := self.packed_record(key, refresh=packed is not None)) is not None:
@@ -328,23 +322,12 @@ class Store:
         """Write a record; its blobs must already exist."""
         if (packed := self.packed_record(record.key)) is not None:  # it could not be used
             self.blobs.packs.forget([packed])
-        body = json.dumps(
-            record.to_json(), sort_keys=True
-        ).encode()  # 50 MB for a stage with all pairs, so avoid copies
+        body = json.dumps(record.to_json(), sort_keys=True).encode()
         path = self.record_path(record.key)
-        if is_link(path.parent):
-            raise StoreError(
-                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
-                "with --cache DIR"
-            )
+        refuse_link(path)
         if is_folder(path):
             make_room(path)
-        with (
-            replacing(path, temporary_in=self.blobs.temporary, durable=self.durable) as temporary,
-            temporary.open("wb") as stream,
-        ):
-            stream.write(f"{digest_from_bytes(body)}\n".encode())
-            stream.write(body)
+        write_checked(path, body, temporary_in=self.blobs.temporary, durable=self.durable)
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be unusable."""
@@ -405,7 +388,7 @@ class Store:
 
     def record_path(self, key: str) -> Path:
         """Return the path of the record of a key, whether or not it exists."""
-        return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
+        return self.root / "records" / key[:FOLDER_DIGITS] / f"{key}.json"
 
     def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
@@ -435,13 +418,12 @@ class Store:
                 "the cache, delete the file, and nothing is lost; otherwise choose another cache with --cache DIR"
             ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
-        if type(version) is not int or version not in _FOLDER_DIGITS:
+        if type(version) is not int or version != LAYOUT_VERSION:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, but this version uses {LAYOUT_VERSION}. "
                 "Choose another cache with --cache DIR"
             )
-        self.folder_digits = _FOLDER_DIGITS[version]
-        mark = self.root / CACHE_MARK  # missing from caches of earlier versions
+        mark = self.root / CACHE_MARK
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
@@ -460,10 +442,7 @@ class Store:
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:
     """Return the record in the bytes of a file, or None if they do not match the digest in the first line."""
-    end = data.find(b"\n")
     try:
-        if end < 0 or data[:end].decode() != digest_from_bytes(memoryview(data)[end + 1 :]):
-            return None
-        return UnitRecord.from_json(json.loads(str(memoryview(data)[end + 1 :], "utf-8")))
+        return UnitRecord.from_json(json.loads(checked_body(data)))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None

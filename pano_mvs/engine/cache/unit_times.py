@@ -13,8 +13,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from statistics import median
 
-from pano_mvs.core.digest import digest_from_bytes
-from pano_mvs.core.files import read_regular, write_text
+from pano_mvs.core.files import checked_body, read_regular, write_checked
 from pano_mvs.core.paths import stat_of
 from pano_mvs.scene.image_header import image_kind, stated_size_of_file
 
@@ -83,9 +82,8 @@ class UnitTimes:
         for stage, sample in self._new:
             samples[stage] = [*samples.pop(stage, []), sample][-_MAX_SAMPLES:]
         value = {stage: [astuple(sample) for sample in found] for stage, found in list(samples.items())[-1000:]}
-        body = json.dumps(value, allow_nan=False)
-        text = f"{digest_from_bytes(body.encode())}\n{body}"
-        write_text(self._path, text, temporary_in=self._path.parent / "tmp")
+        body = json.dumps(value, allow_nan=False).encode()
+        write_checked(self._path, body, temporary_in=self._path.parent / "tmp")
         self._samples, self._new = samples, []
 
     def expected_unit(
@@ -160,8 +158,7 @@ def _distance(sample: Sample, size: CaptureSize) -> float:
 def _read(path: Path) -> dict[str, list[Sample]]:
     """Return the samples in a file; none if it is missing or damaged."""
     try:
-        checksum, _, body = read_regular(path).partition(b"\n")
-        value = json.loads(body) if checksum.decode() == digest_from_bytes(body) else {}
+        value = json.loads(checked_body(read_regular(path)))
         return {str(stage): [_sample(entry) for entry in found] for stage, found in value.items()}
     except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         return {}

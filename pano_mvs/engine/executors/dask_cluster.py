@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import platform
 import queue
 import socket
 import threading
@@ -21,18 +20,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import pano_mvs
-from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.extras import import_extra, installed_version
+from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import make_folder, temporary_prefix
-from pano_mvs.core.paths import below, children, is_file
+from pano_mvs.core.paths import children, is_file
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.executors.unit_json import request_to_json
+from pano_mvs.engine.stages.stage_code import code_texts
 
 _CONNECT_S = 20.0
 
@@ -51,8 +48,7 @@ class DaskExecutor(Executor):
             threads: threads of each worker; 0 for an equal share of the cores of its host.
 
         Raises:
-            UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
-                not see the cache.
+            UsageError: if dask is not installed, the scheduler does not answer, or a worker does not see the cache.
         """
         distributed = import_extra("distributed", "--executor dask", "dask")
         if scheduler:
@@ -98,8 +94,7 @@ class DaskExecutor(Executor):
         except (OSError, ValueError, TimeoutError) as error:
             raise UsageError(f"--scheduler {cluster}: it does not answer ({error})") from error
         self._token = store.blobs.temporary / f"{temporary_prefix()}hello-{uuid.uuid4().hex}"
-        # What each worker compares with its own: the cache, a file in it, and the versions.
-        self._expected = str(store.root.absolute()), self._token.name, versions()
+        self._expected = str(store.root.absolute()), self._token.name  # what each worker has to see
         try:
             make_folder(self._token.parent)
             self._token.write_text(self._token.name, encoding="ascii")
@@ -188,7 +183,7 @@ class DaskExecutor(Executor):
 
     def _check_workers(self) -> tuple[int, int, int]:
         """Return the number of units at a time, the threads for each, and the threads for a unit that runs alone."""
-        found = self._client.run(introduce, *self._expected[:2], on_error="return")
+        found = self._client.run(introduce, *self._expected, on_error="return")
         for worker, answer in found.items():
             if isinstance(answer, BaseException):
                 raise UsageError(f"dask worker {worker} cannot run pano_mvs: {answer}. Install it there") from answer
@@ -220,12 +215,11 @@ def with_waiting(places: int) -> int:
     return places + (places + 1) // 2
 
 
-_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "pydantic")
 _workers: dict[tuple[str, int], WorkerProcess] = {}
-_accepted: set[str] = set()  # runs for which this dask worker has the same versions and sees the cache
+_accepted: set[str] = set()  # runs whose cache this dask worker sees
 
 
-def run_unit(run: str, text: str, expected: tuple[str, str, dict[str, str]]) -> str:
+def run_unit(run: str, text: str, expected: tuple[str, str]) -> str:
     """Compute a unit in the worker process of this thread, if this dask worker fits; it may have joined a minute ago.
 
     Args:
@@ -234,7 +228,7 @@ def run_unit(run: str, text: str, expected: tuple[str, str, dict[str, str]]) -> 
         expected: as for `objection`.
     """
     if run not in _accepted:
-        if problem := objection(introduce(*expected[:2]), expected):
+        if problem := objection(introduce(*expected), expected):
             return json.dumps(JobOutcome("stopped", cause=problem, error="UsageError", exit_code=2).to_json())
         _accepted.add(run)
     request = json.loads(text if text.startswith("{") else Path(text).read_bytes())
@@ -265,44 +259,27 @@ def introduce(store: str, token: str) -> dict[str, Any]:
     return {
         "host": socket.gethostname(),
         "cores": available_threads(),
-        "versions": versions(),
         "token": content,
         "answer": answer.name,
         "reason": reason,
     }
 
 
-def objection(answer: Mapping[str, Any], expected: tuple[str, str, Mapping[str, str]]) -> str:
+def objection(answer: Mapping[str, Any], expected: tuple[str, str]) -> str:
     """Return why a worker must not compute units; empty if it may.
 
     Args:
         answer: of `introduce`, on the worker.
-        expected: the folder of the cache, the content of the token there, and the versions that the command uses.
+        expected: the folder of the cache, and the content of the token there.
     """
-    root, token, ours = expected
-    place = f"dask worker on {answer['host']}"
-    others = differences(ours, answer["versions"])
-    if others:
-        return f"{place}: {'; '.join(others)}. Results would depend on the worker: install the same versions there"
+    root, token = expected
     if answer["token"] != token:
         reason = answer["reason"] or "it is another folder there"
         return (
-            f"{place} does not see the cache {root} ({reason}). Choose a cache with --cache DIR that all hosts share "
-            "under the same path"
+            f"dask worker on {answer['host']} does not see the cache {root} ({reason}). Choose a cache with "
+            "--cache DIR that all hosts share under the same path"
         )
     return ""
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of everything that affects results."""
-    package = Path(pano_mvs.__file__).parent
-    sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in below(package, "*.py")}
-    # Two checkouts of a version may differ.
-    found = {
-        "python": ".".join(platform.python_version_tuple()[:2]),
-        "pano_mvs": f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}",
-    }
-    return found | {name: installed_version(name) or "not installed" for name in _LIBRARIES}
 
 
 def _new_worker(threads: int) -> WorkerProcess:
@@ -310,9 +287,3 @@ def _new_worker(threads: int) -> WorkerProcess:
     from distributed import get_worker
 
     return WorkerProcess(threads, Path(get_worker().local_directory) / f"pano-mvs-{uuid.uuid4().hex}.txt")
-
-
-def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Return the differences between two sets of versions, in words."""
-    names = [name for name in ours if theirs.get(name) != ours[name]]
-    return [f"{name} is {theirs.get(name)} there and {ours[name]} here" for name in names]

@@ -10,6 +10,7 @@ import time
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,13 +25,12 @@ from pano_mvs.core.errors import (
     ContractError,
     InputError,
     PanoMvsError,
-    PluginError,
     RunStoppedError,
     StoreError,
     UsageError,
 )
 from pano_mvs.core.files import make_folder
-from pano_mvs.core.process_state import Changes, ProcessState, has_plugins
+from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
@@ -46,10 +46,6 @@ from pano_mvs.scene.record import changed_text, vanished_text
 from pano_mvs.scene.two_view import pair_from_name
 
 
-class ChangedStateError(PluginError):
-    """A plugin, in a thread that it left behind, changed what a unit of another stage computes."""
-
-
 def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """Run a unit and store its result; the record is written last.
 
@@ -58,7 +54,6 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     Raises:
         ChangedFileError: if an input file is not the one whose digest is in the key.
         ContractError: if the stage returns something other than what it declared.
-        ChangedStateError: if a plugin changed the process while a built-in stage was running.
         Exception: any exception of the stage.
     """
     started, compiling_s = time.perf_counter(), kernel_cache.compilation_time.seconds
@@ -96,22 +91,17 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 
 
 def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
-    """Return what the stage returns, with the state of the process as before."""
-    process, before, changes = os.getpid(), ProcessState.now() if has_plugins() else None, Changes()
-    try:
-        offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
-        value = unit.entry.spec.function(
-            **arguments, **{name: offered[role] for name, role in unit.entry.spec.extras.items()}
-        )
-    finally:
-        if os.getpid() != process:  # the stage forked, and this is the child, which must not store or answer
-            os._exit(0)
-        if before is not None:
-            changes = before.restore()
-    if changes and not unit.entry.spec.is_built_in:
-        context.note(f"it changed {changes} in its process; this was undone")
-    elif changes.deciding:
-        raise ChangedStateError(f"a plugin changed {changes.deciding} while {unit.label} was computed")
+    """Return what the stage returns, with the state of the process as before if it is a plugin's."""
+    process, spec = os.getpid(), unit.entry.spec
+    offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
+    with nullcontext() if spec.is_built_in else restored_state() as changes:
+        try:
+            value = spec.function(**arguments, **{name: offered[role] for name, role in spec.extras.items()})
+        finally:
+            if os.getpid() != process:  # the stage forked, and this is the child, which must not store or answer
+                os._exit(0)
+    if changes:
+        context.note(f"it changed {', '.join(changes)} in its process; this was undone")
     return value
 
 
@@ -273,8 +263,6 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     if isinstance(error, StoreError | RunStoppedError) and not isinstance(error, DamagedBlobError):
         kind = StoreError if isinstance(error, StoreError) else RunStoppedError
         return JobOutcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
-    if isinstance(error, ChangedStateError):
-        return JobOutcome("failed", cause=str(error), died=True)  # the process cannot be used any more
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
         store.stat_cache.forget(error.path)

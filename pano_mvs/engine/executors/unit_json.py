@@ -35,7 +35,6 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
     Large inputs are written into the job's `inputs_file`.
 
     Raises:
-        UsageError: if the settings of the stage change when they are written as JSON and read back.
         StoreError: if the file cannot be written.
     """
     large = has_large_inputs(job.unit)
@@ -84,9 +83,6 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
 
     Args:
         inputs_file: that `write_large_inputs` wrote; None if all inputs are to be in the message.
-
-    Raises:
-        UsageError: if the settings of the stage change when they are written as JSON and read back.
     """
     spec = unit.entry.spec
     large = _large_ports(unit) if inputs_file is not None else ()
@@ -94,19 +90,13 @@ def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -
     identity = dict(unit.identity)
     if large:
         identity["inputs"] = {name: [] if name in large else part for name, part in identity["inputs"].items()}
-    values = _plain(unit.entry.params)
-    if _plain(unit.entry.spec.params_type.model_validate(values)) != values:
-        raise UsageError(
-            f"stage {unit.entry.name!r} ({unit.entry.spec.origin}): its settings change when they are validated a "
-            "second time, so that they cannot be sent to a worker. Use --executor serial"
-        )
     return {
         "text_version": TEXT_VERSION,
         "stage": unit.entry.name,
         "use": spec.name,
         "version": spec.version,
         "code": spec.code_digest,
-        "params": values,
+        "params": _plain(unit.entry.params),
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in inputs.items()}

@@ -12,24 +12,19 @@ from typing import Any
 
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import is_inside
-from pano_mvs.core.process_state import ProcessState, has_plugins, load_libraries
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.execute import unit_outcome
 from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.unit_json import unit_from_json
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage_code import code_digest
 
 
 def run_request(request: Mapping[str, Any]) -> JobOutcome:
     """Compute the unit of a request; see `request_to_json`."""
-    if _LEFT and (changes := _LEFT[0].restore().deciding):
-        return JobOutcome("failed", cause=f"a plugin changed {changes} in its worker after a unit", died=True)
     try:
         store = _store(*request["store"])
-        if request["plugins"]:
-            load_libraries()
         given, texts = request["plugins"], request.get("plugin_texts", {})
         # Files sent with the request are written to a temporary folder.
         files = {path: _written(digest, *texts[path]) if path in texts else path for path, digest in given.items()}
@@ -38,15 +33,10 @@ def run_request(request: Mapping[str, Any]) -> JobOutcome:
     except PanoMvsError as error:
         return JobOutcome("stopped", cause=str(error), error="UsageError")
     outcome = unit_outcome(unit, store, threads=request["threads"], log=Path(request["log"]))
-    _LEFT[:] = [ProcessState.now(compared=True)] if has_plugins() else []
     for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
     return outcome
-
-
-_LEFT: list[ProcessState] = []
-"""The state of this process after its last unit, if it has loaded plugins; a list, which is the same for each unit."""
 
 
 _folders: dict[str, TemporaryDirectory[str]] = {}

@@ -119,12 +119,6 @@ class ReadyQueue:
         self._settle(unit.entry.name, unit.item)
         self._spread()
 
-    def withdraw(self, stage: str, item: str, cause: str) -> None:
-        """Record that a unit has lost its result; its stage must not be complete yet."""
-        self.states[stage].items.pop(item, None)
-        self.states[stage].failed[item] = cause
-        self._stages[stage].collections.pop(item, None)
-
     def producers(self, stage: str) -> set[str]:
         """Return the stages that feed a stage."""
         return {edge.producer for edge in self._stages[stage].edges.values()}

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from types import MappingProxyType
 from typing import NamedTuple
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
@@ -20,16 +19,6 @@ from pano_mvs.scene import Files
 from pano_mvs.scene.files import item_stems
 
 
-class NameClashError(UsageError):
-    """A unit would write the same file as another unit of its stage, or write a file twice."""
-
-    def __init__(self, text: str, losers: Mapping[str, str] = MappingProxyType({})) -> None:
-        # units of the same stage whose files were withdrawn because they clash with those of this unit: item to the
-        # reason
-        self.losers = losers
-        super().__init__(text)
-
-
 class Owner(NamedTuple):
     """The unit that a file belongs to."""
 
@@ -37,103 +26,9 @@ class Owner(NamedTuple):
     item: str
 
 
-class Claim(NamedTuple):
-    """The result of a claim."""
-
-    refusal: str  # why the unit cannot deliver its files; empty if it can
-    losers: dict[str, str]  # units of the same stage that have to withdraw their files: item to the reason
-
-
-class FileClaims:
-    """The files that the units of one pass deliver, or would deliver if they did not clash with others.
-
-    Of the units of a stage that claim the same file, the first one in the order of the capture gets it. The others
-    deliver nothing, but their claims on other files still count, so that the result does not depend on the order in
-    which claims are made.
-    """
-
-    def __init__(self, order: Callable[[Owner], tuple[int, str]]) -> None:
-        """Start without claims; `order` returns the sort key of a unit."""
-        self._order = order
-        self._owners: dict[str, Owner] = {}  # file to the first unit that claims it, whether or not it delivers
-        self._folders: set[str] = set()
-        self._delivered: set[Owner] = set()
-        self._lost: dict[Owner, tuple[str, ...]] = {}  # unit that cannot deliver to the files that it claims
-
-    def claim(self, owner: Owner, files: Collection[str]) -> Claim:
-        """Enter the files of a unit; call `deliver` once they are written.
-
-        Raises:
-            UsageError: if another stage writes one of the files.
-        """
-        claim = self._resolve(owner, files)
-        for loser in claim.losers:
-            other = Owner(owner.stage, loser)
-            self._delivered.remove(other)
-            self._lost[other] = tuple(name for name, found in self._owners.items() if found == other)
-        for name in files:
-            self._owners[name] = min(owner, self._owners.get(name, owner), key=self._order)
-            self._folders.update(folders_of(name))
-        if claim.refusal:
-            self._lost[owner] = tuple(files)
-        return claim
-
-    def deliver(self, owner: Owner) -> None:
-        """Record that the files of a unit have been written."""
-        self._delivered.add(owner)
-
-    def lost_files(self, owner: Owner) -> tuple[str, ...]:
-        """Return the files that a unit claims but cannot deliver."""
-        return self._lost[owner]
-
-    def refusals(self) -> dict[tuple[str, str], str]:
-        """Return why units could not deliver, independent of the order of claims: stage and item to the reason."""
-        return {
-            (owner.stage, owner.item): next(
-                _reason(what, other.item)
-                for what, other in self._clashes(owner, files)
-                if self._order(other) < self._order(owner)
-            )
-            for owner, files in self._lost.items()
-        }
-
-    def _resolve(self, owner: Owner, files: Collection[str]) -> Claim:
-        refusal, losers = "", {}
-        for what, other in self._clashes(owner, files):
-            if other.stage != owner.stage:
-                raise UsageError(
-                    f"stages {other.stage!r} and {owner.stage!r} both write {what}; give one of them a folder of its "
-                    "own with `to: NAME`"
-                )
-            if self._order(owner) > self._order(other):
-                refusal = refusal or _reason(what, other.item)
-            elif other in self._delivered:
-                losers[other.item] = _reason(what, owner.item)
-        return Claim(refusal, losers)
-
-    def _clashes(self, owner: Owner, files: Iterable[str]) -> Iterator[tuple[str, Owner]]:
-        """Yield the clashes of some files: a description, and the other unit."""
-        for name in files:
-            if (other := self._owners.get(name)) is not None and other != owner:
-                yield name, other
-            for folder in folders_of(name):
-                if (other := self._owners.get(folder)) is not None and other != owner:
-                    yield f"{folder}, as a file and as a folder,", other
-            if name in self._folders:
-                inside = {other for path, other in self._owners.items() if path.startswith(f"{name}/")}
-                yield from ((f"{name}, as a file and as a folder,", other) for other in sorted(inside - {owner}))
-
-
 def folders_of(name: str) -> list[str]:
     """Return the folders of a file, inside the output folder."""
     return [str(folder) for folder in PurePosixPath(name).parents if folder.parts]
-
-
-def _reason(what: str, other: str) -> str:
-    return (
-        f"{what} is delivered for {other} too. Rename one of the images or their folders, or, in the stage, put "
-        "{item} or {name} into the names of the files"
-    )
 
 
 _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
@@ -156,9 +51,9 @@ class Publisher:
         self.earlier: dict[str, str] = {}  # file to digest, as an earlier run or an earlier pass of this run wrote them
         # files of the user that were renamed to make room: original name to new name
         self.set_aside: dict[str, str] = {}
-        self._claims = FileClaims(self._order)
+        self._owners: dict[str, Owner] = {}  # file to the unit that delivers it
+        self._folders: dict[str, Owner] = {}  # folder to a unit that delivers a file below it
         self._stems: dict[str, str] = {}
-        self._ranks: dict[str, int] = {}
         self._open()
         self._cleared: set[Path] = set()
         self._patterns: set[tuple[str, str]] = set()  # what stands before and after the name of an image
@@ -183,14 +78,13 @@ class Publisher:
     def name_items(self, names: Iterable[str]) -> None:
         """Set the text for `{item}` for each image: its path without the extension, unless two images would collide."""
         self._stems = item_stems(names)
-        self._ranks = {name: rank for rank, name in enumerate(self._stems)}
 
     def begin_pass(self) -> None:
         """Start a new pass: what was published so far counts as that of an earlier run."""
         self._open()
         self.earlier |= self.published
         self.published = {}
-        self._claims = FileClaims(self._order)
+        self._owners, self._folders = {}, {}
 
     def require_files(self) -> None:
         """Check that everything which this pass has published is still there.
@@ -202,44 +96,49 @@ class Publisher:
         if lost:
             raise DamagedBlobError(f"{self.out / lost[-1]} was removed during the run; writing it again")
 
-    def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
+    def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> None:
         """Write the files of one unit, unless they exist with the right bytes.
-
-        If several units of a stage write the same file, only the one whose image comes first in the capture is
-        published, and only if none of its files clashes with those of a unit before it. The result does not depend on
-        the order in which the units are computed.
 
         Args:
             to: folder for them inside the output folder.
 
-        Returns:
-            Units of the same stage whose files were withdrawn because they clash with those of this unit: item to the
-            reason.
-
         Raises:
-            NameClashError: if files of this unit clash with one another, or with those of a unit that comes first;
-                nothing is written.
-            UsageError: if two stages write the same file.
+            UsageError: if another unit writes one of the files; nothing is written.
             StoreError: if a file cannot be written.
             DamagedBlobError: if the copy in the cache is damaged.
-            ContractError: if a file would replace one of the run itself; nothing is written.
+            ContractError: if files of this unit clash with one another, or a file would replace one of the run itself;
+                nothing is written.
         """
-        owner = Owner(stage, item)
         files = self._placed_files(item, ref, to)
-        refusal, losers = self._claims.claim(owner, files)
-        for loser in losers:
-            self._withdraw(self._claims.lost_files(Owner(stage, loser)))
-        if refusal:
-            raise NameClashError(refusal, losers)
+        self._claim(Owner(stage, item), files)
         for name, blob in files.items():
             self._write(name, blob)
             self.published[name] = blob.digest
-        self._claims.deliver(owner)
-        return losers
 
-    def refusals(self) -> dict[tuple[str, str], str]:
-        """Return why units of this pass were not published: stage and item to the reason."""
-        return self._claims.refusals()
+    def _claim(self, owner: Owner, files: Iterable[str]) -> None:
+        """Enter the files of a unit; raise UsageError if another unit writes one of them, or has a folder there."""
+        for name in files:
+            for path in (name, *folders_of(name)):
+                self._require_own(path, owner, self._owners)
+            self._require_own(name, owner, self._folders)
+        for name in files:
+            self._owners[name] = owner
+            self._folders |= dict.fromkeys(folders_of(name), owner)
+
+    @staticmethod
+    def _require_own(path: str, owner: Owner, owners: Mapping[str, Owner]) -> None:
+        other = owners.get(path, owner)
+        if other.stage != owner.stage:
+            raise UsageError(
+                f"stages {other.stage!r} and {owner.stage!r} both write {path}; give one of them a folder of its own "
+                "with `to: NAME`"
+            )
+        if other != owner:
+            first, second = sorted((other.item, owner.item))
+            raise UsageError(
+                f"stage {owner.stage!r} delivers {path} for {first} and for {second}. Rename one of the "
+                "images or their folders, or, in the stage, put {item} or {name} into the names of the files"
+            )
 
     def _placed_files(self, item: str, ref: ItemRef, to: str) -> dict[str, BlobRef]:
         """Return the files of a unit by their path in the output folder, after checking these paths."""
@@ -252,23 +151,12 @@ class Publisher:
                     "it a folder with `to: NAME`"
                 )
             if name in files:
-                raise NameClashError(f"it delivers {name} twice. Give each of its files a name of its own")
+                raise ContractError(f"it delivers {name} twice. Give each of its files a name of its own")
             files[name] = blob
         for name in files:
             if folder := next((folder for folder in folders_of(name) if folder in files), ""):
-                raise NameClashError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
+                raise ContractError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
         return files
-
-    def _order(self, owner: Owner) -> tuple[int, str]:
-        return self._ranks.get(owner.item, len(self._ranks)), owner.item
-
-    def _withdraw(self, files: Iterable[str]) -> None:
-        for name in files:
-            del self.published[name]
-            with suppress(ValueError):
-                self.written.remove(name)
-            (self.out / name).unlink(missing_ok=True)
-            self._remove_emptied([name])
 
     def remove_stale(self, earlier: dict[str, str], *, complete: bool = True) -> list[str]:
         """Delete files that an earlier run wrote and this one did not, if they are unchanged since then.

@@ -36,10 +36,10 @@ from pano_mvs.engine.planning.resolve import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, Warned, consequence_of, ignore
-from pano_mvs.engine.running.publish import NameClashError, Publisher
+from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
-from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
+from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.scene import Axis, Files, Record
 
 GRACE_S = 10.0  # time for which running units may go on after an interrupt, so that their results are not lost
@@ -279,8 +279,7 @@ class RunPass:
         except RunStoppedError as error:
             stop = error
         finally:
-            refusals = self._run.publisher.refusals()
-            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced(), refusals=refusals)
+            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced())
         if stop is not None:
             self.result.stopped, self.result.exit_code = str(stop), stop.exit_code
         else:
@@ -380,28 +379,15 @@ class RunPass:
         """Write a unit's files into the output folder; return whether that was possible."""
         entry = unit.entry
         try:
-            losers = self._run.publisher.publish(entry.name, unit.item, record.output, to=entry.policy.to)
-        except (NameClashError, ContractError) as error:
+            self._run.publisher.publish(entry.name, unit.item, record.output, to=entry.policy.to)
+        except ContractError as error:
             self._fail(FinishedJob(unit, JobOutcome("failed", cause=str(error), seconds=record.seconds)))
-            for item, cause in error.losers.items() if isinstance(error, NameClashError) else ():
-                self._withdraw(entry, item, cause)
             return False
         except DamagedBlobError as error:
             self._store.drop(record.key)
             self.damaged.append(str(error))
             return False
-        for item, cause in losers.items():
-            self._withdraw(entry, item, cause)
         return True
-
-    def _withdraw(self, entry: StageEntry, item: str, cause: str) -> None:
-        """Count a unit as failed that had a result, because its files clash with those of an earlier image."""
-        was_computed = self._run.keys.get(entry.name, {}).get(item) in self._run.computed
-        failure = Failure(entry.name, item, cause, consequence=consequence_of(entry, item))
-        self._statistics.unit_withdrawn(failure, was_computed=was_computed)
-        self.queue.withdraw(entry.name, item, cause)
-        if entry.policy.on_error == "stop":
-            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
 
     def _fail(self, finished: FinishedJob) -> None:
         """Record a failed unit; stop the run if the workflow asks for it or if all other units depend on this one."""

@@ -6,9 +6,8 @@ import time
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from struct import Struct
-from types import MappingProxyType
 
 from pano_mvs.core.errors import InputError, RunStoppedError
 from pano_mvs.core.text import plural
@@ -135,17 +134,6 @@ class RunStatistics:
         self._observer(failure.event())
         self._observer(UnitFinished(failure.stage, failure.item, "failed", round(seconds, 6)))
 
-    def unit_withdrawn(self, failure: Failure, *, was_computed: bool) -> None:
-        """Count a unit as failed that was counted with a result before."""
-        count = self._counts[failure.stage]
-        count.summary.run -= was_computed
-        count.summary.cached -= not was_computed
-        count.summary.failed += 1
-        for found in (count.metrics, count.notes, count.rejected, count.doubts):
-            found.pop(failure.item, None)
-        self._result.failures.append(failure)
-        self._observer(failure.event())
-
     def stage_complete(self, entry: StageEntry) -> None:
         """Complete the summary of a stage.
 
@@ -198,22 +186,16 @@ class RunStatistics:
         position_of: Callable[[str, str], tuple[int, int]],
         *,
         replaced: Collection[str] = frozenset(),
-        refusals: Mapping[tuple[str, str], str] = MappingProxyType({}),
     ) -> None:
         """Sort the result by workflow and capture, so that it does not depend on which unit ended first.
 
         Args:
             position_of: returns the position of a unit in the workflow and in the capture.
             replaced: stages whose results later stages replaced: their doubts do not count any more.
-            refusals: stage and item of units whose files could not be published, to the final reason.
         """
         result = self._result
         result.stages.sort(key=lambda summary: position_of(summary.name, ""))
         result.failures.sort(key=lambda failure: position_of(failure.stage, failure.item))
-        result.failures[:] = [
-            replace(failure, cause=refusals.get((failure.stage, failure.item), failure.cause))
-            for failure in result.failures
-        ]
 
         def enter(stage: str, found: Mapping[str, Mapping[str, str]], reasons: dict[str, tuple[str, str]]) -> None:
             for item in sorted(found, key=lambda item: position_of(stage, item)):

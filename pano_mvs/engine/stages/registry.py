@@ -8,10 +8,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import re
 import sys
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -22,11 +21,11 @@ from types import ModuleType
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
-from pano_mvs.core.paths import below, children, home_folder, is_file, resolved
-from pano_mvs.core.process_state import loading_plugin
+from pano_mvs.core.paths import children, home_folder, is_file, resolved
+from pano_mvs.core.process_state import restored_state
 from pano_mvs.core.text import shortened
-from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
+from pano_mvs.engine.stages.stage_code import code_digest
 
 ENTRY_POINT_GROUP = "pano_mvs.plugins"
 
@@ -36,15 +35,13 @@ class Plugin:
     """A plugin that was found."""
 
     origin: str  # the distribution, or the file
-    # what it defines, or, if it is broken, declares in its source: ("stage", name), or the kind and name of a
-    # registration
-    names: tuple[tuple[str, str], ...]
+    names: tuple[tuple[str, str], ...]  # what it defines: ("stage", name), or the kind and name of a registration
     error: str = ""  # why it could not be loaded, in one line; empty if it was loaded
     trace: str = ""  # the traceback of that error
 
     def why_broken(self) -> str:
-        """Return the error message for the use of one of its names."""
-        return f"the plugin that defines it, {self.origin}, failed to load:\n{self.trace.rstrip()}"
+        """Return why none of its names can be used."""
+        return f"the plugin {self.origin} failed to load:\n{self.trace.rstrip()}"
 
 
 @dataclass(slots=True)
@@ -131,25 +128,18 @@ class Registry:
         }
 
     def suggest(self, name: str) -> str:
-        """Return a hint for an unknown stage name: why its plugin is broken, or similar names."""
+        """Return a hint for an unknown stage name: similar names, and the plugins that could not be loaded."""
         if ("stage", name) in self.clashes:
             return self.clashes["stage", name]
-        for plugin in self.broken:
-            if ("stage", name) in plugin.names:
-                return plugin.why_broken()
-        known = [*self.stages, *(given for plugin in self.broken for kind, given in plugin.names if kind == "stage")]
-        close = get_close_matches(name, dict.fromkeys(known), n=3, cutoff=0.5)
-        hints = [f"did you mean {' or '.join(map(repr, close))}?"] if close else ["`pano-mvs plugins` lists all stages"]
-        hints.extend(
-            f"(plugin {plugin.origin} failed to load: {plugin.error})" for plugin in self.broken if not plugin.names
-        )
-        return " ".join(hints)
+        close = get_close_matches(name, self.stages, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(map(repr, close))}?" if close else "`pano-mvs plugins` lists all stages"
+        return "\n".join([hint, *(plugin.why_broken() for plugin in self.broken)])
 
     def _load_entry_point(self, entry: EntryPoint) -> None:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
         try:
             ours = entry.value.partition(".")[0] == "pano_mvs"
-            with redirect_stdout(sys.stderr), nullcontext() if ours else loading_plugin():
+            with redirect_stdout(sys.stderr), nullcontext() if ours else restored_state():
                 module = entry.load()
             if not isinstance(module, ModuleType):
                 raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
@@ -157,7 +147,7 @@ class Registry:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            self.plugins.append(_broken(origin, names_in_package(entry), error))
+            self.plugins.append(_broken(origin, error))
             return
         self.clashes |= clashes
         self._add(module, origin, "")
@@ -166,13 +156,13 @@ class Registry:
     def _load_folder(self, folder: Path) -> None:
         if not folder.is_absolute():
             error = PluginError(f"${PLUGINS_VARIABLE} holds {str(folder)!r}, which is not an absolute path")
-            self.plugins.append(_broken(f"${PLUGINS_VARIABLE}", (), error))
+            self.plugins.append(_broken(f"${PLUGINS_VARIABLE}", error))
             return
         for path in plugin_files_in(folder):
             try:
                 loaded = self._load_file(path)
             except PluginError as error:
-                self.plugins.append(_broken(str(path), names_in_files([path]), error.__cause__ or error))
+                self.plugins.append(_broken(str(path), error.__cause__ or error))
                 continue
             if loaded is not None:
                 module, digest = loaded
@@ -202,17 +192,16 @@ class Registry:
                 self.origins[spec.name] = origin
 
     def _withhold(self) -> None:
-        """Remove names that are defined twice, and make names of broken plugins unavailable."""
+        """Remove names that are defined twice, and state why others may be missing."""
         for kind, name in self.clashes:
             if kind == "stage":
                 self.stages.pop(name, None)
-        missing = {name: plugin.why_broken() for plugin in self.broken for name in plugin.names if name[0] != "stage"}
-        set_unavailable(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
+        set_unavailable(self.clashes, [plugin.why_broken() for plugin in self.broken])
 
 
-def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseException) -> Plugin:
+def _broken(origin: str, error: BaseException) -> Plugin:
     summary = shortened(" ".join(f"{type(error).__name__}: {error}".split()))
-    return Plugin(origin, tuple(dict.fromkeys(names)), summary, _trace(error))
+    return Plugin(origin, (), summary, _trace(error))
 
 
 def _trace(error: BaseException) -> str:
@@ -265,7 +254,7 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
-        with redirect_stdout(sys.stderr), loading_plugin():  # commands write their results to the standard output
+        with redirect_stdout(sys.stderr), restored_state():  # commands write their results to the standard output
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
@@ -291,9 +280,6 @@ def _where(error: BaseException, path: Path) -> str:
 
 
 PLUGINS_VARIABLE = "PANO_MVS_PLUGINS"
-
-# Declarations are found in the text, because a broken file may have no syntax tree.
-_DECLARATION = re.compile(r"""^[ \t]*@(?:\w+\.)*(stage|source|register_\w+)\(\s*["']([^"'\n]+)["']""", re.MULTILINE)
 
 
 def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Path]:
@@ -322,35 +308,3 @@ def plugin_files_in(folder: Path) -> list[Path]:
     """Return the plugin files in a folder, by name: all Python files except tests and names that begin with _."""
     files = children(folder, "*.py")
     return [file for file in files if not file.name.startswith(("_", ".", "test_")) and file.name != "conftest.py"]
-
-
-def declared_names(text: str) -> list[tuple[str, str]]:
-    """Return the names that a source text declares: ("stage", name), or the kind and name of a registration."""
-    return [
-        ("stage" if what in ("stage", "source") else what.removeprefix("register_").replace("_", " "), name)
-        for what, name in _DECLARATION.findall(text)
-    ]
-
-
-def names_in_files(files: Iterable[Path]) -> tuple[tuple[str, str], ...]:
-    """Return the names that files declare, as far as they can be read."""
-    found: list[tuple[str, str]] = []
-    for file in files:
-        try:
-            found.extend(declared_names(file.read_text(encoding="utf-8", errors="replace")))
-        except OSError:
-            continue  # it is listed as broken anyway; only its names stay unknown
-    return tuple(found)
-
-
-def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
-    """Return the names that the package behind an entry point declares, without importing it."""
-    try:
-        spec = importlib.util.find_spec(entry.module.partition(".")[0])
-    except (ImportError, ValueError):
-        return ()
-    if spec is None:
-        return ()
-    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
-    files = [file for folder in folders for file in below(folder, "*.py")]
-    return names_in_files(files if folders else [Path(spec.origin)] if spec.origin else [])

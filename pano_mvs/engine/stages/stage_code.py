@@ -1,38 +1,45 @@
-"""The code and the libraries that a stage uses, as they count towards the cache keys of its units."""
+"""The code and the libraries that a stage uses, as they count towards the cache keys of its units.
+
+The code is the module of the stage and all modules that it imports, and those that these import, inside of its package
+(for a plugin file: beside it) and of pano_mvs. Comments, layout and docstrings do not count. Imports by a name that is
+computed at run time are not found.
+"""
 
 from __future__ import annotations
 
+import ast
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
-from pathlib import Path, PurePath
+from pathlib import Path
+from typing import TypeAlias
 
 import pano_mvs
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import write_text
 from pano_mvs.core.kernel_cache import user_cache_folder
-from pano_mvs.core.paths import below, is_folder
-from pano_mvs.engine.code.plugin_digest import code_digest, code_texts
-from pano_mvs.engine.code.reach import CodeGraph, Reach
 from pano_mvs.engine.stages.params import Params, registered_files
 from pano_mvs.engine.stages.stage import StageSpec
 
-_OURS = pano_mvs.__name__
-_OUR_ROOT = Path(pano_mvs.__file__).parent
+_OURS = Path(pano_mvs.__file__).resolve().parent
 _LEFT_OUT = (
-    *(f"{_OURS}.{name}" for name in ("cli", "report", "viewer")),  # show results, but make none
-    f"{_OURS}.engine",  # counts by planning.resolve.KEY_SCHEMA, which is raised by hand
-    f"{_OURS}.core.kernel_cache",  # affects only speed
+    *(f"pano_mvs/{name}/" for name in ("cli", "report", "viewer")),  # show results, but make none
+    "pano_mvs/engine/",  # counts by planning.resolve.KEY_SCHEMA, which is raised by hand
+    "pano_mvs/core/kernel_cache.py",  # affects only speed
+    "pano_mvs/__init__.py",  # these only collect names
+    "pano_mvs/stages/__init__.py",
 )
-_KEPT = (f"{_OURS}.engine.stages.context",)
+_KEPT = "pano_mvs/engine/stages/context.py"
+_DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _DISTRIBUTIONS: Mapping[str, tuple[str, ...]] = {
     "cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "PIL": ("pillow",),
+    "ruamel": ("ruamel.yaml",),
 }
 _SHOWN_AS = {"cv2": "OpenCV"}
 _IGNORED = frozenset(
@@ -44,49 +51,55 @@ _IGNORED = frozenset(
     }
 )
 
+_Import: TypeAlias = tuple[int, str, Sequence[str]]  # level, module ("" for `from .`), and names
+_Parsed: TypeAlias = tuple[str, Sequence[_Import]]  # digest of what a module executes, and its imports
+
 
 @dataclass(frozen=True, slots=True)
 class StageCode:
     """What the results of a stage depend on beside its settings and inputs."""
 
-    digest: str  # of the code that the stage reaches
-    libraries: Mapping[str, str]  # name to version of the libraries that this code uses
+    digest: str  # of the code
+    libraries: Mapping[str, str]  # name to version of the libraries that this code imports
 
 
 def stage_code(spec: StageSpec, params: Params) -> StageCode:
-    """Return the code of a stage with given settings, which may hold names that plugins registered.
-
-    For a built-in stage, or one of an installed package, this is every function, class and constant of its package and
-    of pano_mvs that it reaches. For a plugin file, it is the whole file and the files beside it that it imports.
-    """
-    if spec.code_digest:
-        reached = [_code_of_file(Path(str(sys.modules[spec.function.__module__].__file__)), spec.code_digest)]
-    else:
-        reached = [_code_in_package(spec.function.__module__, spec.function.__qualname__)]
-    digests: dict[str, str] = {"": reached[0][0]}
+    """Return the code of a stage with given settings, which may hold names that plugins registered."""
+    module = spec.function.__module__
+    file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+    if file.suffix != ".py":  # compiled, or entered interactively: only its version is known
+        return StageCode("", library_versions([module.partition(".")[0]]))
+    found = [_code_of(file, spec.code_digest)]
+    digests: dict[str, str] = {"": found[0][0]}
     for setting, path in registered_files(params).items():
-        reached.append(_code_of_file(path, code_digest(path)))
-        digests[setting] = reached[-1][0]
-    libraries = library_versions(name for _, names in reached for name in names)
+        found.append(_code_of(path, code_digest(path)))
+        digests[setting] = found[-1][0]
+    libraries = library_versions(name for _, names in found for name in names)
     return StageCode(digest_from_value(digests) if len(digests) > 1 else digests[""], libraries)
 
 
-def reach_of_function(module: str, name: str, graph: CodeGraph) -> Reach:
-    """Return what a function reaches, including the kinds and settings in its annotations.
+def code_digest(path: Path) -> str:
+    """Return the digest of the code in a Python file and the local files that it imports.
 
-    Args:
-        module: dotted name of its module.
-        name: its qualified name there.
+    Raises:
+        OSError: if a file cannot be read.
+        SyntaxError: if one is not Python.
     """
-    if "." in name:
-        # It is made by another function with unknown arguments: its whole package counts.
-        return graph.reach_of([f"{module}:", f"{module.partition('.')[0]}:"])
-    return graph.reach_of([f"{module}:{name}"])
+    return digest_from_value(_local_code(path).files)
 
 
-def code_graph(packages: Mapping[str, Path], texts: Mapping[str, tuple[str, bool]] | None = None) -> CodeGraph:
-    """Return the graph of some packages, without the code that only shows results or runs stages."""
-    return CodeGraph(packages, texts=texts, left_out=_LEFT_OUT, kept=_KEPT)
+def code_texts(path: Path) -> tuple[str, dict[str, str]]:
+    """Return the name of a Python file, and by name the texts of it and the local files that it imports.
+
+    The names are relative to a common folder, so that the files can be written to any other folder.
+
+    Raises:
+        OSError: if a file cannot be read.
+        SyntaxError: if one is not Python.
+    """
+    roots = _Roots.of(path.resolve())
+    texts = {name: (roots.base / name).read_text(encoding="utf-8") for name in _local_code(path).files}
+    return roots.name_of(path.resolve()), texts
 
 
 def library_versions(modules: Iterable[str]) -> dict[str, str]:
@@ -111,83 +124,194 @@ def _version(module: str) -> str:
     return "not installed"
 
 
-_Code = tuple[str, tuple[str, ...]]  # a digest, and the libraries that the code uses
-
-
 @cache
-def _code_in_package(module: str, name: str) -> _Code:
-    top = module.partition(".")[0]
-    root = _root_of(top)
-    if root is None:  # compiled, or entered interactively: only its version is known
-        return "", (top,)
-    return _known(root, [module, name], lambda: reach_of_function(module, name, _graph_of(top, root)))
+def _code_of(path: Path, own_digest: str) -> tuple[str, frozenset[str]]:
+    """Return the digest of the code that a file imports, and the libraries.
 
-
-@cache
-def _code_of_file(path: Path, digest: str) -> _Code:
-    """Return what a plugin file reaches in pano_mvs, with a digest that includes its own code."""
-    texts = {_module_name(name): (text, name.endswith("__init__.py")) for name, text in code_texts(path)[1].items()}
-
-    def reach() -> Reach:
-        return code_graph({_OURS: _OUR_ROOT}, texts).reach_of([f"{name}:" for name in texts])
-
-    reached, libraries = _known(_OUR_ROOT, [digest, {name: list(text) for name, text in texts.items()}], reach)
-    return digest_from_value([digest, reached]), libraries
-
-
-def _module_name(name: str) -> str:
-    parts = PurePath(name).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
-
-
-def _known(root: Path, what: object, reach: Callable[[], Reach]) -> _Code:
-    """Return what `reach` finds, from the user's cache if no file of the package has changed since.
-
-    Hashing all files takes a twentieth of a second, and following names some seconds.
+    Args:
+        own_digest: of a plugin file, when it was loaded; empty for modules of installed packages.
     """
-    sources, key = _sources_of(root), digest_from_value(what)
-    try:
-        place = user_cache_folder() / "pano-mvs" / "code" / f"{root.stem}-{digest_from_value(str(root))[:16]}.json"
-    except (OSError, RuntimeError):  # a user without a home
-        place = None
-    codes = {} if place is None else _codes_in(place, sources)
-    if key not in codes:
-        found = reach()
-        codes = _codes_in(place, sources) if place is not None else {}  # others may have added theirs meanwhile
-        codes[key] = found.digest, sorted(found.libraries)
-        with suppress(StoreError):
-            if place is not None:
-                write_text(place, json.dumps({"sources": sources, "codes": codes}))
-    digest, libraries = codes[key]
-    return digest, tuple(libraries)
+    found = _local_code(path)
+    files, outer = dict(found.files), set(found.outer)
+    roots = _Roots.of(path.resolve())
+    if roots.package != _OURS:
+        if roots.package is not None and not own_digest:
+            outer.add(roots.package.name)  # its version stands for its compiled modules
+        ours = _Roots(None, _OURS)
+        inner = _Code()
+        inner.collect([file for name in outer for file in ours.files(name)], ours)
+        files |= inner.files
+        outer |= inner.outer
+    libraries = {name.partition(".")[0] for name in outer} - {_OURS.name} - sys.stdlib_module_names
+    _keep_parsed()
+    return digest_from_value([own_digest, files]), frozenset(libraries)
 
 
-def _codes_in(place: Path, sources: str) -> dict[str, tuple[str, list[str]]]:
-    """Return what a file says about code with these sources; nothing if it is missing or damaged."""
+def _local_code(path: Path) -> _Code:
+    code = _Code()
+    code.collect([path.resolve()], _Roots.of(path.resolve()))
+    return code
+
+
+@dataclass(frozen=True, slots=True)
+class _Roots:
+    """The folders in which absolute imports are looked up."""
+
+    folder: Path | None  # folder of a plugin file, which is on the path while the file is imported
+    # the outermost package that contains the file, if any; other packages beside it are ignored
+    package: Path | None
+
+    @staticmethod
+    def of(path: Path) -> _Roots:
+        package = None
+        for folder in path.parents:
+            if not (folder / "__init__.py").is_file():
+                break
+            package = folder
+        return _Roots(None if package == _OURS else path.parent, package)
+
+    @property
+    def base(self) -> Path:
+        """The folder from which the names of files start."""
+        base = self.package.parent if self.package is not None else self.folder
+        assert base is not None
+        return base
+
+    def name_of(self, path: Path) -> str:
+        """Return a file's name without the folder into which its package is installed."""
+        return path.relative_to(self.base).as_posix() if path.is_relative_to(self.base) else str(path)
+
+    def files(self, dotted: str) -> list[Path]:
+        found = [] if self.folder is None else _module_files(self.folder, dotted)
+        if self.package is not None and dotted.partition(".")[0] == self.package.name:
+            found += (_our_files if self.package == _OURS else _module_files)(self.package.parent, dotted)
+        return found
+
+
+@dataclass(slots=True)
+class _Code:
+    """Files that import each other."""
+
+    files: dict[str, str] = field(default_factory=dict)  # name to the digest of what it executes
+    outer: set[str] = field(default_factory=set)  # dotted names that they import from elsewhere
+
+    def collect(self, pending: list[Path], roots: _Roots) -> None:
+        """Add some files and what they import from the roots."""
+        seen: set[Path] = set()
+        while pending:
+            path = pending.pop()
+            if path in seen:
+                continue
+            seen.add(path)
+            name = roots.name_of(path)
+            if not name.startswith(_LEFT_OUT) or name == _KEPT:
+                self.files[name], files, outer = (_our_module if roots.package == _OURS else _module)(path, roots)
+                pending += files - seen
+                self.outer |= outer
+
+
+def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
+    """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
-        kept = json.loads(place.read_bytes())
-        found = kept["codes"] if kept["sources"] == sources else {}
-        return {str(key): (str(digest), list(map(str, libraries))) for key, (digest, libraries) in found.items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        digest, imports = _parsed(path.read_text(encoding="utf-8"))
+    except SyntaxError as error:
+        error.filename = str(path)
+        raise
+    files: set[Path] = set()
+    outer: set[str] = set()
+    for level, module, names in imports:
+        dotted = [module, *(f"{module}.{name}" if module else name for name in names)]
+        if module == "pano_mvs.api" and names:
+            homes = [_homes_in_api().get(name, module) for name in names]
+            dotted = [*homes, *(f"{home}.{name}" for home, name in zip(homes, names, strict=True))]
+        if level:
+            base = path.parent.joinpath(*[".."] * (level - 1)).resolve()
+            files.update([base / "__init__.py"] if (base / "__init__.py").is_file() else [])  # names may be its own
+            files.update(file for name in dotted for file in _module_files(base, name))
+        elif found := [file for name in dotted for file in roots.files(name)]:
+            files.update(found)
+        else:
+            outer.update(dotted)
+    return digest, files, outer
+
+
+@cache
+def _homes_in_api() -> dict[str, str]:
+    """Return the modules of the names that `pano_mvs.api` passes on, most of which a stage does not use."""
+    imports = _parsed((_OURS / "api" / "__init__.py").read_text(encoding="utf-8"))[1]
+    return {name: module for _, module, names in imports for name in names}
+
+
+_our_module = cache(_module)  # these do not change while a process runs
+
+
+def _module_files(base: Path, dotted: str) -> list[Path]:
+    """Return the files that run when a dotted name is imported, with the __init__.py of every package above it."""
+    parts = [part for part in dotted.split(".") if part]
+    candidates = [base.joinpath(*parts[: depth + 1], "__init__.py") for depth in range(len(parts))]
+    if parts:
+        candidates.append(base.joinpath(*parts).with_suffix(".py"))
+    return [candidate for candidate in candidates if candidate.is_file()]
+
+
+_our_files = cache(_module_files)
+
+
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> _Parsed:
+    """Return the digest and the imports of a module; parsing takes a second for all modules, so it is kept."""
+    key = digest_from_bytes(text.encode())
+    known = _known_parsed()
+    if key not in known:
+        tree = ast.parse(text)
+        imports = tuple(_imports_in(tree))
+        for node in ast.walk(tree):
+            match node:
+                case (ast.Module() | ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef()) as block:
+                    if ast.get_docstring(block, clean=False) is not None:
+                        block.body = block.body[1:] or [ast.Pass()]
+        known[key] = digest_from_bytes(ast.unparse(tree).encode()), imports
+    return known[key]
+
+
+def _imports_in(tree: ast.AST) -> Iterator[_Import]:
+    """Yield the imports in code, also those that run later, but not those for type checkers."""
+    for node in ast.iter_child_nodes(tree):
+        match node:
+            case ast.Import(names=names):
+                yield from ((0, alias.name, ()) for alias in names)
+            case ast.ImportFrom(module=module, names=names, level=level):
+                yield level, module or "", tuple(alias.name for alias in names)
+            case ast.If(test=ast.Name(id="TYPE_CHECKING") | ast.Attribute(attr="TYPE_CHECKING")):
+                pass
+            case ast.Call(
+                func=ast.Name(id=name) | ast.Attribute(attr=name), args=[ast.Constant(value=str(module)), *_]
+            ) if name in _DYNAMIC_IMPORTS:
+                yield 0, module, ()
+            case _:
+                yield from _imports_in(node)
+
+
+_FILE = f"{sys.version_info.major}.{sys.version_info.minor}.json"
+
+
+@cache
+def _known_parsed() -> dict[str, _Parsed]:
+    """Return what earlier processes have parsed; nothing if the file is missing or damaged."""
+    try:
+        return dict(json.loads((user_cache_folder() / "pano-mvs" / "code" / _FILE).read_bytes()))
+    except (OSError, ValueError, TypeError, RuntimeError):
         return {}
 
 
-@cache
-def _sources_of(root: Path) -> str:
-    """Return the digest of the source of a package and of pano_mvs, and of the version of Python, which parses them."""
-    files = {path for top in (root, _OUR_ROOT) for path in ([top] if top.suffix == ".py" else below(top, "*.py"))}
-    return digest_from_value([sys.version, {str(path): digest_from_bytes(path.read_bytes()) for path in files}])
+def _keep_parsed() -> None:
+    """Write what this process has parsed."""
+    known = _known_parsed()
+    if len(known) > _kept_counts[-1]:
+        _kept_counts.append(len(known))
+        with suppress(StoreError, OSError, RuntimeError):  # a user without a home
+            place = user_cache_folder() / "pano-mvs" / "code" / _FILE
+            write_text(place, json.dumps(dict(list(known.items())[-4000:])))
 
 
-@cache
-def _graph_of(top: str, root: Path) -> CodeGraph:
-    return code_graph({top: root, _OURS: _OUR_ROOT})
-
-
-def _root_of(top: str) -> Path | None:
-    """Return the folder of a loaded package, or the file of a loaded module."""
-    module = sys.modules.get(top)
-    folders = list(getattr(module, "__path__", ()))
-    file = str(folders[0]) if folders else str(getattr(module, "__file__", None) or "")
-    path = Path(file)
-    return path if file and (is_folder(path) if folders else path.suffix == ".py") else None
+_kept_counts = [0]

@@ -14,10 +14,10 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
-from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.stages.stage_code import code_digest
 from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, did_you_mean, merge_stages, read_text
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.files import OUTPUT_MARK, is_cache
+from pano_mvs.core.files import CACHE_MARK, OUTPUT_MARK
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.core.text import shortened_list
 from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif, position_from_exif, read_container
@@ -147,7 +147,7 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
     Raises:
         InputError: if the folder itself cannot be listed, or is a cache.
     """
-    if is_cache(folder):
+    if exists(folder / CACHE_MARK):
         raise InputError(
             f"{folder}: this is a cache of pano-mvs, in which images of its own lie. Give the folder that "
             "holds the panoramas; if they lie in here, move them to a folder of their own"
@@ -181,7 +181,7 @@ def _is_left_out(folder: Path) -> bool:
     name = folder.name
     if name.startswith(".") or name.lower() in _IGNORED_FOLDERS:
         return True
-    return exists(folder / OUTPUT_MARK) or is_cache(folder)
+    return exists(folder / OUTPUT_MARK) or exists(folder / CACHE_MARK)
 
 
 def _placed(

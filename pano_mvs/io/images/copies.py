@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
 from pano_mvs.core.files import read_regular, replacing
-from pano_mvs.io.images.keyframe_file import file_of_state
+from pano_mvs.io.images.video import file_of_state
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
 from pano_mvs.scene.image_header import stated_size

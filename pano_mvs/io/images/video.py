@@ -1,13 +1,16 @@
 """Panoramic videos: their headers, and their frames between two times.
 
-Times are the container's time stamps, so that the frame rate may vary. Frames are not addressed by number.
+Times are the container's time stamps, so that the frame rate may vary. Frames are not addressed by number. Choosing
+keyframes decodes the whole video, but every command has to list them: their times are among the user's caches.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import InputError
-from pano_mvs.core.paths import is_file, is_folder, problem_of
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError, StoreError
+from pano_mvs.core.files import write_text
+from pano_mvs.core.kernel_cache import user_cache_folder
+from pano_mvs.core.paths import is_file, is_folder, problem_of, resolved
 from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
 from pano_mvs.scene.stereo import StereoLayout, StereoSetting, eye_size_hw, one_eye, stereo_layout
 
@@ -191,3 +197,47 @@ def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
         yield capture
     finally:
         capture.release()
+
+
+def keyframe_file(video: Path, settings: object) -> Path | None:
+    """Return the file for the keyframes of a video as it is now; None if the user has no writable folder for caches."""
+    return file_of_state(video, "keyframes", settings, suffix=".json")
+
+
+def file_of_state(path: Path, what: str, settings: object, *, suffix: str) -> Path | None:
+    """Return the file among the user's caches for what was computed from a file as it is now; None if there is none.
+
+    Args:
+        path: the file; its path, size, time stamps and inode are part of the name.
+        what: folder for what is stored.
+        settings: plain values that it depends on.
+        suffix: of the name.
+    """
+    try:
+        stated = path.stat()
+        folder = user_cache_folder()
+    except OSError:
+        return None
+    state = [str(resolved(path)), stated.st_size, stated.st_mtime_ns, stated.st_ctime_ns, stated.st_ino]
+    return folder / "pano-mvs" / what / f"{digest_from_value([state, settings])}{suffix}"
+
+
+def read_times(path: Path | None) -> list[float] | None:
+    """Return the stored times in seconds; None if there are none, or the file is damaged."""
+    if path is None:
+        return None
+    try:
+        times = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(times, list) or not all(isinstance(time, float) and math.isfinite(time) for time in times):
+        return None
+    return times
+
+
+def store_times(path: Path | None, times: list[float]) -> None:
+    """Store times in seconds; a folder that cannot be written costs only time."""
+    if path is not None:
+        with suppress(OSError, StoreError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_text(path, json.dumps([float(time) for time in times]))

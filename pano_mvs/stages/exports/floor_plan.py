@@ -32,8 +32,16 @@ from pano_mvs.api import (
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.paths import children
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.plan_drawings import DXF_REMEDY, PlanDrawing, has_ezdxf, svg_text, world_file_text, write_dxf
-from pano_mvs.io.plan_picture import draw_plan, strip_px
+from pano_mvs.io.plan_drawings import (
+    DXF_REMEDY,
+    PlanDrawing,
+    draw_plan,
+    has_ezdxf,
+    strip_px,
+    svg_text,
+    world_file_text,
+    write_dxf,
+)
 from pano_mvs.scene.surfaces import Structure
 from pano_mvs.scene.upright import world_up, z_up_from_world
 

@@ -360,7 +360,6 @@ def nearly_records(wrong: bool) -> st.SearchStrategy[Any]:
             "rejected": st.dictionaries(names, names, max_size=1) | other,
             "doubts": st.dictionaries(names, names, max_size=1) | other,
             "seconds": st.floats(0, 1e6) | other,
-            "checked": st.just(True),
         }
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -13,11 +12,10 @@ import pytest
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.code.reach import CodeGraph
 from pano_mvs.engine.planning.resolve import KEY_SCHEMA, resolve, resolve_source
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit
 from pano_mvs.engine.stages.stage import SourceItem
-from pano_mvs.engine.stages.stage_code import reach_of_function, stage_code
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.scene import Axis, Pairs, Record, Views
 from tests.engine.conftest import Toy
 from tests.engine.workflows.test_wiring import MORE
@@ -307,16 +305,6 @@ def test_a_stage_of_a_module_without_source_counts_by_its_version(toy: Toy, monk
     function.__qualname__ = "function"
     code = stage_code(replace(entry.spec, function=function, code_digest=""), entry.params)
     assert (code.digest, code.libraries) == ("", {"compiled_stages": "not installed"})
-
-
-def test_a_stage_that_a_function_made_counts_with_all_of_its_module(tmp_path: Path) -> None:
-    (tmp_path / "pack").mkdir()
-    (tmp_path / "pack" / "__init__.py").write_text("top = 1\n")
-    (tmp_path / "pack" / "m.py").write_text("def made(x: K):\n    def stage(): ...\nother = 2\nclass K: ...\n")
-    graph = CodeGraph({"pack": tmp_path / "pack"})
-    whole_module = reach_of_function("pack.m", "made.<locals>.stage", graph)
-    assert whole_module.definitions.keys() == {"pack:top", "pack.m:made", "pack.m:other", "pack.m:K"}
-    assert reach_of_function("pack.m", "made", graph).definitions.keys() == {"pack.m:made", "pack.m:K"}
 
 
 def test_a_plugin_that_is_a_package_uses_no_library_of_its_own_name(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,35 +6,16 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.processes import start_of
 from pano_mvs.engine.running import output_lock as module
-from pano_mvs.engine.running.output_lock import LOCK_NAME, output_lock
+from pano_mvs.engine.running.output_lock import LOCK_NAME, is_run_gone, output_lock
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="elsewhere it is not known whether a process is gone")
-
-Change = Callable[[dict[str, Any]], dict[str, Any]]
-
-
-def left_behind(out: Path, change: Change) -> Path:
-    """Leave the lock of a run that was killed, changed."""
-    path = out / LOCK_NAME
-    with output_lock(out):
-        owner = json.loads(path.read_bytes())
-    path.write_text(json.dumps(change(owner)))
-    return path
-
-
-def ended_process() -> int:
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
 
 
 def test_a_second_run_is_refused_and_the_lock_goes_with_the_first(tmp_path: Path) -> None:
@@ -45,105 +26,62 @@ def test_a_second_run_is_refused_and_the_lock_goes_with_the_first(tmp_path: Path
         ):
             pass
         assert [path.name for path in tmp_path.iterdir()] == [LOCK_NAME]
+        assert not is_run_gone(tmp_path)
     assert not list(tmp_path.iterdir())
+    assert not is_run_gone(tmp_path)
     with output_lock(tmp_path):
         pass
 
 
-@ON_POSIX
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda owner: owner | {"process": ended_process()},
-        lambda owner: owner | {"process_started": "1"},  # the number belongs to another process by now
-        lambda owner: owner | {"place": "x", "boot": "before", "machine": "m"},
-    ],
-)
-def test_the_lock_of_a_process_that_is_gone_is_taken_over(
-    tmp_path: Path, change: Change, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "machine_id", lambda: "m")
-    path = left_behind(tmp_path, change)
+def test_the_lock_of_a_process_that_was_killed_is_taken_over(tmp_path: Path) -> None:
+    code = f"""import os
+from pathlib import Path
+from pano_mvs.engine.running.output_lock import output_lock
+with output_lock(Path({str(tmp_path)!r})): os._exit(9)"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 9
+    assert is_run_gone(tmp_path)
     with output_lock(tmp_path):
-        assert json.loads(path.read_bytes())["process"] == os.getpid()
-    assert not path.exists()
+        assert json.loads((tmp_path / LOCK_NAME).read_bytes())["process"] == os.getpid()
+    assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda owner: owner | {"place": "x", "host": "another", "boot": "x"},
-        lambda owner: owner | {"place": "x"},  # another container of this host
-        lambda owner: owner | {"place": "x", "boot": "x", "machine": ""},
-    ],
-)
-def test_the_lock_of_another_host_is_left_to_the_user(tmp_path: Path, change: Change) -> None:
-    path = left_behind(tmp_path, change)
-    before = path.read_bytes()
-    with pytest.raises(StoreError, match=rf"which cannot be checked from here, delete {path}"), output_lock(tmp_path):
-        pass
-    assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize("text", [b"", b"{", b"[]", b'{"process": "1"}', b'{"process": -1}'])
-def test_a_lock_that_names_nobody_is_left_to_the_user(
-    tmp_path: Path, text: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_PAUSE_S", 0)
+@pytest.mark.parametrize("text", [b"", b"{", b"[]"])
+def test_a_file_that_names_nobody_is_no_obstacle(tmp_path: Path, text: bytes) -> None:
     (tmp_path / LOCK_NAME).write_bytes(text)
-    with pytest.raises(StoreError, match="does not name the run"), output_lock(tmp_path):
-        pass
-    assert (tmp_path / LOCK_NAME).read_bytes() == text
-
-
-def test_a_file_system_without_links_has_locks_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", refuse)
     with output_lock(tmp_path):
-        with pytest.raises(StoreError, match="another run is writing"), output_lock(tmp_path):
-            pass
-        assert [path.name for path in tmp_path.iterdir()] == [LOCK_NAME]
-    assert not list(tmp_path.iterdir())
+        assert json.loads((tmp_path / LOCK_NAME).read_bytes())["process"] == os.getpid()
 
 
-def test_a_link_whose_success_a_file_server_did_not_report_counts(
+def test_a_file_that_its_owner_has_just_removed_is_not_the_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link = os.link
+    lock, calls = module._lock, []
 
-    def unheard(source: Path, target: Path) -> None:
-        link(source, target)
-        raise FileExistsError(17, "File exists")  # the server did it twice, as the first answer was lost
+    def overtaken(handle: int) -> bool | None:
+        calls.append(handle)
+        if len(calls) == 1:
+            (tmp_path / LOCK_NAME).unlink()
+        return lock(handle)
 
-    monkeypatch.setattr(os, "link", unheard)
+    monkeypatch.setattr(module, "_lock", overtaken)
     with output_lock(tmp_path):
         assert (tmp_path / LOCK_NAME).is_file()
+    assert len(calls) == 2
+
+
+def test_a_file_system_without_locks_stops_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_lock", lambda _handle: None)
+    with output_lock(tmp_path):
+        assert not is_run_gone(tmp_path)
 
 
 @ON_POSIX
-def test_of_two_that_judge_a_lock_stale_one_alone_takes_it_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The second read the old lock before the first had replaced it: it must not remove the new one."""
-    path = left_behind(tmp_path, lambda owner: owner | {"process_started": "1"})
-    remove, first = module._remove_stale, output_lock(tmp_path)
-    calls: list[Path] = []
-
-    def overtaken(path: Path, stale: bytes | None) -> None:
-        calls.append(path)
-        if len(calls) == 1:
-            first.__enter__()
-        remove(path, stale)
-
-    monkeypatch.setattr(module, "_remove_stale", overtaken)
-    with pytest.raises(StoreError, match=f"process {os.getpid()} on"), output_lock(tmp_path):
+def test_a_link_in_its_place_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "letter").write_text("dear")
+    (tmp_path / LOCK_NAME).symlink_to(tmp_path / "letter")
+    with pytest.raises(StoreError, match="cannot be written"), output_lock(tmp_path):
         pass
-    assert len(calls) == 2
-    assert path.is_file()
-    first.__exit__(None, None, None)
-    assert not path.exists()
+    assert (tmp_path / "letter").read_text() == "dear"
 
 
 def test_a_lock_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:

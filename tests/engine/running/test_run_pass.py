@@ -244,38 +244,10 @@ def test_a_damaged_record_is_reported_with_its_path_and_computed_again(finished:
     assert len(shelf.submitted) == 1
 
 
-def test_files_that_give_way_to_those_of_an_earlier_unit_end_the_run_if_asked(toy: Toy, shelf: Shelf) -> None:
+def test_units_that_deliver_one_file_end_the_run(toy: Toy, shelf: Shelf) -> None:
     toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
-    result = run_with(toy, shelf, "each.on_error=stop")
-    assert result.exit_code == RunStoppedError.exit_code
-    assert "stage 'each' has on_error: stop" in result.stopped
-    assert "mean/fixed.txt" in result.stopped
-
-
-def test_a_unit_that_has_to_give_way_ends_the_run_if_asked(toy: Toy, shelf: Shelf) -> None:
-    """The only other one comes before it in the capture, and delivers later."""
-    for number in (3, 4, 5):
-        (toy.folder / "capture" / f"{number}.txt").unlink()
-    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
-    result = run_with(toy, shelf, "each.on_error=stop")
-    assert next(label for label in shelf.submitted if label.startswith("each")) == "each:2.txt"
-    assert (result.exit_code, summary(result)["each"][2]) == (RunStoppedError.exit_code, 1)
-    assert "stage 'each' has on_error: stop, and each:2.txt failed: mean/fixed.txt" in result.stopped
-
-
-def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy, shelf: Shelf) -> None:
-    """Also where a later one was there before it: that one's result is withdrawn."""
-    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
-    session = toy.session()
-    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
-    result = run.execute()
-    assert [one.item for one in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
-    assert summary(result)["each"] == (1, 0, 4, 0)
-    assert toy.deliverables()["mean/fixed.txt"] == b"45.0"
-    assert list(run.states["each"].items) == ["1.txt"]
-    assert list(run.states["each"].failed) == ["2.txt", "3.txt", "4.txt", "5.txt"]
-    cached = run_with(toy, shelf)
-    assert summary(cached)["each"] == (0, 1, 4, 0)
+    with pytest.raises(UsageError, match=r"stage 'each' delivers mean/fixed\.txt for"):
+        run_with(toy, shelf)
 
 
 def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.io.images import captures
 from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
@@ -62,9 +61,6 @@ def test_caches_are_no_part_of_the_capture(tmp_path: Path) -> None:
     """Their masks and previews were taken for images on the second run."""
     Store(tmp_path / "new")
     Store(tmp_path / "deep" / "old")
-    (tmp_path / "deep" / "old" / CACHE_MARK).unlink()  # as versions without the mark left it
-    for folder in ("blobs", "records"):
-        (tmp_path / "deep" / "old" / folder).mkdir()
     for name in ("1.jpg", "deep/2.jpg", "new/blobs/ab/3.png", "deep/old/blobs/ab/4.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()

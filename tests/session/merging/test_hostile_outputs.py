@@ -150,10 +150,10 @@ _OTHERS = {  # readers of files that state names, with the test of them; the rea
 _NO_NAMES = {
     *(f"io.ply.{name}" for name in ("read_ply", "read_ply_mesh", "read_ply_points", "open_ply_points")),
     *(f"io.ranges.read_{name}" for name in ("range_tiff", "range_png", "normals", "confidence_png", "npy", "exr")),
-    *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.keyframe_file.read_times"),
+    *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.video.read_times"),
     *("io.images.metadata.read_container", "io.splats.open_mask", "io.meshes.read_glb"),
     *(f"io.poses.json_files.{name}" for name in ("read_json", "read_json_value")),
-    *("report.cloud_pictures.read_pictures", "session.merging.block_runs.open_blocks", "session.session.open_session"),
+    *("session.merging.block_runs.open_blocks", "session.session.open_session"),
 }
 
 

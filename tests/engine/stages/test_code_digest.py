@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.engine.code.plugin_digest import code_digest, code_texts
+from pano_mvs.engine.stages.stage_code import code_digest, code_texts
 
 PLUGIN = '''"""What it is for."""
 import helper

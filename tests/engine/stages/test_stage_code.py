@@ -1,0 +1,188 @@
+"""The key of a stage changes with the code that it imports and with its libraries."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import shutil
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pano_mvs
+from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.engine.executors.unit_json import require_same_code
+from pano_mvs.engine.stages import stage_code as stage_code_module
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage_code import code_digest, code_texts, library_versions, stage_code
+from pano_mvs.testing.stage_calls import StageCase
+from tests.testing.test_builtin_stages import INPUTS, SETTINGS, SIZES_HW
+
+PACKAGE = Path(pano_mvs.__file__).parent
+
+
+@cache
+def built_in() -> list[str]:
+    stages = Registry.installed().stages
+    return [name for name in sorted(stages) if stages[name].function.__module__.startswith("pano_mvs.stages.")]
+
+
+@cache
+def files_of(stage: str) -> set[str]:
+    """Return the files that count for a stage, without the name of the package."""
+    module = sys.modules[Registry.installed().stages[stage].function.__module__]
+    code = stage_code_module._local_code(Path(str(module.__file__)))
+    return {name.removeprefix("pano_mvs/") for name in code.files}
+
+
+@pytest.mark.parametrize(
+    ("file", "stages", "others"),
+    [
+        ("algorithms/poses/adjustment/kernels_patch_alignment.py", {"poses.refine", "poses.localise"}, {"fusion.vote"}),
+        ("algorithms/features/kernels_sphorb.py", {"features.sphorb"}, {"poses.verify", "depth.sweep"}),
+        ("algorithms/sweep/numba/kernels_sgm_rows.py", {"depth.sweep", "poses.verify"}, {"fusion.vote", "export.ply"}),
+        ("algorithms/two_view/kernels_five_point.py", {"matches.brute_force"}, {"depth.sweep", "masks.moving"}),
+        ("geometry/kernels_sphere.py", {"depth.sweep", "fusion.vote", "poses.verify"}, set()),
+        ("engine/stages/context.py", {"depth.sweep"}, set()),
+    ],
+)
+def test_an_edit_changes_the_keys_of_the_stages_that_import_it(file: str, stages: set[str], others: set[str]) -> None:
+    found = {name for name in built_in() if file in files_of(name)}
+    assert found >= stages
+    assert not found & others
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in PACKAGE.rglob("kernels_*.py")))
+def test_every_kernel_is_in_a_key(name: str) -> None:
+    assert any(file.endswith(f"/{name}") for stage in built_in() for file in files_of(stage))
+
+
+def test_what_shows_results_or_drives_stages_is_in_no_key() -> None:
+    counted = set().union(*map(files_of, built_in()))
+    assert not {file for file in counted if file.startswith(("cli/", "report/", "viewer/", "testing/"))}
+    assert {file for file in counted if file.startswith("engine/")} == {"engine/stages/context.py"}
+    assert len(counted) > 150
+
+
+@contextmanager
+def recorded_calls() -> Iterator[set[CodeType]]:
+    """Record the code of every Python function that is called, in all threads."""
+    called: set[CodeType] = set()
+
+    def record(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:  # class bodies run at the first import
+            called.add(frame.f_code)
+
+    threading.setprofile(record)
+    sys.setprofile(record)
+    try:
+        yield called
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", built_in())
+def test_the_modules_that_a_stage_calls_count(stage: str, tmp_path: Path) -> None:
+    spec = Registry.installed().stages[stage]
+    case = StageCase(spec, SETTINGS.get(stage, {}), INPUTS.get(stage, {}), SIZES_HW.get(stage, (32, 64)))
+    params, arguments = case.params(case.capture), case.arguments(case.capture)
+    offered: dict[str, Any] = {"params": params, "ctx": Context(np.random.default_rng(0), tmp_path)}
+    if spec.list_items is not None:
+        offered["item"] = next(iter(spec.list_items(params)))
+    extras = {name: offered[role] for name, role in spec.extras.items()}
+    # The first kernels of a process look for their cache; some are imported only when a stage runs.
+    importlib.import_module("pano_mvs.algorithms.ranges.kernels_agreement")
+    with recorded_calls() as called, suppress(PanoMvsError):
+        spec.function(**arguments, **extras)
+    paths = {Path(code.co_filename) for code in called if code.co_name != "<module>"}
+    found = {path.relative_to(PACKAGE).as_posix() for path in paths if path.is_relative_to(PACKAGE)}
+    not_counted = ("engine/", "testing/", "core/kernel_cache.py")
+    assert {file for file in found if not file.startswith(not_counted)} - files_of(stage) == set()
+
+
+@pytest.mark.parametrize(
+    ("stage", "libraries", "others"),
+    [
+        ("poses.unit_translations", {"numpy"}, {"pycolmap"}),
+        ("filters.speckle", {"numpy", "numba"}, {"pycolmap"}),
+        ("poses.colmap", {"numpy", "scipy", "pycolmap"}, {"onnxruntime"}),
+        ("depth.sweep", {"numpy", "scipy", "OpenCV", "numba", "llvmlite"}, {"pycolmap"}),
+    ],
+)
+def test_the_libraries_that_a_stage_imports_are_in_its_key(stage: str, libraries: set[str], others: set[str]) -> None:
+    spec = Registry.installed().stages[stage]
+    found = stage_code(spec, spec.params_type()).libraries
+    assert found.keys() >= libraries
+    assert not found.keys() & {*others, "pydantic", "pano_mvs", "json"}
+    assert found["numpy"] == importlib.import_module("numpy").__version__
+
+
+def test_a_plugin_counts_with_what_it_imports_from_the_api(tmp_path: Path) -> None:
+    digests = {}
+    for name, start in (("two", "from pano_mvs.api import Pose"), ("more", "from pano_mvs.api import verify_pair")):
+        path = tmp_path / name / "plug.py"
+        path.parent.mkdir()
+        path.write_text(f"{start}\nimport scipy\n")
+        digests[name] = stage_code_module._code_of(path, "")
+    assert {"numpy", "scipy"} <= digests["two"][1] < digests["more"][1]
+
+
+def test_a_copy_elsewhere_has_the_same_code(tmp_path: Path) -> None:
+    shutil.copytree(PACKAGE / "core", tmp_path / "pano_mvs" / "core")
+    (tmp_path / "pano_mvs" / "__init__.py").touch()
+    copy, original = (code_texts(place / "core" / "files.py")[1] for place in (tmp_path / "pano_mvs", PACKAGE))
+    assert copy == {name: text for name, text in original.items() if name != "pano_mvs/__init__.py"} | {
+        name: "" for name in copy if name == "pano_mvs/__init__.py"
+    }
+
+
+def test_a_worker_with_other_code_or_libraries_refuses() -> None:
+    spec = Registry.installed().stages["filters.median"]
+    params = spec.params_type()
+    found = stage_code(spec, params)
+    same = {"code": found.digest, "libraries": dict(found.libraries)}
+    require_same_code(spec, params, same)
+    with pytest.raises(UsageError, match=r"'filters\.median' is not the same in the worker"):
+        require_same_code(spec, params, same | {"code": "0" * 32})
+    with pytest.raises(UsageError, match=r"the worker has OpenCV .*, the run was started with 1\.2\.3"):
+        require_same_code(spec, params, same | {"libraries": {"OpenCV": "1.2.3"}})
+
+
+def test_a_library_that_is_not_there_and_one_under_another_name() -> None:
+    assert library_versions(["cv2", "pydantic", "no_such_module"])["no_such_module"] == "not installed"
+    assert set(library_versions(["cv2", "pydantic", "pillow_heif"])) == {"OpenCV"}
+    assert library_versions(["ruamel"])["ruamel"][0].isdigit()
+
+
+def test_what_was_parsed_is_kept_for_later_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_code_module, "user_cache_folder", lambda: tmp_path / "kept")
+
+    def later_process() -> None:
+        stage_code_module._known_parsed.cache_clear()
+        stage_code_module._parsed.cache_clear()
+        monkeypatch.setattr(stage_code_module, "_kept_counts", [0])
+
+    later_process()
+    plugin = tmp_path / "plug.py"
+    plugin.write_text("import json\nx = 1\n")
+    before = code_digest(plugin)
+    stage_code_module._keep_parsed()
+    place = next((tmp_path / "kept").rglob("*.json"))
+    for damage in ("", "{", "[]", "1"):
+        if damage:
+            place.write_text(damage)
+        later_process()
+        assert len(stage_code_module._known_parsed()) == (0 if damage else 1)
+        assert code_digest(plugin) == before
+    later_process()
