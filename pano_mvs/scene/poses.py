@@ -98,7 +98,7 @@ class Poses(Record):
             confirm in a small sweep with these poses; NaN where too few pixels can be judged; None if not computed.
         expected_shares: (N,) float64 the expected share, from the neighbouring cameras.
         right_probabilities: (N,) float64 probability that each pose is right, by all that was measured about it; NaN
-            where nothing was; None if not computed.
+            where nothing was; None if not computed, or if the images turned out not to be full spheres.
         doubts: name of every registered image whose pose is doubtful, with the reason.
         track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
             observations by it. None: unknown, equal weights.

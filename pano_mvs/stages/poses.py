@@ -174,7 +174,10 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
 
 
 def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, ctx: Context) -> Poses:
-    """Return refined poses whose cameras are doubtful if their panoramas do not cover the full sphere."""
+    """Return refined poses whose cameras are doubtful if their panoramas do not cover the full sphere.
+
+    What was measured of such cameras is for full spheres, so they have no probability to be right.
+    """
     settings = arguments_from(refine_poses, params)
     found = fitted_elevation_range(poses, refined, loss=settings["loss"], loss_scale_deg=settings["loss_scale_deg"])
     if found is None or found.is_full:
@@ -186,7 +189,8 @@ def _checked_projection(poses: Poses, refined: Poses, *, params: RefineParams, c
         "metadata"
     )
     ctx.note(reason)
-    return replace(refined, doubts={name: refined.doubts.get(name, reason) for name in refined.names})
+    doubts = {name: refined.doubts.get(name, reason) for name in refined.names}
+    return replace(refined, doubts=doubts, right_probabilities=None)
 
 
 class FromModelParams(Params):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.adjustment.refine import ElevationRange, fitted_elevation_range, refine_poses
+from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.scene import Poses
+from pano_mvs.stages.poses import RefineParams, refine
 from tests.algorithms.poses.synthetic_capture import noisy_bearings, points_in_box, random_poses
 
 SIZE_HW = (512, 1024)
@@ -72,6 +77,19 @@ def test_the_edges_of_cropped_images_are_found(top_deg: float, bottom_deg: float
     assert not found.is_full
     assert found.top_deg == pytest.approx(top_deg, abs=1)
     assert found.bottom_deg == pytest.approx(bottom_deg, abs=1)
+
+
+@pytest.mark.parametrize(("top_deg", "doubted"), [(90, False), (75, True)])
+def test_cameras_of_cropped_images_are_doubted_and_have_no_probability(
+    top_deg: float, doubted: bool, tmp_path: Path
+) -> None:
+    """Regression: they kept the probability of .99 that was measured as if their images were full spheres."""
+    poses = seen_in(top_deg, -top_deg, seed=1)
+    poses = replace(poses, right_probabilities=np.full(len(poses.names), 0.99))
+    params = RefineParams.model_validate({"align": False})
+    refined = refine(poses=poses, images={}, params=params, ctx=Context(np.random.default_rng(0), tmp_path))
+    assert (set(refined.doubts) == set(poses.names)) == doubted
+    assert (refined.right_probabilities is None) == doubted
 
 
 def test_rays_and_steps_agree() -> None:
