@@ -146,23 +146,7 @@ def _grown(
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
-    weights: dict[int, float] = {}
-    for image in edge:
-        _count_pairs(pairs, image, left, weights=weights)
-    if not adjust:
-        model.adjust(cameras=False)
-    adjusted = 2
-    reasons: dict[int, str] = {}
-    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
-        image, pose = step
-        model.add(image, pose)
-        left.discard(image)
-        del weights[image]
-        _count_pairs(pairs, image, left, weights=weights)
-        # All cameras are adjusted each time their number has grown by this factor.
-        if not adjust or len(model.cameras) > 1.25 * adjusted:
-            model.adjust(cameras=adjust)
-            adjusted = len(model.cameras)
+    reasons = extend(model, left, adjust=adjust, confirmation=confirmation)
     for image in edge:
         if image in model.cameras and (reason := _unsupported(model, image)):
             for other in model.held_by([image]):
@@ -173,7 +157,7 @@ def _grown(
             left.add(image)
             reasons[image] = reason
     settle(model, adjust=adjust)
-    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
+    refused = {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
     checks = None
     aliased = confirmation is not None and bool(find_aliases(model))
     # The images are not consulted if the model explains this share of the pairs.
@@ -182,12 +166,42 @@ def _grown(
     return GrownModel(model, refused, checks, aliased)
 
 
-def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:
-    """Add the pairs of a newly registered image to the weights of its unregistered partners."""
-    for partner in pairs.partners[image]:
-        if partner in left:
-            edge = min(image, partner), max(image, partner)
-            weights[partner] = weights.get(partner, 0.0) + pairs.geometries[edge][0].weight
+def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Confirmation | None) -> dict[int, str]:
+    """Add images to a model one at a time, the one whose pose its pairs determine most clearly first.
+
+    Args:
+        model: the model, changed in place.
+        left: images to add; those that were added are removed.
+        adjust: whether all cameras are adjusted each time their number has grown by a quarter.
+        confirmation: decides between rival placements by the images; None if the pairs alone decide.
+
+    Returns:
+        Why images could not be added when they were last tried.
+    """
+    weights: dict[int, float] = {}
+
+    def count_pairs(image: int) -> None:
+        for partner in model.pairs.partners[image]:
+            if partner in left:
+                edge = min(image, partner), max(image, partner)
+                weights[partner] = weights.get(partner, 0.0) + model.pairs.geometries[edge][0].weight
+
+    for image in model.cameras:
+        count_pairs(image)
+    if not adjust:
+        model.adjust(cameras=False)
+    adjusted = 2
+    reasons: dict[int, str] = {}
+    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
+        image, pose = step
+        model.add(image, pose)
+        left.discard(image)
+        del weights[image]
+        count_pairs(image)
+        if not adjust or len(model.cameras) > 1.25 * adjusted:
+            model.adjust(cameras=adjust)
+            adjusted = len(model.cameras)
+    return reasons
 
 
 def _unsupported(model: PlacedModel, image: int) -> str:
@@ -224,7 +238,7 @@ def _next(
         for image in order[first : first + _LOOKED_AT]:
             evidence, found = model.place(image)
             if not found:
-                reasons[image] = _why_nothing(model, image)
+                reasons[image] = why_nothing(model, image)
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
@@ -271,7 +285,7 @@ def settle(model: PlacedModel, *, adjust: bool) -> None:
         model.choose_again()
 
 
-def _why_nothing(model: PlacedModel, image: int) -> str:
+def why_nothing(model: PlacedModel, image: int) -> str:
     if any(idx in model.cameras for idx in model.pairs.partners[image]):
         return "no pair with a registered image shares enough points with a third image to determine the distance"
     return "its pairs are all with images that could not be registered"

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
-from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
@@ -231,28 +232,47 @@ class PlacedModel:
             cameras: False keeps the cameras fixed and only triangulates.
         """
         tracks, members = self.tracks()
-        model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
-        first = next(iter(self.cameras))
-        # The first camera stays fixed.
-        order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
-        model.cameras = {idx: self.cameras[members[idx]] for idx in order}
+        found = self._triangulated(tracks, members)
         if cameras:
-            model.adjust()
-            for idx, image in enumerate(members):
-                self.cameras[image] = model.cameras[idx]
-        else:
-            model.triangulate()
-        for image in members:
-            self._ranges[image][:] = np.nan
-            self._parallax[image][:] = 0
-        points = model.points_in_world[tracks.track_idx]
+            bundle = adjust_bundle(
+                Bundle(
+                    rotations=np.array([self.cameras[image].rotation for image in members]),
+                    centers=np.array([self.cameras[image].center for image in members]),
+                    points=found.points_in_world[found.valid],
+                    point_idx=(np.cumsum(found.valid) - 1)[tracks.track_idx[found.used]].astype(np.int32),
+                    image_idx=tracks.image_idx[found.used],
+                    bearings=tracks.bearings[found.used],
+                ),
+                loss="cauchy",
+                scale_rad=MAX_ERROR_RAD / 4,
+                max_iterations=20,
+                tolerance=1e-3,  # the finished model is refined anyway
+                fixed_camera=members.index(next(iter(self.cameras))),
+            )
+            for image, rotation, center in zip(members, bundle.rotations, bundle.centers, strict=True):
+                self.cameras[image] = Rigid3.from_center(rotation, center)
+            found = self._triangulated(tracks, members)
+        points = found.points_in_world[tracks.track_idx]
         known = np.isfinite(points[:, 0])
         centers = np.array([self.cameras[image].center for image in members])
         distances = np.linalg.norm(points - centers[tracks.image_idx], axis=1)
         for idx, image in enumerate(members):
             mine = known & (tracks.image_idx == idx)
+            self._ranges[image][:], self._parallax[image][:] = np.nan, 0
             self._ranges[image][tracks.keypoint_idx[mine]] = distances[mine]
             self._parallax[image][tracks.keypoint_idx[mine]] = np.pi
+
+    def _triangulated(self, tracks: Tracks, members: Sequence[int]) -> Triangulated:
+        """Return the points of tracks among registered images."""
+        rotations = np.array([self.cameras[image].rotation for image in members])[tracks.image_idx]
+        return triangulate_observations(
+            np.array([self.cameras[image].center for image in members])[tracks.image_idx],
+            np.einsum("nji,nj->ni", rotations, tracks.bearings),
+            tracks.track_idx,
+            count=tracks.count,
+            max_error_rad=MAX_ERROR_RAD,
+            min_angle_rad=float(np.deg2rad(1.0)),
+        )
 
     def tracks(self) -> tuple[Tracks, list[int]]:
         """Return the tracks that the chosen geometries form among registered images, and the position of each image."""

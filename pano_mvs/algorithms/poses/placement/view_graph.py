@@ -67,13 +67,6 @@ def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
     return sorted(groups, key=lambda group: (-len(group), group[0]))
 
 
-def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rigid3:
-    """Return second_from_first of an edge, with a translation of length 1, for either order of the images."""
-    if (first, second) in edges:
-        return Rigid3(edges[first, second].rotation, edges[first, second].direction)
-    return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
-
-
 def views_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:
     """Return all pairs, verified or not, by positions (first, second), first < second, as second_from_first."""
     position = {name: idx for idx, name in enumerate(names)}
