@@ -286,6 +286,7 @@ def settle(model: PlacedModel, *, adjust: bool) -> None:
 
 
 def why_nothing(model: PlacedModel, image: int) -> str:
+    """Return why none of the pairs of an image suggests a place for it."""
     if any(idx in model.cameras for idx in model.pairs.partners[image]):
         return "no pair with a registered image shares enough points with a third image to determine the distance"
     return "its pairs are all with images that could not be registered"
