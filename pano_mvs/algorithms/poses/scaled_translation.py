@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
 from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
-from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator
+from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
@@ -61,7 +62,7 @@ def solve_scaled_translation(
     """
     del rng
     names = tuple(features)
-    pairs = pairs_of(features, two_views, estimator=scale_estimator, kappa=kappa)
+    pairs = pairs_of(features, two_views, scale_of=partial(estimate_scale, estimator=scale_estimator, kappa=kappa))
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)

@@ -12,7 +12,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.joining.alignment import Alignment, PairHypothesis, align_models
 from pano_mvs.algorithms.poses.joining.cross_matches import THRESHOLD_RAD, CrossMatches
 from pano_mvs.algorithms.poses.joining.floors import LENGTH_STD, KnownLengths, height_above_floor, length_by_floor
-from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
+from pano_mvs.algorithms.poses.placement.pair_evidence import AGREEING, oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
@@ -280,7 +280,7 @@ def _has_lengths(
         _lengths(models, pair, view), (length, length / similarity.scale), models, strict=True
     ):
         if len(model.cameras) > 1:
-            if not abs(np.log(found / expected)) < np.log(1.25):
+            if not abs(np.log(found / expected)) < np.log(AGREEING):
                 return False
             log10_alarms += alarms
     return log10_alarms < -1.0

@@ -15,7 +15,8 @@ from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
-    ScaleEstimator,
+    ScaleOf,
+    estimate_scale,
     gather_pair_evidence,
     geometries_of,
     oriented,
@@ -35,9 +36,7 @@ class Pairs:
 
     features: Mapping[str, Features]  # key points by image name, in the capture's order
     geometries: Mapping[Edge, tuple[Geometry, ...]]  # (i, j), i < j, to the geometries of the pair, the heaviest first
-    # how translation scale factors are estimated from the ratios of single features
-    estimator: ScaleEstimator = "cauchy"
-    kappa: float = 0.01  # the paper's κ
+    scale_of: ScaleOf = estimate_scale  # estimates translation scale factors from the ratios of single features
     # (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without success; None:
     # all, without matches
     compared: Mapping[Edge, TwoView] | None = None
@@ -87,23 +86,21 @@ def pairs_of(
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     *,
-    estimator: ScaleEstimator = "cauchy",
-    kappa: float = 0.01,
+    scale_of: ScaleOf = estimate_scale,
 ) -> Pairs:
     """Return the pairs of a capture, with all geometries; pairs whose rotations contradict other pairs are left out.
 
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
-        estimator: see `estimate_scale`.
-        kappa: see `estimate_scale`.
+        scale_of: estimates translation scale factors from the ratios of single features.
     """
     names = tuple(features)
     geometries = {
         (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
         for (a, b), view in consistent_edges(names, two_views).items()
     }
-    return Pairs(features, geometries, estimator, kappa, views_by_position(names, two_views))
+    return Pairs(features, geometries, scale_of, views_by_position(names, two_views))
 
 
 @dataclass(eq=False)
@@ -145,8 +142,7 @@ class PlacedModel:
             geometries=self.pairs.geometries,
             cameras=self.cameras,
             ranges=self._ranges,
-            estimator=self.pairs.estimator,
-            kappa=self.pairs.kappa,
+            scale_of=self.pairs.scale_of,
         )
 
     def place(self, image: int) -> tuple[PairEvidence, list[Placement]]:
@@ -157,18 +153,17 @@ class PlacedModel:
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image, choose the geometries of its pairs that agree, and update ranges from them."""
         self.cameras[image] = cam_from_world
-        evidence = self.evidence(image)
         for edge in [edge for edge in self.chosen if image in edge]:
             del self.chosen[edge]
-        if not len(evidence):
-            return
-        agrees = agreement(evidence, cam_from_world.rotation[None], cam_from_world.center[None])[0]
-        for idx in np.flatnonzero(agrees):
-            edge = _edge(image, int(evidence.partner[idx]))
-            # Geometries are sorted by weight, so the first one that agrees is the heaviest.
-            if edge not in self.chosen:
-                self.chosen[edge] = int(evidence.rank[idx])
-                self._learn_ranges(edge)
+        for edge, rank in self._agreeing(image).items():
+            self.chosen[edge] = rank
+            self._learn_ranges(edge)
+
+    def _agreeing(self, image: int) -> dict[Edge, int]:
+        """Return the pairs of a registered image, each with the rank of its heaviest geometry that agrees."""
+        evidence, pose = self.evidence(image), self.cameras[image]
+        agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
+        return {_edge(image, partner): rank for partner, rank in explained_partners(evidence, agrees).items()}
 
     def remove(self, image: int) -> None:
         """Remove an image from the model."""
@@ -293,13 +288,8 @@ class PlacedModel:
         """Choose the geometry of every pair of registered images again, by the current cameras."""
         self.chosen = {}
         for image in sorted(self.cameras):
-            evidence = self.evidence(image)
-            if not len(evidence):
-                continue
-            pose = self.cameras[image]
-            agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
-            for idx in np.flatnonzero(agrees):
-                self.chosen.setdefault(_edge(image, int(evidence.partner[idx])), int(evidence.rank[idx]))
+            for edge, rank in self._agreeing(image).items():
+                self.chosen.setdefault(edge, rank)
 
     def verify_again(self) -> None:
         """Verify pairs of registered images that no geometry explains again, by the relative poses of their cameras.

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
-from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
 from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
 
@@ -54,40 +55,22 @@ def linked_parts(model: PlacedModel) -> list[list[int]]:
     matches is a part of two images.
     """
     views = {edge: model.pairs.geometries[edge][rank].view for edge, rank in model.chosen.items()}
-    of_image: dict[int, list[Edge]] = {image: [] for image in model.cameras}
-    for edge in sorted(views, key=lambda edge: (-len(views[edge]), edge)):
-        for image in edge:
-            of_image[image].append(edge)
-    label = {image: image for image in model.cameras}
-
-    def union(images: Collection[int]) -> None:
-        labels = {label[image] for image in images}
-        for image, one in label.items():
-            if one in labels:
-                label[image] = min(labels)
-
-    for image, edges in sorted(of_image.items()):
+    order = sorted(views, key=lambda edge: (-len(views[edge]), edge))
+    linked = set[Edge]()
+    for image in sorted(model.cameras):
+        edges = [edge for edge in order if image in edge]
         mine = {edge: np.unique(views[edge].matches_idx[:, edge.index(image)]) for edge in edges}
-        for number, one in enumerate(edges):
-            for other in edges[:number]:
-                images = {*one, *other}
-                if len({label[idx] for idx in images}) > 1:
-                    shared = np.intersect1d(mine[one], mine[other], assume_unique=True)
-                    # Two pairs of an image that share this many key points have a common scale.
-                    if len(shared) >= 30:
-                        union(images)
-    for edge in sorted(views, key=lambda edge: (-len(views[edge]), edge)):
-        alone = [sum(one == label[image] for one in label.values()) == 1 for image in edge]
-        if all(alone):
-            union(edge)
-    return sorted(_groups(label), key=lambda part: (-len(part), part))
-
-
-def _groups(label: Mapping[int, int]) -> list[list[int]]:
-    groups: dict[int, list[int]] = {}
-    for image, one in sorted(label.items()):
-        groups.setdefault(one, []).append(image)
-    return list(groups.values())
+        for one, other in combinations(edges, 2):
+            # Two pairs of an image that share this many key points have a common scale.
+            if not linked >= {one, other} and len(np.intersect1d(mine[one], mine[other], assume_unique=True)) >= 30:
+                linked |= {one, other}
+    alone = model.cameras.keys() - {image for edge in linked for image in edge}
+    for edge in order:
+        if alone >= {*edge}:
+            linked.add(edge)
+            alone -= {*edge}
+    groups = connected_groups(linked, len(model.pairs.names))
+    return [group for group in groups if group[0] in model.cameras]
 
 
 def _meeting(model: PlacedModel, parts: Sequence[list[int]]) -> Iterator[tuple[list[int], list[int]]]:
