@@ -8,13 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.nearest_two import (
-    NearestTwo,
-    PackedDescriptors,
-    can_compare_as_integers,
-    nearest_two,
-    nearest_two_packed,
-)
+from pano_mvs.algorithms.matching.nearest_two import Comparable
 from pano_mvs.algorithms.poses.photograph_surface import (
     KnownPoints,
     SurfacePoints,
@@ -120,41 +114,22 @@ def similar_panoramas(
     """
     # VLAD vectors hardly separate the panoramas of a photograph's place from others, because a panorama's describes the
     # whole sphere (docs/benchmarks.md). The strongest key points do, with a fraction of the comparisons.
-    samples = [_Sample(descriptors[:300]) for descriptors in photographs]
+    samples = [Comparable(descriptors[:300]) for descriptors in photographs]
     names: list[str] = []
     matches: list[list[int]] = []
     for name, descriptors in panoramas:
-        known = _Sample(descriptors)
+        known = Comparable(descriptors)
         names.append(name)
         matches.append([_count_matches(sample, known) for sample in samples])
-    return [_best(names, [row[idx] for row in matches], count) for idx in range(len(samples))]
-
-
-def _best(names: list[str], matches: list[int], count: int) -> list[str]:
     if not 0 < count < len(names):
-        return list(names)
-    best = np.argsort(np.negative(matches), kind="stable")[:count]
-    return [names[idx] for idx in sorted(best.tolist())]
+        return [list(names) for _ in samples]
+    order = np.argsort(-np.array(matches).T, axis=1, kind="stable")[:, :count]
+    return [[names[idx] for idx in sorted(best)] for best in order.tolist()]
 
 
-class _Sample:
-    """Descriptors (N, D), packed once for many comparisons if the machine compares integers."""
-
-    def __init__(self, descriptors: NDArray[np.generic]) -> None:
-        self.descriptors = descriptors
-        whole = descriptors.size > 0 and can_compare_as_integers(descriptors)
-        self.packed = PackedDescriptors.of(descriptors) if whole else None
-
-
-def _count_matches(sample: _Sample, known: _Sample) -> int:
+def _count_matches(sample: Comparable, known: Comparable) -> int:
     """Return the number of mutual nearest neighbours that pass the ratio test, as `match_l2` finds them."""
     if min(len(sample.descriptors), len(known.descriptors)) < 2:
         return 0
-    found = _nearest_two(sample, known)
+    found = sample.nearest_two(known)
     return len(np.unique(found.nearest[found.mutual()]))
-
-
-def _nearest_two(sample: _Sample, known: _Sample) -> NearestTwo:
-    if sample.packed is not None and known.packed is not None:
-        return nearest_two_packed(sample.packed, known.packed)
-    return nearest_two(sample.descriptors, known.descriptors)

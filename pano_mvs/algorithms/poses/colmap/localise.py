@@ -14,7 +14,6 @@ from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas
 from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
@@ -51,16 +50,13 @@ def localise_photograph(
     focal_px: float | None,
     patches: PhotographPatches | None = None,
     learned: Mapping[str, NDArray[np.int32]] | None = None,
-    candidates: Annotated[
-        int, Setting("number of most similar panoramas to match each photograph with; 0: all", ge=0)
-    ] = 20,
     min_inliers: Annotated[int, Setting("minimum number of key points that agree with the pose", ge=6)] = 30,
     max_error_deg: Annotated[float, Setting("maximum error of a key point that agrees", gt=0, le=5)] = 0.4,
     rng: np.random.Generator,
 ) -> Localised | str:
     """Estimate the pose and the focal length of a photograph, or return the reason why that is not possible.
 
-    Its key points are matched with those of the most similar panoramas. LO-RANSAC finds the pose, with the focal length
+    Its key points are matched with those of the panoramas. LO-RANSAC finds the pose, with the focal length
     unless it is known (as implemented by COLMAP). Pose, focal length and one coefficient of radial distortion are then
     refined, with more matches, which are looked for near the places that the pose predicts, and with patches of the
     panoramas. If the key points alone are too few, the patches decide: also between the poses that single panoramas
@@ -77,7 +73,6 @@ def localise_photograph(
     """
     if patches is not None and patches.too_narrow:
         return f"it is {size_hw[1]} × {size_hw[0]} pixels, which is too narrow to be compared with panoramas"
-    panoramas = _similar(keypoints, panoramas, candidates)
     by_network = learned or {}
     each = {name: _matches(keypoints, known, learned=by_network.get(name)) for name, known in panoramas.items()}
     matches = _joined(each.values())
@@ -106,16 +101,6 @@ def localise_photograph(
     most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
     singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO, learned=by_network.get(name)) for name in most]
     return search.confirmed([matches, *(one for one in singly if len(one.pixels_px) >= _FEW)], rng) or found
-
-
-def _similar(
-    keypoints: PhotographKeypoints, panoramas: Mapping[str, KnownPoints], count: int
-) -> dict[str, KnownPoints]:
-    if not 0 < count < len(panoramas):
-        return dict(panoramas)
-    described = ((name, known.descriptors) for name, known in panoramas.items())
-    (chosen,) = similar_panoramas([keypoints.descriptors], described, count=count)
-    return {name: panoramas[name] for name in chosen}
 
 
 class _Matches(NamedTuple):
