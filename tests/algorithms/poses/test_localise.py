@@ -137,18 +137,6 @@ def test_patches_do_not_confirm_another_room(model: Model) -> None:
     assert isinstance(localised(picture, model[0], focal_px=FOCAL_PX, patches=model[1]), str)
 
 
-@pytest.fixture(scope="module")
-def many(panoramas: dict[str, KnownPoints]) -> dict[str, KnownPoints]:
-    """The panoramas among those of another room, 20 units away."""
-    pose = Rigid3.from_center(np.eye(3), np.array([20.0, 0.0, 0.0]))
-    picture, ranges = render(default_room(5), Rigid3.identity(), SIZE_HW, supersample=1)
-    features = extract_sift(picture, np.ones(SIZE_HW, np.bool_))
-    range_map = RangeMap(ranges.astype(np.float32), np.full(SIZE_HW, 255, np.uint8))
-    other = known_points(features, pose, range_map, min_confidence=128)
-    names = ["w", *panoramas, "x", "y", "z"]
-    return {name: panoramas.get(name, other) for name in names}
-
-
 def test_distortion_is_found(panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]) -> None:
     """The picture is distorted so that its content moves by up to 12 pixels."""
     picture, pose = taken
