@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.essential import essential_from_bearings
-from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver, Solver
+from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver, Solver, draw_samples, samples_needed
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
-from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
@@ -32,8 +31,6 @@ class RelativePose:
 
     second_from_first: Rigid3  # rotation, and translation of length 1
     inliers: NDArray[np.bool_]  # (M,) bool, True for matches with a small residual in front of both cameras
-    residuals_rad: FloatArray  # (M,) spherical Sampson error of all matches
-    iterations: int  # number of hypotheses
     reason: str = ""  # why there is no pose
 
     def __bool__(self) -> bool:
@@ -88,7 +85,7 @@ def estimate_two_view(
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     # Stop when a better model would have been found with this probability.
-    leaders, iterations = search.run(confidence=0.9999, max_iterations=max_iterations)
+    leaders = search.run(confidence=0.9999, max_iterations=max_iterations)
     if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
     pose: Rigid3 | None = leaders[0]
@@ -97,12 +94,11 @@ def estimate_two_view(
         pose = _refined(pose, first, second, threshold_rad=threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is supported by eight matches")
-    residuals, inliers = agreement(pose, first, second, threshold_rad=threshold_rad)
-    return RelativePose(pose, inliers, residuals, iterations)
+    return RelativePose(pose, agreement(pose, first, second, threshold_rad=threshold_rad)[1])
 
 
 def _none(count: int, reason: str) -> RelativePose:
-    return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), np.full(count, np.pi / 2), 0, reason)
+    return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), reason)
 
 
 def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3 | None:
@@ -128,8 +124,8 @@ class _Search:
     solver: MinimalSolver
     optimise: bool
 
-    def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
-        """Return the leading poses, best first, and the number of hypotheses.
+    def run(self, *, confidence: float, max_iterations: int) -> list[Rigid3]:
+        """Return the leading poses, best first.
 
         There is one pose if a better one would have been found by now, and several if the search reached its limit.
         """
@@ -147,7 +143,7 @@ class _Search:
                 ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
                 needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
             leaders = sorted([*leaders, (cost, tried, pose)], key=lambda item: item[:2])[:_LEADERS]
-        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)], tried
+        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)]
 
     def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
         """Return the best pose of a batch if it costs less than `worst`, its cost, and the number of trials."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
+from pano_mvs.algorithms.two_view.cheirality import facing_costs
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
-from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
+from pano_mvs.algorithms.two_view.refinement import refined_on_agreeing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
-
-_HEADINGS_RAD = np.deg2rad(np.arange(0.0, 360.0, 2.0))
-_MIN_MATCHES = 6
 
 
 def upright_poses(
@@ -29,12 +26,12 @@ def upright_poses(
         rng: draws the matches.
         threshold_rad: Sampson error from which a match costs 1 after refinement.
     """
-    if len(first) < _MIN_MATCHES:
+    if len(first) < 6:
         return []
     # Allows for the tilt of the cameras and for the steps between headings.
     wide_rad = max(float(np.deg2rad(0.6)), threshold_rad)
     rough: list[tuple[float, Rigid3]] = []
-    for heading in _HEADINGS_RAD:
+    for heading in np.deg2rad(np.arange(0.0, 360.0, 2.0)):
         rotation = rotation_from_rotvec(np.array([0.0, heading, 0.0]))
         directions, costs = direction_candidates(rotation, first, second, rng=rng, threshold_rad=wide_rad, count=100)
         if len(directions):
@@ -46,15 +43,7 @@ def upright_poses(
             break
         if all(float(geodesic_angle(pose.rotation, other.rotation)) > float(np.deg2rad(3.0)) for other in poses):
             poses.append(pose)
-    refined = [_settled(pose, first, second, threshold_rad=threshold_rad) for pose in poses]
+    bands = [widen * threshold_rad for widen in (3.0, 2.0, 1.0)]
+    refined = [refined_on_agreeing(pose, first, second, thresholds_rad=bands, least=12)[0] for pose in poses]
     costs = facing_costs(refined, first, second, threshold_rad=threshold_rad)
     return [refined[idx] for idx in np.argsort(costs, kind="stable")]
-
-
-def _settled(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3:
-    for widen in (3.0, 2.0, 1.0):
-        near = agreement(pose, first, second, threshold_rad=widen * threshold_rad)[1]
-        if near.sum() < 2 * _MIN_MATCHES:
-            break
-        pose = refine_relative_pose(pose, first[near], second[near], scale_rad=0.5 * widen * threshold_rad)
-    return pose

@@ -23,14 +23,9 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
 )
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import estimate_two_view
-from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose
+from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose, refined_on_agreeing
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
-from pano_mvs.algorithms.two_view.significance import (
-    MAX_LOG10_FALSE_ALARMS,
-    chance_of_pose,
-    independent_count,
-    log10_false_alarms,
-)
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, independent_count, significance_of_pose
 from pano_mvs.algorithms.two_view.upright import upright_poses
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
@@ -43,7 +38,6 @@ MIN_MATCHES = 16
 
 _THRESHOLD_RAD = float(np.deg2rad(0.2))
 _MIN_WITH_PARALLAX = 8
-_NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 
 
 @checks_settings
@@ -175,21 +169,17 @@ def pose_near(
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and its weight (see `weight_of_pair`). None if
         hardly any match agrees, or those that do leave the direction open.
     """
-    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, _MIN_NEAR)
+    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, 8)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0:
         return None
-    near = Rigid3(pose.rotation, pose.translation / length)
-    for widen in _NEAR:
-        agree = agreement(near, p, q, threshold_rad=widen * pair.threshold_rad)[1]
-        if agree.sum() < _MIN_NEAR:
-            return None
-        near = refine_relative_pose(near, p[agree], q[agree], scale_rad=0.5 * widen * pair.threshold_rad)
-    evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
-    if not np.isfinite(evidence.log10_false_alarms):
+    bands = [widen * pair.threshold_rad for widen in (10.0, 5.0, 2.0, 1.0)]
+    near, enough = refined_on_agreeing(Rigid3(pose.rotation, pose.translation / length), p, q, thresholds_rad=bands)
+    if not enough:
         return None
-    if pair.why_open(evidence):
+    evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
+    if not np.isfinite(evidence.log10_false_alarms) or pair.why_open(evidence):
         return None
     alarms = evidence.log10_false_alarms
     return near, alarms, weight_of_pair(first, second, pair.view(evidence)[0], log10_false_alarms=alarms)
@@ -286,21 +276,19 @@ class _Pair:
         """
         inliers = agreement(pose, self.p, self.q, threshold_rad=self.threshold_rad)[1]
         count = int(inliers.sum())
-        witnesses = independent_count(self.p[inliers], self.q[inliers]) if count else 0
-        if witnesses <= sample:
-            return _Evidence(pose, count, witnesses, np.inf, enough=False)
-        # Also check among the inliers alone: if they are clustered along one epipolar circle, any match would agree.
-        chance = max(
-            chance_of_pose(pose, first, second, rng=self.rng, threshold_rad=self.threshold_rad)
-            for first, second in ((self.p, self.q), (self.p[inliers], self.q[inliers]))
-        )
-        alarms = log10_false_alarms(
-            witnesses,
-            max(independent_count(self.p, self.q), witnesses),
-            chance=chance,
+        witnesses, alarms = significance_of_pose(
+            pose,
+            self.p,
+            self.q,
+            inliers,
+            rng=self.rng,
+            threshold_rad=self.threshold_rad,
+            fewest=sample + 1,
             sample=sample,
             models_per_sample=models,
         )
+        if witnesses <= sample:
+            return _Evidence(pose, count, witnesses, np.inf, enough=False)
         enough = witnesses >= self.min_inliers
         found = _Evidence(pose, count, witnesses, alarms, enough)
         if self.known or not (self.first.learned and self.second.learned):

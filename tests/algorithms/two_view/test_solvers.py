@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
 from pano_mvs.algorithms.two_view.essential import sampson_angles
-from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver, essentials_from_five
-from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.minimal_solvers import (
+    SOLVERS,
+    Solver,
+    draw_samples,
+    essentials_from_five,
+    samples_needed,
+)
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
 from tests.algorithms.poses.synthetic_capture import (

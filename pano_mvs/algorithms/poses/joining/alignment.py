@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.joining.cross_matches import THRESHOLD_RAD, CrossMatches
 from pano_mvs.algorithms.poses.joining.floors import KnownLengths
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.two_view.significance import log10_false_alarms
+from pano_mvs.algorithms.two_view.significance import CELL_RAD, independent_count, log10_false_alarms
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 
 _LENGTHS = np.geomspace(0.1, 30.0, 80)
-_CELL_RAD = 0.025  # matches in one cell of an image count once
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +181,7 @@ def _measured(similarity: Similarity3, jacobian: FloatArray, matches: CrossMatch
     if len(jacobian) and len(agreeing):
         noise_rad = max(float(np.sqrt(np.mean(errors[inliers] ** 2))), 0.2 * THRESHOLD_RAD)
         # Matches on one detail count as one.
-        noise_rad *= float(np.sqrt(len(agreeing) / _independent(agreeing)))
+        noise_rad *= float(np.sqrt(len(agreeing) / independent_count(*agreeing.rays.swapaxes(0, 1))))
         hessian = jacobian.T @ jacobian
         covariance = noise_rad**2 * np.linalg.inv(hessian + 1e-12 * np.trace(hessian) * np.eye(len(hessian)))
         offsets = similarity.apply(agreeing.centers[:, 1]) - agreeing.centers[:, 0]
@@ -206,22 +205,13 @@ def _log10_false_alarms(similarity: Similarity3, known: CrossMatches, agreeing: 
     """
     sample = 4  # seven degrees of freedom, two from each match with a known point
     chosen = known[np.flatnonzero(agreeing)]
-    witnesses = _independent(chosen)
+    witnesses = independent_count(*chosen.rays.swapaxes(0, 1))
     if witnesses <= sample:
         return 1.0
     # Also among the agreeing matches alone: these may be clustered more than all matches, as in a door.
     chance = max(_chance(similarity, some) for some in (known, chosen))
-    candidates = max(_independent(known), witnesses)
+    candidates = max(independent_count(*known.rays.swapaxes(0, 1)), witnesses)
     return log10_false_alarms(witnesses, candidates, chance=chance, sample=sample, models_per_sample=4)
-
-
-def _independent(matches: CrossMatches) -> int:
-    """Return the number of matches on different details: at most one from each small cell of either image."""
-    counts = []
-    for side in (0, 1):
-        cells = np.floor(matches.rays[:, side] / _CELL_RAD).astype(np.int64)
-        counts.append(len(np.unique(cells, axis=0)))
-    return min(counts)
 
 
 def _chance(similarity: Similarity3, matches: CrossMatches) -> float:
@@ -239,7 +229,7 @@ def _chance(similarity: Similarity3, matches: CrossMatches) -> float:
         use = np.isfinite(in_second[:, 0])
     rays, towards = rays[use], in_second[use] - centers[use]
     cosine = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12) @ rays.T
-    apart = rays @ rays.T < np.cos(_CELL_RAD)
+    apart = rays @ rays.T < np.cos(CELL_RAD)
     total = max(int(apart.sum()), 1)
     everywhere = 0.25 * THRESHOLD_RAD**2
     for widen in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0):
