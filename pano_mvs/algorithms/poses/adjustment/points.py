@@ -36,7 +36,7 @@ def triangulate_observations(
     Args:
         centers: (T, 3) camera centre of every observation, in the world.
         rays_in_world: (T, 3) its unit ray, rotated into the world.
-        point_idx: (T,) the track of every observation.
+        point_idx: (T,) the track of every observation, ascending.
         count: P, number of tracks.
         max_error_rad: largest angle between an observed ray and the ray to the point.
         min_angle_rad: smallest angle between the rays of a track of two; longer tracks must be as well conditioned.
@@ -44,18 +44,6 @@ def triangulate_observations(
     # Importing numba takes most of a second, so import it only where it is used.
     from pano_mvs.algorithms.poses.adjustment.kernels_points import triangulate
 
-    if np.any(np.diff(point_idx) < 0):
-        order = np.argsort(point_idx, kind="stable")
-        found = triangulate_observations(
-            centers[order],
-            rays_in_world[order],
-            point_idx[order],
-            count=count,
-            max_error_rad=max_error_rad,
-            min_angle_rad=min_angle_rad,
-        )
-        place = np.argsort(order)
-        return Triangulated(found.points_in_world, found.valid, found.used[place], found.errors_rad[place])
     starts = np.searchsorted(point_idx, np.arange(count + 1))
     # For two rays at angle α the smallest eigenvalue of Σ (I − r rᵀ) is 1 − cos α; more rays only increase it.
     least = float(1 - np.cos(min_angle_rad))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.uncertainty import (
@@ -104,9 +104,8 @@ def fitted_elevation_range(poses: Poses, refined: Poses, *, loss: Loss, loss_sca
     found = ElevationRange(90.0, -90.0, (0.0, 0.0))
     # Nine captures of full spheres are within 2.3 deviations; later rounds choose the observations that fit them.
     for round_idx in range(8):
-        step = estimate_elevation_range(
-            _bundle(fitted)[0], loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg)), neighbour=neighbour
-        )
+        robust = RobustLoss(loss, float(np.deg2rad(loss_scale_deg)))
+        step = estimate_elevation_range(_bundle(fitted)[0], robust, neighbour=neighbour)
         found = found.then(step)
         if step.deviations <= (1 if round_idx else 3.0):
             break
@@ -128,6 +127,10 @@ class _Settings:
     loss_scale_deg: float
     max_error_deg: float
     max_iterations: int
+
+    def robust(self, wider: int = 1) -> RobustLoss:
+        """Return the loss, with a wider scale."""
+        return RobustLoss(self.loss, float(np.deg2rad(self.loss_scale_deg * wider)))
 
 
 def _refined_centrally(poses: Poses, settings: _Settings, *, load: Callable[[str], Picture] | None) -> Poses:
@@ -152,7 +155,7 @@ def _refined_with_rigs(
     own_rigs = [rigs.get(name) for name in poses.names]
     if not neighbour or not any(own_rigs) or not len(poses.track_point_idx):
         return _refined_centrally(poses, settings, load=load)
-    estimate = partial(_offset_scale, settings=settings, neighbour=neighbour)
+    estimate = partial(estimate_offset_scale, loss=settings.robust(), neighbour=neighbour)
     bundle, colors = _with_offsets(*_bundle(poses), own_rigs)
     measured = all(rig.metric for rig in own_rigs if rig is not None)
     if poses.metric and measured:
@@ -204,12 +207,6 @@ def _with_unit(
     return None
 
 
-def _offset_scale(bundle: Bundle, *, settings: _Settings, neighbour: int) -> OffsetScale:
-    return estimate_offset_scale(
-        bundle, loss=settings.loss, scale_rad=float(np.deg2rad(settings.loss_scale_deg)), neighbour=neighbour
-    )
-
-
 def _adjusted(
     bundle: Bundle, colors: NDArray[np.uint8], settings: _Settings, *, rounds: int, widen: int = 1
 ) -> tuple[Bundle, NDArray[np.uint8]]:
@@ -231,11 +228,10 @@ def _adjusted(
             min_angle_rad=float(np.deg2rad(1.0)),
         )
         bundle, colors = _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
-        scale_rad = float(np.deg2rad(settings.loss_scale_deg * wider))
+        loss = settings.robust(wider)
         bundle = adjust_bundle(
-            replace(bundle, lengths=floor_lengths(bundle, scale_rad=scale_rad)),
-            loss=settings.loss,
-            scale_rad=scale_rad,
+            replace(bundle, lengths=floor_lengths(bundle, scale_rad=loss.scale_rad)),
+            loss,
             max_iterations=settings.max_iterations,
             tolerance=_TOLERANCES[round_idx - rounds] if widen == 1 else _TOLERANCES[0],
         )
@@ -249,9 +245,7 @@ def _with_uncertainty(poses: Poses, bundle: Bundle, settings: _Settings, *, neig
     """Return refined poses with the standard deviations of their cameras, given the distance of one to the first."""
     if not neighbour or not len(bundle.points):
         return poses
-    centers, rotations = camera_deviations(
-        bundle, loss=settings.loss, scale_rad=float(np.deg2rad(settings.loss_scale_deg)), neighbour=neighbour
-    )
+    centers, rotations = camera_deviations(bundle, settings.robust(), neighbour=neighbour)
     return replace(poses, center_stds=centers, rotation_stds_rad=rotations)
 
 
@@ -448,17 +442,16 @@ class ElevationRange:
         return ElevationRange(float(edges[0]), float(edges[1]), step.stds_deg)
 
 
-def estimate_elevation_range(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> ElevationRange:
+def estimate_elevation_range(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> ElevationRange:
     """Return the elevations of the edges that fit the rays best.
 
     Args:
         bundle: an adjusted bundle of panoramas that all cover the same elevations.
         loss: the loss of the adjustment.
-        scale_rad: the scale of that loss.
         neighbour: position of the camera whose distance to the first is held.
     """
     unknown = ElevationRange(90.0, -90.0, (float("inf"), float("inf")))
-    held = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
+    held = held_cameras(bundle, loss, neighbour=neighbour)
     derivatives = ray_derivatives(held.bundle)
     x, y, z = held.bundle.bearings.T
     elevations, level = np.arcsin(np.clip(-y, -1, 1)), np.maximum(np.hypot(x, z), 1e-12)

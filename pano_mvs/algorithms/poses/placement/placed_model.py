@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
@@ -238,8 +238,7 @@ class PlacedModel:
                     image_idx=tracks.image_idx[found.used],
                     bearings=tracks.bearings[found.used],
                 ),
-                loss="cauchy",
-                scale_rad=MAX_ERROR_RAD / 4,
+                RobustLoss("cauchy", MAX_ERROR_RAD / 4),
                 max_iterations=20,
                 tolerance=1e-3,  # the finished model is refined anyway
                 fixed_camera=members.index(next(iter(self.cameras))),
