@@ -66,7 +66,7 @@ def solve_scaled_translation(
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation)
+    models, reasons = solved_models(pairs, adjust=adjust, confirmation=confirmation)
     groups = [_finished(grown, adjust=adjust) for grown in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
@@ -83,8 +83,8 @@ def solve_scaled_translation(
     return join_groups(groups, order=names, rejected=rejected)
 
 
-def _grown_and_joined(
-    pairs: Pairs, *, adjust: bool, confirmation: Confirmation | None
+def solved_models(
+    pairs: Pairs, *, adjust: bool = True, confirmation: Confirmation | None = None
 ) -> tuple[list[GrownModel], dict[int, str]]:
     """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
