@@ -12,7 +12,6 @@ from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
 from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed, why_few_known, why_few_seen
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.poses.verification.aliases import find_aliases
 from pano_mvs.algorithms.poses.verification.camera_checks import (
     PAIRS_POWER,
     CameraChecks,
@@ -36,11 +35,10 @@ class GrownModel:
     model: PlacedModel  # the cameras
     refused: dict[int, str]  # position of each image that could not be added, to the reason
     checks: CameraChecks | None  # result of the check against the images; None if the images were not consulted
-    aliased: bool = False  # whether runner-up geometries of several pairs suggest the same move of a block of cameras
 
     def is_satisfactory(self) -> bool:
         """Return whether no other model needs to be tried."""
-        if self.refused or self.aliased:
+        if self.refused:
             return False
         if self.checks is None:
             # The first model is accepted if it explains this share of the pairs.
@@ -84,7 +82,7 @@ def grown_models(
             break
     models.sort(key=GrownModel.rank)
     if models and models[0].checks is not None and confirmation is not None:
-        # Move cameras and blocks of cameras to where the images confirm them best.
+        # Move cameras to where the images confirm them best.
         checks = correct_cameras(models[0].model, confirmation)
         if checks.moved:
             settle(models[0].model, adjust=adjust)
@@ -159,11 +157,10 @@ def _grown(
     settle(model, adjust=adjust)
     refused = {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
     checks = None
-    aliased = confirmation is not None and bool(find_aliases(model))
     # The images are not consulted if the model explains this share of the pairs.
-    if left or aliased or model.explained_share() < 0.97:
+    if left or model.explained_share() < 0.97:
         checks = check_cameras(model, confirmation)
-    return GrownModel(model, refused, checks, aliased)
+    return GrownModel(model, refused, checks)
 
 
 def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Confirmation | None) -> dict[int, str]:
