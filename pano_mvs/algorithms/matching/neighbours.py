@@ -238,14 +238,9 @@ def east_north_m(positions_lla: Sequence[tuple[float, float, float]]) -> FloatAr
 
 def _nearest(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
     """Return links (first < second) of each item to its nearest ones; infinite distances are not links."""
-    apart = distances.copy()
-    np.fill_diagonal(apart, np.inf)
-    order = np.argsort(apart, axis=1, kind="stable")[:, :neighbours]
-    rows = np.repeat(np.arange(len(apart)), order.shape[1])
-    columns = order.ravel()
-    finite = np.isfinite(apart[rows, columns])
-    links = np.sort(np.stack([rows[finite], columns[finite]], axis=1), axis=1)
-    return np.unique(links, axis=0)
+    chosen = np.eye(len(distances), dtype=np.bool_)
+    _choose(chosen, np.full(len(distances), neighbours), distances)
+    return np.argwhere(np.triu(chosen, 1))
 
 
 def _share_that_follow(looks: FloatArray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
-from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed, why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.resection import points_needed, why_refused
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.camera_checks import (
     PAIRS_POWER,
@@ -290,8 +290,6 @@ def why_nothing(model: PlacedModel, image: int) -> str:
 
 
 def _why_refused(pairs: Pairs, image: int, support: int, *, known: int, agreeing: int) -> str:
-    if known >= MIN_POINTS:
-        return why_few_seen(support, known, agreeing=agreeing)
     partner = pairs.partners[image][0]
     count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return why_few_known(known, partner=pairs.names[partner], matches=count)
+    return why_refused(support, known, agreeing=agreeing, partner=pairs.names[partner], matches=count)

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
@@ -19,8 +18,8 @@ from pano_mvs.algorithms.poses.adjustment.uncertainty import (
     camera_deviations,
     estimate_offset_scale,
     held_cameras,
+    parameter_step,
     ray_derivatives,
-    unexplained,
 )
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
@@ -450,26 +449,17 @@ def estimate_elevation_range(bundle: Bundle, loss: RobustLoss, *, neighbour: int
         loss: the loss of the adjustment.
         neighbour: position of the camera whose distance to the first is held.
     """
-    unknown = ElevationRange(90.0, -90.0, (float("inf"), float("inf")))
     held = held_cameras(bundle, loss, neighbour=neighbour)
     derivatives = ray_derivatives(held.bundle)
     x, y, z = held.bundle.bearings.T
     elevations, level = np.arcsin(np.clip(-y, -1, 1)), np.maximum(np.hypot(x, z), 1e-12)
     upwards = np.stack([y * x / level, -level, y * z / level], axis=1)
     by_shift = -np.einsum("tij,tj->ti", np.swapaxes(tangent_basis(held.bundle.bearings), 1, 2), upwards)
-    try:
-        own = np.stack(
-            [unexplained(held, derivatives, by) for by in (elevations[:, None] * by_shift, by_shift)], axis=-1
-        )
-        information = np.einsum("t,tik,til->kl", held.weights, own, own)
-        covariance = held.variance * np.linalg.inv(information)
-    except LinAlgError:
-        return unknown
-    step = -np.linalg.solve(information, np.einsum("t,tik,ti->k", held.weights, own, derivatives.residuals))
+    step, covariance = parameter_step(held, derivatives, np.stack([elevations[:, None] * by_shift, by_shift], axis=-1))
     edges = np.array([[np.pi / 2, 1.0], [-np.pi / 2, 1.0]])
-    variances = np.einsum("ek,kl,el->e", edges, covariance, edges)
-    if not (np.isfinite(variances).all() and (variances > 0).all()):
-        return unknown
+    variances = np.einsum("ek,kl,el->e", edges, np.where(np.isfinite(covariance), covariance, 0.0), edges)
+    if not (variances > 0).all():
+        return ElevationRange(90.0, -90.0, (float("inf"), float("inf")))
     top, bottom = np.degrees(edges @ (np.array([1.0, 0.0]) + step))
     stds = np.degrees(np.sqrt(variances))
     return ElevationRange(float(top), float(bottom), (float(stds[0]), float(stds[1])))

@@ -123,9 +123,8 @@ class OffsetScale:
 def estimate_offset_scale(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> OffsetScale:
     """Return the units per metre that fit the rays best, by one Gauss–Newton step from the bundle's own value.
 
-    Residuals are r(u) ≈ r + g (u − u₀), where u is the units per metre and g = −Bᵀ (I − x̂ x̂ᵀ) o / |x|. Of g, only the
-    part counts that no movement of the cameras and points explains (variable projection; Golub & Pereyra 1973). The
-    first camera and the length of the first baseline are held, because without offsets they define the unit.
+    Residuals are r(u) ≈ r + g (u − u₀), where u is the units per metre and g = −Bᵀ (I − x̂ x̂ᵀ) o / |x|. The first
+    camera and the length of the first baseline are held, because without offsets they define the unit.
 
     Args:
         bundle: an adjusted bundle with offsets.
@@ -141,15 +140,33 @@ def estimate_offset_scale(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -
     derivatives = ray_derivatives(held.bundle)
     assert held.bundle.offsets_m is not None
     by_unit = -np.einsum("tij,tj->ti", derivatives.by_ray, held.bundle.offsets_m)
+    step, covariance = parameter_step(held, derivatives, by_unit[..., None])
+    return OffsetScale(bundle.units_per_m + float(step[0]), float(np.sqrt(covariance[0, 0])))
+
+
+def parameter_step(
+    held: HeldCameras, derivatives: RayDerivatives, by_parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss–Newton step of parameters of all rays, (K,), and its covariance; 0 and inf if it is unknown.
+
+    Of the derivatives, only the part counts that no movement of cameras and points explains (variable projection;
+    Golub & Pereyra 1973).
+
+    Args:
+        held: the system of the cameras.
+        derivatives: those of the bundle of the system.
+        by_parameters: (T, 2, K) derivatives of the residuals by the parameters.
+    """
+    count = by_parameters.shape[2]
     try:
-        own = unexplained(held, derivatives, by_unit)
+        own = np.stack([unexplained(held, derivatives, by) for by in np.moveaxis(by_parameters, 2, 0)], axis=-1)
+        information = np.einsum("t,tik,til->kl", held.weights, own, own)
+        covariance = held.variance * np.linalg.inv(information)
     except LinAlgError:
-        return OffsetScale(bundle.units_per_m, float("inf"))
-    information = float(np.sum(held.weights[:, None] * own**2))
-    if not information > 0:
-        return OffsetScale(bundle.units_per_m, float("inf"))
-    step = -float(np.sum(held.weights[:, None] * own * derivatives.residuals)) / information
-    return OffsetScale(bundle.units_per_m + step, float(np.sqrt(held.variance / information)))
+        return np.zeros(count), np.full((count, count), np.inf)
+    step = -np.linalg.solve(information, np.einsum("t,tik,ti->k", held.weights, own, derivatives.residuals))
+    known = np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()
+    return (step, covariance) if known else (np.zeros(count), np.full((count, count), np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

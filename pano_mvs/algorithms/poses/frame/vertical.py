@@ -149,13 +149,9 @@ def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertic
     if not prior:
         return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if pictures else prior
     lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
-    if not lines:
-        return _unknown(lines.reason)
-    reason = _too_far(lines.up, prior, "vertical lines are")
-    if reason:
-        return _unknown(reason)
-    evidence = f"{lines.count} vertical lines in the pictures"
-    return Vertical(lines.up, "lines", evidence, prior.disagreement_deg, uncertainty_deg=lines.uncertainty_deg)
+    return _near_cameras(
+        lines, prior, "lines", what="vertical lines are", evidence=f"{lines.count} vertical lines in the pictures"
+    )
 
 
 def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: Segments) -> Vertical:
@@ -184,17 +180,24 @@ def vertical_from_structure(poses: Poses) -> Vertical:
     if not prior:
         return prior
     layers = sharpest_up(poses.points_in_world, poses.centers, prior.up_in_world)
-    if not layers:
-        return _unknown(layers.reason)
-    reason = _too_far(layers.up, prior, "layers of sparse points are")
-    if reason:
-        return _unknown(reason)
     moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
     evidence = (
         f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
         f"of {len(poses.names)} cameras"
     )
-    return Vertical(layers.up, "structure", evidence, prior.disagreement_deg, uncertainty_deg=layers.uncertainty_deg)
+    return _near_cameras(layers, prior, "structure", what="layers of sparse points are", evidence=evidence)
+
+
+def _near_cameras(found: Upward, prior: Vertical, source: str, *, what: str, evidence: str) -> Vertical:
+    """Return a direction as the vertical, unless it is too far from that of the cameras."""
+    moved_deg = float(np.rad2deg(angle_between(found.up, prior.up_in_world)))
+    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
+    # ramp.
+    if found and moved_deg > 2.0 + 3 * 1.4826 * prior.disagreement_deg:
+        return _unknown(f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction")
+    if not found:
+        return _unknown(found.reason)
+    return Vertical(found.up, source, evidence, prior.disagreement_deg, uncertainty_deg=found.uncertainty_deg)
 
 
 def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -222,15 +225,6 @@ def _of_one_camera(poses: Poses) -> Vertical:
         return _unknown("there is no camera")
     # How far from upright a single camera is usually held.
     return Vertical(poses.rotations[0].T @ UP, "cameras", "a single camera", 2.0)
-
-
-def _too_far(up: FloatArray, prior: Vertical, what: str) -> str:
-    """Return why a direction cannot be the vertical, if it is too far from that of the cameras; else ""."""
-    moved_deg = float(np.rad2deg(angle_between(up, prior.up_in_world)))
-    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
-    # ramp.
-    limit_deg = 2.0 + 3 * 1.4826 * prior.disagreement_deg
-    return f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction" if moved_deg > limit_deg else ""
 
 
 def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) -> float:

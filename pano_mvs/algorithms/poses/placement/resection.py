@@ -114,17 +114,22 @@ def why_no_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> str:
     return f"it has no reliable pair; its best partner is {partner!r}: {two_views[pair].reason}"
 
 
-def why_few_seen(support: int, known: int, *, agreeing: int = 1) -> str:
-    """Return why a camera is not reliable that sees too few known points where they should be."""
-    return (
-        f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
-        f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, moving "
-        "objects, stitching errors, or an image that is not a panorama"
-    )
+def why_refused(support: int, known: int, *, agreeing: int, partner: str, matches: int) -> str:
+    """Return why a camera is not reliable.
 
-
-def why_few_known(known: int, *, partner: str, matches: int) -> str:
-    """Return why an image cannot be placed that matches too few known points; its best pair is with `partner`."""
+    Args:
+        support: number of known points that it sees where they should be.
+        known: number of known points that it matches.
+        agreeing: number of pairs that agree with its pose.
+        partner: name of the image of its best pair.
+        matches: number of matches of this pair.
+    """
+    if known >= MIN_POINTS:
+        return (
+            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
+            f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, "
+            "moving objects, stitching errors, or an image that is not a panorama"
+        )
     return (
         f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
         f"needed. Its best partner is {partner!r} with {matches} {plural(matches, 'match', 'matches')}. "
