@@ -141,9 +141,6 @@ _PATCH_RADIUS = 15  # number of cells from the centre to the farthest test
 _TESTS = 256
 _MARGIN = 32  # at least _CLEARANCE lattice steps, stretched by 1.42, starting 5 cells beyond a face
 _CLEARANCE = 18  # number of cells around a corner that must not be masked: its patch, and the support of the smoothing
-# Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
-_ANTIALIAS, _CORNER_SIGMA = 0.5, 0.65
-_WINDOW_SIGMA = 1.0
 _PATCH_SIGMA = 2.0
 
 
@@ -192,7 +189,8 @@ def extract_sphorb(
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grids = grid_pyramid(image.shape[1], levels)
     scales = np.array([grids[0].steps / grid.steps for grid in grids])
-    sigmas_px = np.sqrt(_ANTIALIAS**2 * (scales**2 - 1) + (_CORNER_SIGMA * scales) ** 2)
+    # Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
+    sigmas_px = np.sqrt(0.5**2 * (scales**2 - 1) + (0.65 * scales) ** 2)
     pictures = [grid.sample(smoothed) for grid, smoothed in zip(grids, smooth_panorama(gray, sigmas_px), strict=True)]
     found = [_detect(p, g, threshold=fast_threshold) for p, g in zip(pictures, grids, strict=True)]
     if not mask.all():
@@ -331,7 +329,7 @@ def _harris_window() -> tuple[NDArray[np.int64], FloatArray]:
     rings = [np.zeros((1, 2), np.int64), *(hexagon_ring(r) for r in range(1, 3))]
     window = np.concatenate(rings)
     squared = np.sum(plane_from_lattice(window) ** 2, axis=1)
-    return window, np.exp(-0.5 * squared / _WINDOW_SIGMA**2) / 255**2
+    return window, np.exp(-0.5 * squared) / 255**2
 
 
 @cache

@@ -20,9 +20,6 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
-# Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
-# slide.
-_SIFT_EDGE_RATIO = 20
 # Distance from masked pixels, in key point sizes: SIFT's patch extends three sizes from its centre, with decreasing
 # weights, with less than a quarter of the weight beyond this distance; ORB's extends half a size plus a tenth for
 # smoothing.
@@ -228,10 +225,9 @@ def _sizes_and_scores(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.flo
 
 def sift_detector(contrast_threshold: float = 0.004) -> cv2.SIFT:
     """Return OpenCV's detector with the settings of `extract_sift`."""
-    # Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
-    return cv2.SIFT.create(
-        contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
-    )
+    # Twice the usual edge ratio: on plain walls many key points are on edges, and geometric verification rejects those
+    # that slide. Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
+    return cv2.SIFT.create(contrastThreshold=contrast_threshold, edgeThreshold=20, enable_precise_upscale=True)
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -15,9 +15,6 @@ from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-# Typical changes of rotation, translation, log focal length and distortion.
-_STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
-_RADIAL_STD = 0.1
 # Errors beyond this many times the median of the inliers' count less and less (Cauchy's loss).
 _ROBUST = 1.5
 
@@ -213,10 +210,11 @@ def _least_squares(
 
     def residuals(change: FloatArray) -> FloatArray:
         moved = _moved(camera, change[:8])
-        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
+        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / 0.1]
         return np.concatenate([errors_of(moved, change[8:]), own])
 
-    steps = (*_STEPS, *more)
+    # Typical changes of rotation, translation, log focal length and distortion.
+    steps = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05, *more)
     return least_squares(residuals, np.zeros(len(steps)), x_scale=steps)
 
 

@@ -25,7 +25,6 @@ BoolArray = NDArray[np.bool_]
 
 _TWINS = 16  # number of samples among the matches of a known geometry
 _PEAKS = 6  # number of candidates of each kind that are refined
-_MIN_OWN_SHARE = 0.08  # own matches, relative to the matches of the best geometry
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
 _MIN_DIRECTION_RAD = float(np.deg2rad(2.5))
 
@@ -123,7 +122,7 @@ class _Search:
         """Return the geometry with most matches of its own; None unless these are more than chance."""
         searched = ~np.any([geometry.agreeing for geometry in known], axis=0)
         # Own independent matches, relative to the number that a best geometry needs.
-        needed = max(0.6 * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
+        needed = max(0.6 * self.min_inliers, 0.08 * float(known[0].agreeing.sum()))
         rest = self.rng.permutation(np.flatnonzero(searched))
         if len(rest) < needed:
             return None

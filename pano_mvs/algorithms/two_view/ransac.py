@@ -20,7 +20,6 @@ from pano_mvs.geometry import Rigid3
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
 _SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
-_LAG_SIGMAS = 3.0  # hypotheses that are worse than the best by more than this are rejected early
 _LEADERS = 6  # number of hypotheses whose direction is estimated again
 _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
@@ -161,7 +160,7 @@ class _Search:
             threshold_rad=self.threshold_rad,
             # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
-            sigmas=_LAG_SIGMAS if self.optimise else np.inf,
+            sigmas=3.0 if self.optimise else np.inf,
             count=4,
         )
         if not len(finalists):

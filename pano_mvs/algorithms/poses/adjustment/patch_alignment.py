@@ -25,8 +25,6 @@ _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
 _FLOOR = 0.1  # samples: error that the deviation of the aligned patches does not include
-_NOT_ALIGNED = 0.3  # samples: sigma of an observation that does not align and keeps its detected position …
-_NOT_TRIED = 0.15  # … and of an observation of a track beyond the maximum that is aligned
 _MAX_PER_IMAGE = 1500  # observations: if there are more, their number gives enough precision
 _AT_ONCE = 100_000  # observations whose patches are in memory at a time
 
@@ -66,7 +64,8 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     chosen = np.zeros(len(lengths), np.bool_)
     chosen[order[np.cumsum(lengths[order]) <= _MAX_PER_IMAGE * len(poses.names)]] = True
     chosen = chosen[poses.track_point_idx]  # observations of the longest tracks
-    sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
+    # In samples: of an observation that does not align and keeps its detected position, and of one that is not tried.
+    sigmas_rad = np.where(chosen, 0.3, 0.15) * step_rad
     for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
         _align_block(poses, sightings, block, load=load, step_rad=step_rad, bearings=bearings, sigmas_rad=sigmas_rad)
     return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))

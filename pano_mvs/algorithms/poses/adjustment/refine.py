@@ -333,9 +333,6 @@ def _poses(
 # The floor around two cameras: at most this far away, in heights; points within a factor of the same height; a level
 # with this many points, and more than twice as many as any other.
 _REACH, _SAME_LEVEL, _MIN_POINTS = 2.5, 0.04, 8
-# A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of 20
-# panoramas, 28 of 35 are within 1.6 %, the others at 7 to 14 %, all due to wrong lengths.
-_MAX_DIFFERENCE, _MIN_STD, _MIN_PAIRS = 0.25, 0.02, 3
 
 
 def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
@@ -360,12 +357,14 @@ def floor_lengths(bundle: Bundle, *, scale_rad: float) -> Lengths | None:
     # In heights: shorter ones do not determine the height, and would be held at any length.
     long = baselines > 0.2 * heights
     pairs, heights, baselines = pairs[long], heights[long], baselines[long]
-    if len(pairs) < _MIN_PAIRS:
+    if len(pairs) < 3:
         return None
     differences = np.log(heights / np.median(heights))
-    same = np.abs(differences) < _MAX_DIFFERENCE
+    # A length whose height differs by more comes from a table, or from cameras at different heights. In a real tour of
+    # 20 panoramas, 28 of 35 are within 1.6 %, the others at 7 to 14 %, all due to wrong lengths.
+    same = np.abs(differences) < 0.25
     # What is known of the spread of heights before any is measured.
-    std = max(_MIN_STD, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
+    std = max(0.02, 1.4826 * float(np.median(np.abs(differences))), 0.1 / len(pairs) ** 0.5)
     # 1.39 is the squared median of the length of a normal vector of variance 1 in each of two directions.
     weight = float(np.median(bundle.scaled_errors_rad()) / scale_rad) ** 2 / 1.39
     return Lengths(pairs[same], (baselines * np.exp(-differences))[same], std, weight)

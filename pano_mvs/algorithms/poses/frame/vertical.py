@@ -35,11 +35,6 @@ Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 SURE = 0.8
 """Probability from which a capture is taken to be upside down. Of upright ones that were measured, none reaches .01."""
 
-# Errors that all sensors of a type, or all cameras of one person, have in common; that of a single reading.
-_SENSOR_BIAS_DEG, _CAMERA_BIAS_DEG, _SINGLE_READING_DEG = 0.5, 1.0, 1.0
-# Of the median of the angles between directions and their mean, in terms of the standard deviation of the direction.
-_STD_PER_MEDIAN = 0.85 * np.sqrt(2.0)
-
 
 @dataclass(frozen=True, eq=False)
 class Vertical:
@@ -117,8 +112,8 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
     states = plural(int(kept.sum()), "states", "state")
     evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas {states}{agreement}"
     if len(measured) == 1:
-        return Vertical(up, "sensors", evidence, uncertainty_deg=_SINGLE_READING_DEG)
-    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, int(kept.sum()), _SENSOR_BIAS_DEG)
+        return Vertical(up, "sensors", evidence, uncertainty_deg=1.0)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, int(kept.sum()), 0.5)
     return Vertical(up, "sensors", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
@@ -134,7 +129,7 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
             f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
         )
     evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
-    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), _CAMERA_BIAS_DEG)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), 1.0)
     return Vertical(up, "cameras", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
@@ -228,7 +223,9 @@ def _of_one_camera(poses: Poses) -> Vertical:
 
 
 def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) -> float:
-    return float(np.hypot(bias_deg, _STD_PER_MEDIAN * disagreement_deg / np.sqrt(count)))
+    """Return the standard deviation of a mean, with an error that all sensors, or all cameras, have in common."""
+    # 0.85 √2: of the median of the angles between directions and their mean, in standard deviations of a direction.
+    return float(np.hypot(bias_deg, 0.85 * np.sqrt(2.0) * disagreement_deg / np.sqrt(count)))
 
 
 def _unknown(reason: str) -> Vertical:

@@ -13,9 +13,6 @@ from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, Similarity3, ranges_from_bearings
 
-_MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
-# Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
-_MAX_SPREAD = 0.05
 LENGTH_STD = 0.06
 """Relative standard deviation of a length by the floor that a pair sees. 45 pairs of a real tour: 1.33 to 1.58 m."""
 
@@ -88,8 +85,10 @@ def _height(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[
     ups = np.array([camera.rotation.T @ up for camera, up in zip(cameras, ups_in_cam, strict=True)])
     up = ups.mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > _MAX_TILT_RAD:
+    # Of a typical camera against all: others are not known to be upright.
+    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > np.deg2rad(3.0):
         return 0.0
     centers = np.array([camera.center for camera in cameras])
     floor = floor_below(points, centers, up)
-    return floor.depth if floor and np.std(centers @ up) <= _MAX_SPREAD * floor.depth else 0.0
+    # Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
+    return floor.depth if floor and np.std(centers @ up) <= 0.05 * floor.depth else 0.0

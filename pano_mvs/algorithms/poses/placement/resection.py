@@ -15,9 +15,6 @@ from pano_mvs.scene import TwoView
 MAX_ERROR_RAD = float(np.deg2rad(0.5))
 """Largest error of a point that an image sees where it should."""
 
-FIRST_GUESS_RAD = float(np.deg2rad(2.0))
-"""The same at a pose that is not yet refined."""
-
 MIN_POINTS = 15
 
 
@@ -29,7 +26,7 @@ def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearin
 def refined_on_points(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> tuple[Rigid3, int]:
     """Return a pose refined with limits that narrow, and the number of points that it sees where they should be."""
     pose = cam_from_world
-    for scale_rad in (FIRST_GUESS_RAD / 2, MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
+    for scale_rad in (float(np.deg2rad(1.0)), MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
         pose = refine_resection(pose, points_in_world, bearings, scale_rad=scale_rad)
     return pose, int((resection_errors(pose, points_in_world, bearings) < MAX_ERROR_RAD).sum())
 

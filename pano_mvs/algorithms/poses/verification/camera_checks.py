@@ -18,8 +18,6 @@ from pano_mvs.algorithms.poses.verification.contradictions import contradicted_p
 from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
 from pano_mvs.geometry import Rigid3
 
-# If no more than this can be expected to be confirmed, nothing can be concluded.
-_MIN_EXPECTED = 0.1
 # Exponent of the share of explained pairs relative to the share of confirmed texture.
 PAIRS_POWER = 0.25
 
@@ -116,9 +114,10 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
 def _suspects(found: CameraChecks) -> list[int]:
     """Return the images that confirm much less than expected, worst first."""
     ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
-    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest.
+    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest. If no
+    # more than a tenth can be expected to be confirmed, nothing can be concluded.
     return sorted(
-        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > _MIN_EXPECTED),
+        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > 0.1),
         key=lambda image: (ratios[image], image),
     )
 
