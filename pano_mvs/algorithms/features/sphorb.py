@@ -19,6 +19,7 @@ from scipy import fft
 
 from pano_mvs.algorithms.faces.layout import face_corners
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -285,19 +286,17 @@ def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners
 def _record(
     image: NDArray[np.uint8], chosen: list[_Corners], descriptors: NDArray[np.uint8], *, sizes_rad: NDArray[np.float32]
 ) -> Features:
-    height, width = image.shape[:2]
     bearings = np.concatenate([c.bearings for c in chosen])
     scores = np.concatenate([c.responses for c in chosen])
     order = np.argsort(-scores, kind="stable")
-    x, y = np.floor(pixel_from_ray(bearings[order], (height, width))).astype(np.intp).T
     return Features(
         bearings=bearings[order],
         descriptors=descriptors[order],
         sizes_rad=sizes_rad[order],
         scores=scores[order],
-        colors_rgb=image[np.clip(y, 0, height - 1), x % width],
+        colors_rgb=image[pixels_containing(bearings[order], image.shape[:2])],
         metric="hamming",
-        size_hw=(height, width),
+        size_hw=(image.shape[0], image.shape[1]),
     )
 
 

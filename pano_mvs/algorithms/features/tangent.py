@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.faces.layout import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
@@ -167,8 +168,7 @@ def _extract(
     scores = np.concatenate([f.scores for f in found])
     descriptors = np.concatenate([f.descriptors for f in found])
     pixel_rad = 2 * np.pi / size_hw[1]
-    x, y = np.floor(pixel_from_ray(bearings, size_hw)).astype(np.intp).T
-    x, y = x % size_hw[1], np.clip(y, 0, size_hw[0] - 1)
+    y, x = pixels_containing(bearings, size_hw)
     keep = np.flatnonzero(mask[y, x])
     keep = keep[distinct_keypoints(bearings[keep], scores[keep], radius_rad=0.5 * pixel_rad)]
     keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.fusion.view import normals_from_range
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
+from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.scene import Features, RangeMap
 
 # A patch is used if most of 5 × 5 ranges around its middle, two pixels apart, are on its tangent plane within 2 %.
@@ -54,8 +55,7 @@ def surface_points(
         min_confidence: smallest confidence of a range that is used.
     """
     size_hw = (range_map.range.shape[0], range_map.range.shape[1])
-    x, y = np.floor(pixel_from_ray(features.bearings, size_hw)).astype(np.intp).T
-    x, y = x % size_hw[1], np.clip(y, 0, size_hw[0] - 1)
+    y, x = pixels_containing(features.bearings, size_hw)
     good = np.flatnonzero(np.isfinite(range_map.range[y, x]) & (range_map.confidence[y, x] >= min_confidence))
     x, y, bearings = x[good], y[good], features.bearings[good]
     wanted = np.zeros(size_hw, np.bool_)
@@ -126,8 +126,7 @@ def known_points(
         min_confidence: smallest confidence of a range that is used.
     """
     height, width = range_map.range.shape
-    x, y = np.floor(pixel_from_ray(features.bearings, (height, width))).astype(np.intp).T
-    x, y = x % width, np.clip(y, 0, height - 1)
+    y, x = pixels_containing(features.bearings, (height, width))
     ranges = range_map.range[y, x].astype(np.float64)
     beside = np.stack([range_map.range[np.clip(y + dy, 0, height - 1), (x + dx) % width] for dx, dy in _BESIDE])
     with np.errstate(invalid="ignore"):

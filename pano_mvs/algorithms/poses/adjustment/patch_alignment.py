@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
@@ -189,12 +190,10 @@ def _masked(mask: NDArray[np.bool_], rays: tuple[FloatArray, FloatArray, FloatAr
     masked = np.zeros(len(middles), np.bool_)
     if mask.all():
         return masked
-    height, width = mask.shape
     steps = np.linspace(-(SIZE - 1) / 2, (SIZE - 1) / 2, 5)
     for across in steps:
         for down in steps:
-            pixels = pixel_from_ray(middles + across * first_axes + down * second_axes, mask.shape).astype(np.intp)
-            masked |= ~mask[pixels[:, 1].clip(max=height - 1), pixels[:, 0] % width]
+            masked |= ~mask[pixels_containing(middles + across * first_axes + down * second_axes, mask.shape)]
     return masked
 
 
