@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,82 +11,39 @@ from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
 from pano_mvs.algorithms.poses.placement.places import Placement, agreement
 from pano_mvs.algorithms.poses.placement.resection import points_needed, why_refused
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.poses.verification.camera_checks import (
-    PAIRS_POWER,
-    CameraChecks,
-    check_cameras,
-    correct_cameras,
-)
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_MAX_GROWN = 3  # number of seeds from which models are grown
 _LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
 _CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
 _CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
 _RIVALS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class GrownModel:
-    """A model, and the images that could not be added to it."""
-
-    model: PlacedModel  # the cameras
-    refused: dict[int, str]  # position of each image that could not be added, to the reason
-    checks: CameraChecks | None  # result of the check against the images; None if the images were not consulted
-
-    def is_satisfactory(self) -> bool:
-        """Return whether no other model needs to be tried."""
-        if self.refused:
-            return False
-        if self.checks is None:
-            # The first model is accepted if it explains this share of the pairs.
-            return self.model.explained_share() > 0.85
-        return not self.checks.doubts and not self.checks.removed
-
-    def rank(self) -> tuple[float, float]:
-        """Return the sort key of models: the share of images and pairs that they explain, best first.
-
-        Doubtful cameras do not count as confirmed. A model in which all cameras are confirmed about as expected is
-        better than one in which most are confirmed slightly more and one is hardly confirmed.
-        """
-        confirmed = 0.0
-        if self.checks is not None:
-            shares, doubts = self.checks.shares, self.checks.doubts
-            confirmed = sum(np.nan_to_num(share) for image, share in shares.items() if image not in doubts)
-        return -float(confirmed) * self.model.explained_share() ** PAIRS_POWER, -self.model.explained_weight()
-
-
-def grown_models(
+def grown_model(
     pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
-) -> list[GrownModel]:
-    """Return models of a connected group of images, the model that explains the pairs best first.
+) -> tuple[PlacedModel, dict[int, str]]:
+    """Return a model of a connected group of images, and why images of the group could not be added to it.
+
+    It grows from the best seed to which any image can be attached, of at most six that contradict one another.
 
     Args:
         pairs: all pairs of the capture.
         images: positions of the images of the group.
         adjust: whether all cameras are adjusted as the model grows.
-        confirmation: consulted only where the pairs cannot decide between placements or between models.
+        confirmation: consulted only where the pairs cannot decide between placements.
     """
-    models: list[GrownModel] = []
+    models: list[tuple[PlacedModel, dict[int, str]]] = []
     tried: set[tuple[Edge, int]] = set()
-    while seeds := ranked_seeds(pairs, images, without=tried):
+    while len(models) < 6 and (seeds := ranked_seeds(pairs, images, without=tried)):
         edge, rank = seeds[0]
-        models.append(_grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation))
-        # A seed that agrees with this model would lead to the same model again.
-        tried |= {seeds[0], *models[-1].model.chosen.items()}
-        # Do not try seeds that no image can be attached to.
-        grown = sum(len(found.model.cameras) > 2 for found in models)
-        if models[-1].is_satisfactory() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
+        model, refused = _grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation)
+        models.append((model, refused))
+        if not refused or len(model.cameras) > 2:
             break
-    models.sort(key=GrownModel.rank)
-    if models and models[0].checks is not None and confirmation is not None:
-        # Move cameras to where the images confirm them best.
-        checks = correct_cameras(models[0].model, confirmation)
-        if checks.moved:
-            settle(models[0].model, adjust=adjust)
-        models[0] = replace(models[0], refused=models[0].refused | checks.removed, checks=checks)
-    return models
+        # A seed that agrees with this model would lead to the same model again.
+        tried |= {seeds[0], *model.chosen.items()}
+    return max(models, key=lambda found: len(found[0].cameras))
 
 
 def ranked_seeds(
@@ -139,7 +95,7 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
 
 def _grown(
     pairs: Pairs, images: Collection[int], edge: Edge, *, rank: int, adjust: bool, confirmation: Confirmation | None
-) -> GrownModel:
+) -> tuple[PlacedModel, dict[int, str]]:
     """Return the model that grows from a seed, and the reasons for images that could not be added."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
@@ -155,12 +111,7 @@ def _grown(
             left.add(image)
             reasons[image] = reason
     settle(model, adjust=adjust)
-    refused = {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
-    checks = None
-    # The images are not consulted if the model explains this share of the pairs.
-    if left or model.explained_share() < 0.97:
-        checks = check_cameras(model, confirmation)
-    return GrownModel(model, refused, checks)
+    return model, {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
 
 
 def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Confirmation | None) -> dict[int, str]:

@@ -56,7 +56,7 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
         return []
     models, _ = solved_models(pairs_of(features, _Selected(two_views, sequence)))
     found = []
-    for model in (one.model for one in models):
+    for model in models:
         model.adjust()
         order = sorted(model.cameras)
         steps = np.linalg.norm(np.diff([model.cameras[image].center for image in order], axis=0), axis=1)

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
+from pano_mvs.algorithms.poses.growth import grown_model, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
@@ -67,7 +67,7 @@ def solve_scaled_translation(
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
     models, reasons = solved_models(pairs, adjust=adjust, confirmation=confirmation)
-    groups = [_finished(grown, adjust=adjust) for grown in models]
+    groups = [_finished(model, adjust=adjust) for model in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
@@ -85,38 +85,33 @@ def solve_scaled_translation(
 
 def solved_models(
     pairs: Pairs, *, adjust: bool = True, confirmation: Confirmation | None = None
-) -> tuple[list[GrownModel], dict[int, str]]:
+) -> tuple[list[PlacedModel], dict[int, str]]:
     """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
     Images that could not be added to any model are tried as models of one camera when models are joined.
     """
-    grown: list[GrownModel] = []
+    grown: list[PlacedModel] = []
     reasons: dict[int, str] = {}
     waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
     while waiting:
-        grown.append(grown_models(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)[0])
-        refused = grown[-1].refused
+        model, refused = grown_model(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)
+        grown.append(model)
         reasons |= refused
         left = {edge for edge in pairs.geometries if edge[0] in refused and edge[1] in refused}
         waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
-    placed = {image for one in grown for image in one.model.cameras}
+    placed = {image for model in grown for image in model.cameras}
     alone = [PlacedModel(pairs, {image: Rigid3.identity()}) for image in range(len(pairs.names)) if image not in placed]
-    found: list[GrownModel] = []
-    for model, numbers in join_models([*(one.model for one in grown), *alone]) if grown else []:
+    found: list[PlacedModel] = []
+    for model, numbers in join_models([*grown, *alone]) if grown else []:
         if len(numbers) > 1:
             settle(model, adjust=adjust)
-            found.append(GrownModel(model, {}, check_cameras(model, confirmation)))
-        elif numbers[0] < len(grown):
-            found.append(grown[numbers[0]])
-    return sorted(found, key=lambda one: (-len(one.model.cameras), min(one.model.cameras))), reasons
+        if len(model.cameras) > 1:
+            found.append(model)
+    return sorted(found, key=lambda model: (-len(model.cameras), min(model.cameras))), reasons
 
 
-def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
-    """Return a finished model as poses of one group, with points."""
-    model = grown.model
+def _finished(model: PlacedModel, *, adjust: bool) -> Poses:
+    """Return a finished model as poses of one group, with points and with what its pairs say for its cameras."""
     if adjust:
         model.adjust()
-    poses = normalised_poses(poses_of(model))
-    if grown.checks is not None:
-        poses = with_camera_checks(poses, model.pairs, grown.checks)
-    return poses
+    return with_camera_checks(normalised_poses(poses_of(model)), model.pairs, check_cameras(model))

@@ -315,16 +315,6 @@ class PlacedModel:
         for edge in sorted(self.chosen):
             self._learn_ranges(edge)
 
-    def explained_share(self) -> float:
-        """Return the share of all pairs of registered images, by weight, that have a geometry that agrees."""
-        pairs = self.pairs.geometries
-        total = sum(found[0].weight for edge, found in pairs.items() if self.cameras.keys() >= {*edge})
-        return self.explained_weight() / total if total else 1.0
-
-    def explained_weight(self) -> float:
-        """Return the total weight of the geometries that agree with the cameras."""
-        return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
-
     def _learn_ranges(self, edge: Edge) -> None:
         """Use the ranges of a pair's matches where their parallax is larger than that of the known ranges."""
         first, second = edge

@@ -18,9 +18,6 @@ from pano_mvs.algorithms.poses.verification.contradictions import contradicted_p
 from pano_mvs.algorithms.poses.verification.joints import Joint, measured_joints
 from pano_mvs.geometry import Rigid3
 
-# Exponent of the share of explained pairs relative to the share of confirmed texture.
-PAIRS_POWER = 0.25
-
 
 @dataclass(eq=False)
 class CameraChecks:
@@ -72,13 +69,10 @@ def correct_cameras(
         _judge(model, confirmation, found)
 
 
-def check_cameras(model: PlacedModel, confirmation: Confirmation | None) -> CameraChecks:
-    """Return the evidence of the images, or of the pairs alone, for the cameras of a model, without changing it."""
-    found = CameraChecks(asked=confirmation is not None)
-    if confirmation is None:
-        found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
-    else:
-        _judge(model, confirmation, found)
+def check_cameras(model: PlacedModel) -> CameraChecks:
+    """Return the evidence of the pairs alone for the cameras of a model, without changing it."""
+    found = CameraChecks(asked=False)
+    found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
     _believe(model, found)
     return found
 
