@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.essential import essential_from_bearings
-from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver, Solver, draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.minimal_solvers import (
+    SOLVERS,
+    MinimalSolver,
+    Solver,
+    draw_samples,
+    essential_from_bearings,
+    samples_needed,
+)
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.arrays import FloatArray

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
-from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.algorithms.two_view.minimal_solvers import (
     SOLVERS,
     Solver,
@@ -27,7 +26,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_matches,
 )
 from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_of
-from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front
+from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front, sampson_angles
 
 
 def samples_of_five(
