@@ -44,8 +44,8 @@ def solve_scaled_translation(
     views that all see the first image to an unordered set. Starting from a seed pair, each image is placed by the
     rotations and directions of its pairs with registered images. The length of a translation is the one that puts
     points with known ranges at these ranges. All geometries of a pair are considered, not only the one with most
-    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses, or several
-    models, agree with the pairs about equally well, the images decide (see `Confirmation`).
+    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses agree with
+    the pairs about equally well, the images decide (see `Confirmation`).
 
     Args:
         features: key points by image name, in the capture's order.

@@ -364,7 +364,7 @@ def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: fl
                 rays = features[name].bearings @ truth[name].rotation
                 middle = np.array([-2.0 if room == "a" else 2.0, 0.0, 0.0])
                 reach = (np.sign(rays) * (1.9, 1.3, 2.0) + middle - truth[name].center) / rays
-                model.set_ranges(image, scale * reach.min(axis=1))
+                model.known_ranges(image)[:] = scale * reach.min(axis=1)
         found.append(model)
     return found
 

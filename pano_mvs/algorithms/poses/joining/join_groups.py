@@ -353,7 +353,7 @@ def joined_model(first: PlacedModel, second: PlacedModel, first_from_second: Sim
     for image, camera in second.cameras.items():
         center = first_from_second.apply(camera.center[None])[0]
         model.cameras[image] = Rigid3.from_center(camera.rotation @ turn.T, center)
-        model.set_ranges(image, scale * second.known_ranges(image))
+        model.known_ranges(image)[:] = scale * second.known_ranges(image)
     model.chosen |= second.chosen
     return model
 

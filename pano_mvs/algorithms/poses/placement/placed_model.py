@@ -128,10 +128,6 @@ class PlacedModel:
         """Return the ranges of all key points of an image, (N,), NaN where unknown; not a copy."""
         return self._ranges[image]
 
-    def set_ranges(self, image: int, ranges: FloatArray) -> None:
-        """Replace the ranges of all key points of an image, (N,)."""
-        self._ranges[image][:] = ranges
-
     def evidence(self, image: int, partners: Sequence[int] | None = None) -> PairEvidence:
         """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
