@@ -162,11 +162,7 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     evidence = without.evidence(image)
     pose = model.cameras[image]
     agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
-    _, support, known = without.polished(image, evidence, Placement(pose, agrees, 0.0))
-    agreeing = len(set(evidence.partner[agrees].tolist()))
-    if support >= points_needed(known, agreeing=agreeing):
-        return ""
-    return _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
+    return _polished(without, image, evidence, placement=Placement(pose, agrees, 0.0))[1]
 
 
 def _next(
@@ -217,12 +213,21 @@ def _accepted(
     model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement, reasons: dict[int, str]
 ) -> Rigid3 | None:
     """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
+    pose, why = _polished(model, image, evidence, placement=placement)
+    if why:
+        reasons[image] = why
+    return None if why else pose
+
+
+def _polished(model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement) -> tuple[Rigid3, str]:
+    """Return the refined pose of a placement, and why it is refused if too few known points support it."""
     pose, support, known = model.polished(image, evidence, placement)
     agreeing = len(set(evidence.partner[placement.explained].tolist()))
     if support >= points_needed(known, agreeing=agreeing):
-        return pose
-    reasons[image] = _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
-    return None
+        return pose, ""
+    pairs, partner = model.pairs, model.pairs.partners[image][0]
+    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
+    return pose, why_refused(support, known, agreeing=agreeing, partner=pairs.names[partner], matches=count)
 
 
 def settle(model: PlacedModel, *, adjust: bool) -> None:
@@ -238,9 +243,3 @@ def why_nothing(model: PlacedModel, image: int) -> str:
     if any(idx in model.cameras for idx in model.pairs.partners[image]):
         return "no pair with a registered image shares enough points with a third image to determine the distance"
     return "its pairs are all with images that could not be registered"
-
-
-def _why_refused(pairs: Pairs, image: int, support: int, *, known: int, agreeing: int) -> str:
-    partner = pairs.partners[image][0]
-    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return why_refused(support, known, agreeing=agreeing, partner=pairs.names[partner], matches=count)
