@@ -127,8 +127,8 @@ def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
         return None
     best = max(certain, key=lambda joint: joint.strength)
     # Where structure repeats, an alignment with another, similar place has matches of its own.
-    others = matches[np.flatnonzero(~best.alignment.inliers)]
-    rest = align_models(others, hypotheses=hypotheses, known=known, has_scale=has_scale)
+    unexplained = matches[np.flatnonzero(~best.alignment.inliers)]
+    rest = align_models(unexplained, hypotheses=hypotheses, known=known, has_scale=has_scale)
     rivals = [
         *certain,
         *(_Joint(other, _evidence_of_pairs(other, first, second, views=views), learned) for other in rest[:1]),
