@@ -25,7 +25,7 @@ def grown_model(
 ) -> tuple[PlacedModel, dict[int, str]]:
     """Return a model of a connected group of images, and why images of the group could not be added to it.
 
-    It grows from the best seed to which any image can be attached, of at most six that contradict one another.
+    It grows from the best seed or, if no image can be attached to this, from the best one that contradicts it.
 
     Args:
         pairs: all pairs of the capture.
@@ -35,7 +35,7 @@ def grown_model(
     """
     models: list[tuple[PlacedModel, dict[int, str]]] = []
     tried: set[tuple[Edge, int]] = set()
-    while len(models) < 6 and (seeds := ranked_seeds(pairs, images, without=tried)):
+    while len(models) < 2 and (seeds := ranked_seeds(pairs, images, without=tried)):
         edge, rank = seeds[0]
         model, refused = _grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation)
         models.append((model, refused))
