@@ -8,7 +8,7 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.placement.places import Placement, agreement
+from pano_mvs.algorithms.poses.placement.places import Placement
 from pano_mvs.algorithms.poses.placement.resection import points_needed, why_refused
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
@@ -101,15 +101,6 @@ def _grown(
     model.seed(edge, rank)
     left = set(images) - set(edge)
     reasons = extend(model, left, adjust=adjust, confirmation=confirmation)
-    for image in edge:
-        if image in model.cameras and (reason := _unsupported(model, image)):
-            for other in model.held_by([image]):
-                model.remove(other)
-                left.add(other)
-                reasons[other] = "its pairs are all with images that could not be registered"
-            model.remove(image)
-            left.add(image)
-            reasons[image] = reason
     settle(model, adjust=adjust)
     return model, {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
 
@@ -150,19 +141,6 @@ def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Co
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     return reasons
-
-
-def _unsupported(model: PlacedModel, image: int) -> str:
-    """Return why an unchecked camera of the seed does not fit the other cameras; "" if it does."""
-    if len(model.cameras) < 4:
-        return ""
-    without = model.copy()
-    without.remove(image)
-    without.learn_ranges()
-    evidence = without.evidence(image)
-    pose = model.cameras[image]
-    agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
-    return _polished(without, image, evidence, placement=Placement(pose, agrees, 0.0))[1]
 
 
 def _next(
