@@ -15,8 +15,7 @@ from pano_mvs.algorithms.learned.networks import Networks
 from pano_mvs.algorithms.learned.photographs import PhotographView, match_photograph, view_of_photograph
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
+from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints, LocatedPanoramas
 from pano_mvs.api import (
     All,
     Context,

@@ -14,10 +14,7 @@ from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
-_CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
-_CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
-_RIVALS = 2
+_CLEAR_WITH_IMAGES = 0.4  # a placement is in doubt if the runner-up has more than this share of the best score
 
 
 def grown_model(
@@ -154,10 +151,18 @@ def _next(
         confirmation: decides between rival placements by the images; None if the pairs alone decide.
         reasons: receives why an image cannot be added yet.
     """
+
+    def accepted(image: int, evidence: PairEvidence, placement: Placement) -> Rigid3 | None:
+        pose, why = _polished(model, image, evidence, placement=placement)
+        if why:
+            reasons[image] = why
+        return None if why else pose
+
     order = sorted(weights, key=lambda idx: (-weights[idx], idx))
-    for first in range(0, len(order), _LOOKED_AT):
+    # Six images are placed before the clearest of them is added, if none is clear by itself.
+    for first in range(0, len(order), 6):
         doubtful: list[tuple[float, int, PairEvidence, list[Placement]]] = []
-        for image in order[first : first + _LOOKED_AT]:
+        for image in order[first : first + 6]:
             evidence, found = model.place(image)
             if not found:
                 reasons[image] = why_nothing(model, image)
@@ -165,13 +170,13 @@ def _next(
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
             # Share of an image's pairs, by weight, that must agree with a clear placement.
-            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
-            if clear and (pose := _accepted(model, image, evidence, placement=found[0], reasons=reasons)):
+            clear = rival < (0.8 if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
+            if clear and (pose := accepted(image, evidence, found[0])):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))
         for _, image, evidence, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
             for placement in _by_images(model, image, found, confirmation=confirmation):
-                if pose := _accepted(model, image, evidence, placement=placement, reasons=reasons):
+                if pose := accepted(image, evidence, placement):
                     return image, pose
     return None
 
@@ -180,21 +185,11 @@ def _by_images(
     model: PlacedModel, image: int, found: list[Placement], *, confirmation: Confirmation | None
 ) -> list[Placement]:
     """Return placements in the order in which to try them; the images decide between rivals."""
-    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
+    rivals = [placement for placement in found[:2] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
     if confirmation is None or len(rivals) < 2:
-        return found[:_RIVALS]
+        return found[:2]
     shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
     return [rivals[idx] for idx in np.argsort(-np.nan_to_num(shares), kind="stable")]
-
-
-def _accepted(
-    model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement, reasons: dict[int, str]
-) -> Rigid3 | None:
-    """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
-    pose, why = _polished(model, image, evidence, placement=placement)
-    if why:
-        reasons[image] = why
-    return None if why else pose
 
 
 def _polished(model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement) -> tuple[Rigid3, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,13 +48,12 @@ def find_false_closures(features: Mapping[str, Features], two_views: Mapping[Pai
     # Captures are tested that have this number of images, in which most consecutive images are paired, valid or not …
     if len(place) < 20 or not is_path(two_views) or all(map(is_near, two_views)):
         return []
-    # Views are read one by one, because those of a large capture do not fit into memory.
     valid = [pair for pair, view in two_views.items() if view]
     sequence = [pair for pair in valid if is_near(pair)]
     # … and by valid pairs, most of which are in sequence.
     if len(sequence) == len(valid) or not is_path(sequence) or len(sequence) < 0.5 * len(valid):
         return []
-    models, _ = solved_models(pairs_of(features, _Selected(two_views, sequence)))
+    models, _ = solved_models(pairs_of(features, {pair: two_views[pair] for pair in sequence}))
     found = []
     for model in models:
         model.adjust()
@@ -81,22 +80,3 @@ def _points(model: PlacedModel, image: int, keypoints: NDArray[np.int32]) -> Flo
     """Return some key points of an image in the world, (M, 3), NaN where unknown."""
     camera, rays = model.cameras[image], model.pairs.bearings[image][keypoints]
     return camera.center + model.known_ranges(image)[keypoints, None] * (rays @ camera.rotation)
-
-
-class _Selected(Mapping[Pair, TwoView]):
-    """Some of the pairs, which are read on access."""
-
-    def __init__(self, two_views: Mapping[Pair, TwoView], pairs: Collection[Pair]) -> None:
-        self._two_views = two_views
-        self._pairs = dict.fromkeys(pairs)
-
-    def __getitem__(self, pair: Pair) -> TwoView:
-        if pair not in self._pairs:
-            raise KeyError(pair)
-        return self._two_views[pair]
-
-    def __iter__(self) -> Iterator[Pair]:
-        return iter(self._pairs)
-
-    def __len__(self) -> int:
-        return len(self._pairs)

@@ -21,8 +21,6 @@ from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, si
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 
-BoolArray = NDArray[np.bool_]
-
 _TWINS = 16  # number of samples among the matches of a known geometry
 _PEAKS = 6  # number of candidates of each kind that are refined
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
@@ -34,7 +32,7 @@ class _Geometry:
     """A relative pose, and which matches agree with it, (M,)."""
 
     pose: Rigid3
-    agreeing: BoolArray
+    agreeing: NDArray[np.bool_]
 
 
 def distinct_geometries(
@@ -169,7 +167,7 @@ class _Search:
         return refined_on_agreeing(pose, p, q, thresholds_rad=bands, max_iterations=6)[0]
 
     def _significant(
-        self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, *, needed: float
+        self, geometry: _Geometry, known: Sequence[_Geometry], searched: NDArray[np.bool_], *, needed: float
     ) -> bool:
         turn = min(float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known)
         # Two matches determine the direction if the rotation is known.
@@ -188,7 +186,7 @@ class _Search:
         return false_alarms <= MAX_LOG10_FALSE_ALARMS
 
 
-def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray) -> bool:
+def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: NDArray[np.bool_]) -> bool:
     """Return whether a geometry differs from all known ones, and is not one of them adapted to a few more matches."""
     mostly_own = 2 * (geometry.agreeing & searched).sum() > geometry.agreeing.sum()
     for other in known:

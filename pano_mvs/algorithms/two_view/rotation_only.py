@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import angle_between, nearest_rotation
 
-_SAMPLES = 200
-
 
 def estimate_rotation(
     first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
@@ -26,7 +24,7 @@ def estimate_rotation(
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import best_turn
 
-    samples = rng.integers(len(first), size=(_SAMPLES, 2))
+    samples = rng.integers(len(first), size=(200, 2))
     rotation = np.eye(3)
     squared_chord = (2 * np.sin(threshold_rad / 2)) ** 2
     best_turn(np.ascontiguousarray(first), np.ascontiguousarray(second), samples, squared_chord, rotation)

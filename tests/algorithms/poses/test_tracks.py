@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, triangulate_tracks
+from pano_mvs.algorithms.poses.adjustment.tracks import (
+    Tracks,
+    build_tracks,
+    triangulate_observations,
+    triangulate_tracks,
+)
 from pano_mvs.algorithms.poses.placement.pair_evidence import estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups, consistent_edges
 from pano_mvs.core.errors import UsageError

@@ -251,14 +251,13 @@ class _Layout:
         return _Layout(starts, width, tangent_basis(bundle.bearings), bundle.origins)
 
 
-def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
+def reduced_cameras(
+    bundle: Bundle, weights: FloatArray, *, damping: float, layout: _Layout | None = None
+) -> ReducedCameras:
     """Return the reduced camera system of a weighted bundle; points are damped, cameras are not."""
-    return _reduced_cameras(bundle, _Layout.of(bundle), weights, damping=damping)
-
-
-def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float) -> ReducedCameras:
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import reduced_system
 
+    layout = layout or _Layout.of(bundle)
     return ReducedCameras(
         *reduced_system(
             bundle.rotations,
@@ -281,7 +280,7 @@ def _step(
     """Return the bundle after one damped step."""
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import moved_points
 
-    system = _reduced_cameras(bundle, layout, weights, damping=damping)
+    system = reduced_cameras(bundle, weights, damping=damping, layout=layout)
     if bundle.lengths is not None:
         bundle.lengths.add_to(system, bundle.centers, scale_rad=scale_rad)
     # The small constant keeps a camera without observations in place.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Lengths, Loss, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_tracks
-from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
+from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.uncertainty import (
     OffsetScale,
     camera_deviations,

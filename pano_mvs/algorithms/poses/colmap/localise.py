@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
+from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
@@ -203,7 +203,9 @@ class _Search:
         found = pycolmap.estimate_absolute_pose(matches.pixels_px, matches.points_in_world, camera, estimation)
         if found is None:
             return None
-        return PhotographCamera(_rigid(found["cam_from_world"]), float(camera.params[0]), 0.0)
+        pose = found["cam_from_world"]
+        cam_from_world = Rigid3(pose.rotation.matrix(), np.array(pose.translation))
+        return PhotographCamera(cam_from_world, float(camera.params[0]), 0.0)
 
     def refined(self, matches: _Matches, camera: PhotographCamera) -> PhotographCamera:
         """Return the camera with the smallest errors of its inliers."""
@@ -244,10 +246,6 @@ class _Search:
         """Return whether patches left the camera about where key points had put it."""
         turn = geodesic_angle(camera.cam_from_world.rotation, aligned.cam_from_world.rotation)
         return bool(turn < np.radians(2.0)) and _FOV_BOUNDS_DEG[0] < aligned.fov_deg(self.size_hw) < _FOV_BOUNDS_DEG[1]
-
-
-def _rigid(pose: Any) -> Rigid3:
-    return Rigid3(pose.rotation.matrix(), np.array(pose.translation))
 
 
 def _matches(

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
-from pano_mvs.algorithms.poses.adjustment.points import Triangulated, triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
+from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, Triangulated, build_tracks, triangulate_observations
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,

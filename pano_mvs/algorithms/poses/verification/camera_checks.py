@@ -51,7 +51,13 @@ def correct_cameras(
     """
     found = CameraChecks()
     _judge(model, confirmation, found)
-    suspects = _suspects(found)
+    ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
+    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest. If no
+    # more than a tenth can be expected to be confirmed, nothing can be concluded.
+    suspects = sorted(
+        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > 0.1),
+        key=lambda image: (ratios[image], image),
+    )
     trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
     if len(trusted) < 2:
         trusted = dict(model.cameras)
@@ -103,17 +109,6 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: CameraChecks) 
             evidence[image] = confirmation.evidence(image, model.cameras[image], model.cameras)
     found.shares = {image: own.share for image, own in evidence.items()}
     found.expected = {image: expected_of(image) for image in evidence}
-
-
-def _suspects(found: CameraChecks) -> list[int]:
-    """Return the images that confirm much less than expected, worst first."""
-    ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
-    # A camera is tried at other poses if its images confirm less than this share of what its neighbours suggest. If no
-    # more than a tenth can be expected to be confirmed, nothing can be concluded.
-    return sorted(
-        (image for image, ratio in ratios.items() if ratio < 0.75 and found.expected[image] > 0.1),
-        key=lambda image: (ratios[image], image),
-    )
 
 
 def _better_place(

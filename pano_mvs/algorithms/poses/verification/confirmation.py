@@ -163,7 +163,12 @@ class Confirmation:
         known = self._maps.setdefault((image, *sources), [])
         self._maps.move_to_end((image, *sources))
         for before, before_scale, ranges in known:
-            if all(_nearly(a, scale, b, other_scale=before_scale) for a, b in zip(relative, before, strict=True)):
+            # Nearly the same for a sweep at 256 columns.
+            if all(
+                np.linalg.norm(a.translation / scale - b.translation / before_scale) < 0.005
+                and geodesic_angle(a.rotation, b.rotation) < np.deg2rad(0.1)
+                for a, b in zip(relative, before, strict=True)
+            ):
                 return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
         ranges = self._sweep(image, sources, relative)
         known.append((relative, scale, ranges))
@@ -205,12 +210,6 @@ def _confirmed(
         min_support=0.5,
         min_motion_rad=0.05 * px_rad,
     )[0]
-
-
-def _nearly(pose: Rigid3, scale: float, other: Rigid3, *, other_scale: float) -> bool:
-    """Return whether two relative poses, each in its own unit, are equivalent for a sweep at 256 columns."""
-    moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
-    return moved < 0.005 and float(geodesic_angle(pose.rotation, other.rotation)) < np.deg2rad(0.1)
 
 
 @contextmanager
