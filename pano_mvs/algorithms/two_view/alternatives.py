@@ -176,7 +176,7 @@ class _Search:
             geometry.pose,
             self.first[searched],
             self.second[searched],
-            geometry.agreeing[searched],
+            agreeing=geometry.agreeing[searched],
             rng=self.rng,
             threshold_rad=self.threshold_rad,
             fewest=needed,

@@ -279,7 +279,7 @@ class _Pair:
             pose,
             self.p,
             self.q,
-            inliers,
+            agreeing=inliers,
             rng=self.rng,
             threshold_rad=self.threshold_rad,
             fewest=sample + 1,
