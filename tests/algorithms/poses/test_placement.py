@@ -111,6 +111,18 @@ def test_the_world_may_be_turned_moved_and_scaled(size: float) -> None:
         np.testing.assert_array_equal(other.explained, one.explained)
 
 
+def test_rays_cross_where_no_length_is_known() -> None:
+    found = placements(evidence_of([Says(partner, length_known=False) for partner in range(3)]))
+    assert_same_pose(found[0].cam_from_world, TRUTH)
+    assert found[0].explained.all()
+
+
+def test_rays_do_not_cross_behind_a_partner() -> None:
+    """Both point away from where their lines meet."""
+    evidence = evidence_of([Says(0, length_known=False), Says(1, length_known=False)])
+    assert placements(replace(evidence, directions=-evidence.directions)) == []
+
+
 def test_a_known_length_places_an_image_alone() -> None:
     (found,) = placements(evidence_of([Says(0)]))
     assert_same_pose(found.cam_from_world, TRUTH)
@@ -121,10 +133,10 @@ def test_a_known_length_places_an_image_alone() -> None:
     [
         pytest.param([], id="no evidence"),
         pytest.param([Says(0, length_known=False)], id="one ray"),
-        pytest.param([Says(0, length_known=False), Says(1, length_known=False)], id="two rays"),
+        pytest.param([Says(0, length_known=False), Says(0, FALSE, length_known=False)], id="two rays of one partner"),
     ],
 )
-def test_nothing_is_placed_without_a_length(said: list[Says]) -> None:
+def test_nothing_is_placed_by_less_than_a_length_or_two_rays(said: list[Says]) -> None:
     assert placements(evidence_of(said)) == []
 
 

@@ -24,15 +24,14 @@ class Placement:
 def placements(evidence: PairEvidence) -> list[Placement]:
     """Return the distinct poses that the geometries suggest, best score first.
 
-    Each geometry with a known length suggests a pose. Each candidate is scored by all geometries, counting at most one
-    per partner: a geometry agrees with a pose that has its rotation, lies in its direction and, if its length is known,
-    at its distance. The best candidates are refined on the geometries that agree with them (weighted least squares of
-    the angles to the rays) and scored again. This is translation averaging for one camera at a time with several
-    hypotheses per pair, in which a false geometry of a repeated structure is outweighed however many matches it has.
+    Each geometry with a known length suggests a pose, and so do two intersecting rays. Each candidate is scored by all
+    geometries, counting at most one per partner: a geometry agrees with a pose that has its rotation, lies in its
+    direction and, if its length is known, at its distance. The best candidates are refined on the geometries that agree
+    with them (weighted least squares of the angles to the rays) and scored again. This is translation averaging for one
+    camera at a time with several hypotheses per pair, in which a false geometry of a repeated structure is outweighed
+    however many matches it has.
     """
-    known = np.isfinite(evidence.lengths)
-    rotations = evidence.rotations[known]
-    centers = evidence.origins[known] + evidence.lengths[known, None] * evidence.directions[known]
+    rotations, centers = _candidates(evidence)
     if not len(centers):
         return []
     # A candidate from a single chain has the error of its length, so directions are compared with more tolerance at
@@ -88,6 +87,40 @@ def agreement(
         (angles < evidence.tolerance_rad + loose_rad) & (turned < float(np.deg2rad(2.0))) & fits & (distances > 0)
     )
     return agrees
+
+
+def _candidates(evidence: PairEvidence) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (C, 3, 3) and centres (C, 3) suggested by single chains and by intersecting rays."""
+    known = np.flatnonzero(np.isfinite(evidence.lengths))
+    rotations = [evidence.rotations[known]]
+    centers = [evidence.origins[known] + evidence.lengths[known, None] * evidence.directions[known]]
+    open_ended = np.flatnonzero(np.isnan(evidence.lengths))
+    if len(open_ended):
+        # Number of geometries without known length whose rays are intersected.
+        heaviest = np.argsort(-evidence.weight, kind="stable")[:8]
+        for a in heaviest:
+            for b in heaviest:
+                if evidence.partner[a] < evidence.partner[b] and (a in open_ended or b in open_ended):
+                    crossing = _crossing(evidence, a, b)
+                    if crossing is not None:
+                        rotations.append(evidence.rotations[a][None])
+                        centers.append(crossing[None])
+    return np.concatenate(rotations), np.concatenate(centers)
+
+
+def _crossing(evidence: PairEvidence, a: np.intp, b: np.intp) -> FloatArray | None:
+    """Return the midpoint of two rays at their closest approach, if it is in front of both."""
+    u, v = evidence.directions[a], evidence.directions[b]
+    gap = evidence.origins[b] - evidence.origins[a]
+    normal = np.cross(u, v)
+    squared = float(normal @ normal)
+    if squared < float(np.sin(np.deg2rad(5.0))) ** 2:
+        return None
+    along_u, along_v = float(np.cross(gap, v) @ normal) / squared, float(np.cross(gap, u) @ normal) / squared
+    if along_u <= 0 or along_v <= 0:
+        return None
+    point: FloatArray = 0.5 * (evidence.origins[a] + along_u * u + evidence.origins[b] + along_v * v)
+    return point
 
 
 def _refined(evidence: PairEvidence, agree: NDArray[np.bool_], center: FloatArray) -> Rigid3:
