@@ -33,7 +33,7 @@ from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, tr
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.stitching import lens_panorama
 from pano_mvs.algorithms.two_view.cheirality import agreement
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import InputError, UsageError

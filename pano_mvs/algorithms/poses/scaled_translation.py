@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
+from pano_mvs.algorithms.poses.frame.gauge import no_poses, normalised_poses
 from pano_mvs.algorithms.poses.growth import grown_model, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
 from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
@@ -73,13 +73,7 @@ def solve_scaled_translation(
         for image, name in enumerate(names)
     }
     if not groups:
-        return Poses.without_points(
-            {},
-            rejected=rejected,
-            frame="the first registered camera",
-            scale="none: no image is registered",
-            metric=False,
-        )
+        return no_poses(rejected)
     return join_groups(groups, order=names, rejected=rejected)
 
 

@@ -1,4 +1,4 @@
-"""Robust estimation of the essential matrix on the sphere: MSAC with local optimisation."""
+"""Robust estimation of the essential matrix on the sphere: MSAC with local optimisation; and of a rotation alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
@@ -216,3 +216,30 @@ class _Search:
 
     def _residuals(self, pose: Rigid3) -> FloatArray:
         return agreement(pose, self.first, self.second, threshold_rad=self.threshold_rad)[0]
+
+
+def estimate_rotation(
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Estimate second_from_first's rotation, (3, 3), without translation, and its inliers, (M,).
+
+    Two-point samples, then the least-squares rotation of the inliers (Kabsch).
+
+    Args:
+        first: (M, 3) unit bearings, M ≥ 2.
+        second: (M, 3) unit bearings.
+        rng: draws the samples.
+        threshold_rad: maximum angle between the rotated and the observed ray of an inlier.
+    """
+    from pano_mvs.algorithms.two_view.kernels_agreement import best_turn
+
+    samples = rng.integers(len(first), size=(200, 2))
+    rotation = np.eye(3)
+    squared_chord = (2 * np.sin(threshold_rad / 2)) ** 2
+    best_turn(np.ascontiguousarray(first), np.ascontiguousarray(second), samples, squared_chord, rotation)
+    for _ in range(4):
+        inliers = angle_between(first @ rotation.T, second) < threshold_rad
+        if inliers.sum() < 2:
+            break
+        rotation = nearest_rotation(second[inliers].T @ first[inliers])
+    return rotation, angle_between(first @ rotation.T, second) < threshold_rad

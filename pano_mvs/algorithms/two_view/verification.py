@@ -22,10 +22,9 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     weight_of_learned,
 )
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
-from pano_mvs.algorithms.two_view.ransac import estimate_two_view
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation, estimate_two_view
 from pano_mvs.algorithms.two_view.redirection import upright_poses
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose, refined_on_agreeing
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, independent_count, significance_of_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings

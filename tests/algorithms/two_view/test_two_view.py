@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.minimal_solvers import essential_from_bearings
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import _linearised, pose_uncertainty, tangent_basis
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import independent_count, log10_false_alarms
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, rotation_from_rotvec, skew
