@@ -15,8 +15,7 @@ from pano_mvs.algorithms.learned.networks import Networks
 from pano_mvs.algorithms.learned.photographs import PhotographView, match_photograph, view_of_photograph
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
+from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints, LocatedPanoramas
 from pano_mvs.api import (
     All,
     Context,
@@ -48,7 +47,8 @@ _BLOCK = 32
 
 def localise_memory_bytes(params: Params, inputs: Mapping[str, Any]) -> int:
     """Return the memory for a block of photographs and the panoramas in memory, of 8000 key points (the default)."""
-    candidates, count = _candidates(params), len(inputs["ranges"])
+    assert isinstance(params, LocaliseParams)
+    candidates, count = params.candidates, len(inputs["ranges"])
     photographs = _BLOCK if 0 < candidates < count else 1
     kept = LocatedPanoramas.kept(candidates, count)
     return 900_000_000 + 7_000_000 * photographs + 6_000_000 * kept
@@ -59,6 +59,9 @@ class LocaliseParams(NetworkParams):
     """Settings of poses.localise."""
 
     path: InputPath = Field(description="folder of photographs, or one photograph")
+    candidates: int = Field(
+        default=20, ge=0, description="number of most similar panoramas to match each photograph with; 0: all"
+    )
     min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of ranges (128: consistent)")
 
     @field_validator("path")
@@ -94,7 +97,7 @@ def localise(
         features,
         ranges,
         min_confidence=params.min_confidence,
-        candidates=_candidates(params),
+        candidates=params.candidates,
     )
     if not panoramas:
         ctx.note("no panorama has both a range map and SIFT key points (features.sift_tangent)")
@@ -112,11 +115,6 @@ def localise(
     ctx.note(f"{len(found)} of {len(paths)} photographs were localised")
     ctx.metric("localised", len(found) / max(1, len(paths)))
     return _record(found, rejected, named, ctx=ctx)
-
-
-def _candidates(params: Params) -> int:
-    candidates: int = arguments_from(localise_photograph, params)["candidates"]
-    return candidates
 
 
 class _Found(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment.bundle import Bundle
-from pano_mvs.algorithms.poses.adjustment.points import ROUNDS, Triangulated
+from pano_mvs.algorithms.poses.adjustment.tracks import Triangulated
 from pano_mvs.core.arrays import FloatArray, IndexArray
 from pano_mvs.geometry import pixel_from_ray, rotation_from_rotvec
 
@@ -120,7 +120,7 @@ def triangulate_numpy(
 ) -> Triangulated:
     """Return the points of tracks; the worst observation of a track goes until all that remain fit."""
     used = np.ones(len(point_idx), np.bool_)
-    for _ in range(ROUNDS):
+    for _ in range(8):
         points, valid = _solve(centers, rays_in_world, point_idx, used, count=count, min_angle_rad=min_angle_rad)
         errors = _errors(centers, rays_in_world, points[point_idx], valid[point_idx])
         bad = used & valid[point_idx] & (errors > max_error_rad)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.algorithms.two_view.refinement import _linearised, tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
@@ -15,6 +14,48 @@ from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
 BoolArray = NDArray[np.bool_]
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the spherical Sampson error |e| / √(|E p|² + |Eᵀ q|² − 2 e²), e = qᵀ E p, in radians.
+
+    To first order this is the total angle by which the two rays must move to intersect.
+
+    Args:
+        essentials: (..., 3, 3) essential matrices E = [t]× R of second_from_first, of any scale.
+        first: (M, 3) unit bearings p in the first image.
+        second: (M, 3) unit bearings q in the second.
+
+    Returns:
+        (..., M); zero if both rays lie on the baseline.
+    """
+    flat = essentials.reshape(-1, 3, 3)
+    # Three matrix products replace a loop: e is linear in E, the squared lengths in EᵀE and EEᵀ.
+    algebraic = flat.reshape(-1, 9) @ _products(second, first).T
+    squares = _symmetric(np.swapaxes(flat, 1, 2) @ flat) @ _quadratics(first).T
+    squares += _symmetric(flat @ np.swapaxes(flat, 1, 2)) @ _quadratics(second).T
+    squared = algebraic**2
+    squares -= 2 * squared
+    residuals = np.sqrt(squared / np.maximum(squares, 1e-300))
+    return residuals.reshape(*essentials.shape[:-2], len(first))
+
+
+def _products(second: FloatArray, first: FloatArray) -> FloatArray:
+    """Return the coefficients of E's nine entries in qᵀ E p, (..., M, 9)."""
+    return (second[..., :, None] * first[..., None, :]).reshape(*first.shape[:-1], 9)
+
+
+def _quadratics(vectors: FloatArray) -> FloatArray:
+    """Return the coefficients of a symmetric matrix's six entries in vᵀ S v, (M, 6)."""
+    x, y, z = vectors.T
+    return np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z], axis=1)
+
+
+def _symmetric(matrices: FloatArray) -> FloatArray:
+    """Return the six entries of symmetric matrices in the order of `_quadratics`, (N, 6)."""
+    rows, columns = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+    entries: FloatArray = matrices[:, rows, columns]
+    return entries
 
 
 def poses_from_essential(essential: FloatArray) -> list[Rigid3]:

@@ -19,6 +19,7 @@ from scipy import fft
 
 from pano_mvs.algorithms.faces.layout import face_corners
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
@@ -141,9 +142,6 @@ _PATCH_RADIUS = 15  # number of cells from the centre to the farthest test
 _TESTS = 256
 _MARGIN = 32  # at least _CLEARANCE lattice steps, stretched by 1.42, starting 5 cells beyond a face
 _CLEARANCE = 18  # number of cells around a corner that must not be masked: its patch, and the support of the smoothing
-# Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
-_ANTIALIAS, _CORNER_SIGMA = 0.5, 0.65
-_WINDOW_SIGMA = 1.0
 _PATCH_SIGMA = 2.0
 
 
@@ -192,7 +190,8 @@ def extract_sphorb(
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grids = grid_pyramid(image.shape[1], levels)
     scales = np.array([grids[0].steps / grid.steps for grid in grids])
-    sigmas_px = np.sqrt(_ANTIALIAS**2 * (scales**2 - 1) + (_CORNER_SIGMA * scales) ** 2)
+    # Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
+    sigmas_px = np.sqrt(0.5**2 * (scales**2 - 1) + (0.65 * scales) ** 2)
     pictures = [grid.sample(smoothed) for grid, smoothed in zip(grids, smooth_panorama(gray, sigmas_px), strict=True)]
     found = [_detect(p, g, threshold=fast_threshold) for p, g in zip(pictures, grids, strict=True)]
     if not mask.all():
@@ -287,19 +286,17 @@ def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners
 def _record(
     image: NDArray[np.uint8], chosen: list[_Corners], descriptors: NDArray[np.uint8], *, sizes_rad: NDArray[np.float32]
 ) -> Features:
-    height, width = image.shape[:2]
     bearings = np.concatenate([c.bearings for c in chosen])
     scores = np.concatenate([c.responses for c in chosen])
     order = np.argsort(-scores, kind="stable")
-    x, y = np.floor(pixel_from_ray(bearings[order], (height, width))).astype(np.intp).T
     return Features(
         bearings=bearings[order],
         descriptors=descriptors[order],
         sizes_rad=sizes_rad[order],
         scores=scores[order],
-        colors_rgb=image[np.clip(y, 0, height - 1), x % width],
+        colors_rgb=image[pixels_containing(bearings[order], image.shape[:2])],
         metric="hamming",
-        size_hw=(height, width),
+        size_hw=(image.shape[0], image.shape[1]),
     )
 
 
@@ -331,7 +328,7 @@ def _harris_window() -> tuple[NDArray[np.int64], FloatArray]:
     rings = [np.zeros((1, 2), np.int64), *(hexagon_ring(r) for r in range(1, 3))]
     window = np.concatenate(rings)
     squared = np.sum(plane_from_lattice(window) ** 2, axis=1)
-    return window, np.exp(-0.5 * squared / _WINDOW_SIGMA**2) / 255**2
+    return window, np.exp(-0.5 * squared) / 255**2
 
 
 @cache

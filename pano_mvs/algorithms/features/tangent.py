@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.faces.layout import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE = 1.2
-# Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
-# slide.
-_SIFT_EDGE_RATIO = 20
 # Distance from masked pixels, in key point sizes: SIFT's patch extends three sizes from its centre, with decreasing
 # weights, with less than a quarter of the weight beyond this distance; ORB's extends half a size plus a tenth for
 # smoothing.
@@ -170,8 +168,7 @@ def _extract(
     scores = np.concatenate([f.scores for f in found])
     descriptors = np.concatenate([f.descriptors for f in found])
     pixel_rad = 2 * np.pi / size_hw[1]
-    x, y = np.floor(pixel_from_ray(bearings, size_hw)).astype(np.intp).T
-    x, y = x % size_hw[1], np.clip(y, 0, size_hw[0] - 1)
+    y, x = pixels_containing(bearings, size_hw)
     keep = np.flatnonzero(mask[y, x])
     keep = keep[distinct_keypoints(bearings[keep], scores[keep], radius_rad=0.5 * pixel_rad)]
     keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]
@@ -228,10 +225,9 @@ def _sizes_and_scores(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.flo
 
 def sift_detector(contrast_threshold: float = 0.004) -> cv2.SIFT:
     """Return OpenCV's detector with the settings of `extract_sift`."""
-    # Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
-    return cv2.SIFT.create(
-        contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
-    )
+    # Twice the usual edge ratio: on plain walls many key points are on edges, and geometric verification rejects those
+    # that slide. Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
+    return cv2.SIFT.create(contrastThreshold=contrast_threshold, edgeThreshold=20, enable_precise_upscale=True)
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -29,12 +29,11 @@ from pano_mvs.algorithms.lens_calibration.adjustment import (
 )
 from pano_mvs.algorithms.lens_calibration.circles import ImageCircle, brightest, find_circle
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
+from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, triangulate_observations
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.stitching import lens_panorama
 from pano_mvs.algorithms.two_view.cheirality import agreement
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.arrays import FloatArray, Picture
 from pano_mvs.core.errors import InputError, UsageError

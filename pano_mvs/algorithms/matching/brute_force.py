@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.matching.nearest_two import can_compare_as_integers, nearest_two, nearest_two_integers
+from pano_mvs.algorithms.matching.nearest_two import Comparable
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
@@ -52,8 +52,7 @@ def match_l2(
     first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float = 0.8, mutual: bool = True
 ) -> NDArray[np.int32]:
     """Match descriptors, (N, D) and (M, D), by Euclidean distance; see `match_features`."""
-    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
-    found = nearest_two_integers(first, second) if whole else nearest_two(first, second)
+    found = Comparable(first).nearest_two(Comparable(second))
     kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)
     if mutual:
         kept &= found.squared <= found.squared_back[found.nearest]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
-
 _BLOCK_ROWS = 256
 
 
@@ -71,19 +69,19 @@ def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
     return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
 
 
-def nearest_two_integers(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
-    """Return the two nearest neighbours of each descriptor by Euclidean distance, like `nearest_two`, without rounding.
+class Comparable:
+    """Descriptors (N, D), packed once for many exact comparisons if they and the machine allow these."""
 
-    Args:
-        first: (N, D) integers for which `can_compare_as_integers` is true.
-        second: (M, D) likewise, M at least 2.
+    def __init__(self, descriptors: NDArray[np.generic]) -> None:
+        self.descriptors = descriptors
+        whole = descriptors.size > 0 and can_compare_as_integers(descriptors)
+        self._packed = PackedDescriptors.of(descriptors) if whole else None
 
-    Raises:
-        UsageError: if there are fewer than two to choose from, or the descriptors are unsuitable.
-    """
-    if len(second) < 2 or first.shape[1] != second.shape[1]:
-        raise UsageError(f"cannot find the nearest two among descriptors {second.shape} for descriptors {first.shape}")
-    return nearest_two_packed(PackedDescriptors.of(first), PackedDescriptors.of(second))
+    def nearest_two(self, other: Comparable) -> NearestTwo:
+        """Return the two nearest neighbours of each among M ≥ 2 others of the same length."""
+        if self._packed is not None and other._packed is not None:
+            return nearest_two_packed(self._packed, other._packed)
+        return nearest_two(self.descriptors, other.descriptors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,15 +96,9 @@ class PackedDescriptors:
 
     @classmethod
     def of(cls, descriptors: NDArray[np.generic]) -> PackedDescriptors:
-        """Return descriptors (N, D) packed.
-
-        Raises:
-            UsageError: if `can_compare_as_integers` is false for them.
-        """
+        """Return descriptors (N, D) packed, for which `can_compare_as_integers` is true."""
         from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
-        if not can_compare_as_integers(descriptors):
-            raise UsageError("descriptors must be small integers, on a machine with vector instructions")
         rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
         packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
         count = len(descriptors)
@@ -114,7 +106,7 @@ class PackedDescriptors:
 
 
 def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
-    """Return the result of `nearest_two_integers`; `second` holds two or more descriptors of the same length."""
+    """Return the result of `nearest_two` without rounding; `second` has M ≥ 2 descriptors of the same length."""
     from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
     state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)

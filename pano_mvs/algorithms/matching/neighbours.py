@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations
 from typing import Annotated
 
@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pano_mvs.algorithms.matching.nearest_two import (
-    NearestTwo,
-    PackedDescriptors,
-    can_compare_as_integers,
-    nearest_two,
-    nearest_two_packed,
-)
+from pano_mvs.algorithms.matching.nearest_two import Comparable
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
@@ -244,14 +238,9 @@ def east_north_m(positions_lla: Sequence[tuple[float, float, float]]) -> FloatAr
 
 def _nearest(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
     """Return links (first < second) of each item to its nearest ones; infinite distances are not links."""
-    apart = distances.copy()
-    np.fill_diagonal(apart, np.inf)
-    order = np.argsort(apart, axis=1, kind="stable")[:, :neighbours]
-    rows = np.repeat(np.arange(len(apart)), order.shape[1])
-    columns = order.ravel()
-    finite = np.isfinite(apart[rows, columns])
-    links = np.sort(np.stack([rows[finite], columns[finite]], axis=1), axis=1)
-    return np.unique(links, axis=0)
+    chosen = np.eye(len(distances), dtype=np.bool_)
+    _choose(chosen, np.full(len(distances), neighbours), distances)
+    return np.argwhere(np.triu(chosen, 1))
 
 
 def _share_that_follow(looks: FloatArray) -> float:
@@ -327,20 +316,12 @@ def sample_matches(
     np.put_along_axis(listed, np.argsort(dissimilarities, axis=1, kind="stable")[:, :length], values=True, axis=1)
     listed = np.triu(listed | listed.T, 1)
     matches = np.zeros((count, count))
-    compare = _comparison(samples)
+    comparable = [Comparable(sample) for sample in samples]
     for first, second in np.argwhere(listed).tolist():
         a, b = samples[first], samples[second]
         if len(a) > 0 and len(b) >= 2 and a.shape[1] == b.shape[1]:  # of one kind, and enough for a ratio test
-            matches[first, second] = np.count_nonzero(compare(first, second).mutual())
+            matches[first, second] = np.count_nonzero(comparable[first].nearest_two(comparable[second]).mutual())
     return matches + matches.T
-
-
-def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], NearestTwo]:
-    """Return a function that compares two samples given by their positions, compiled if the machine supports it."""
-    if all(map(can_compare_as_integers, samples)):
-        packed = {idx: PackedDescriptors.of(sample) for idx, sample in enumerate(samples) if sample.size}
-        return lambda first, second: nearest_two_packed(packed[first], packed[second])
-    return lambda first, second: nearest_two(samples[first], samples[second])
 
 
 def exhaustive_pairs(names: Sequence[str]) -> Pairs:

@@ -7,14 +7,12 @@ from typing import Annotated
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, poses_with_points
-from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
+from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
+from pano_mvs.algorithms.poses.growth import extend, why_nothing
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, why_no_pair
-from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
-
-_ROUNDS = 3
 
 
 @checks_settings
@@ -42,37 +40,31 @@ def extend_poses(
         cannot be registered are in `rejected`, with the reason.
     """
     names = tuple(features)
-    edges = consistent_edges(names, two_views)
-    kept = {(names[a], names[b]): view for (a, b), view in edges.items()}
-    tracks = build_tracks(features, kept)
-    model = GrowingModel(tracks, edges, "cauchy", kappa=0.01)
-    position = {name: idx for idx, name in enumerate(names)}
-    fixed = {position[name]: known.cam_from_world(i) for i, name in enumerate(known.names) if name in position}
-    model.cameras.update(fixed)
-    model.triangulate()
-    reasons = {position[name]: reason for name in names if (reason := why_no_pair(name, two_views))}
-    joined = {idx for edge in edges for idx in edge}
-    for idx in range(len(names)):
-        if idx not in joined:
-            reasons.setdefault(idx, "its pairs contradict the pairs around them")
-    reasons |= model.attach_all(sorted(joined - fixed.keys()))
-    _settled(model, [idx for idx in model.cameras if idx not in fixed])
+    pairs = pairs_of(features, two_views)
+    model = PlacedModel(pairs, {names.index(name): pose for name, pose in known.cameras.items() if name in features})
+    fixed = {*model.cameras}
+    model.verify_again()
+    left = {*range(len(names))} - fixed
+    reasons = extend(model, left, adjust=False, confirmation=None)
     poses = Poses.without_points(
         {names[idx]: model.cameras[idx] for idx in sorted(model.cameras)},
-        rejected={names[idx]: reason for idx, reason in sorted(reasons.items()) if idx not in fixed},
+        rejected={
+            names[idx]: why_no_pair(names[idx], two_views) or reasons.get(idx) or why_nothing(model, idx)
+            for idx in sorted(left)
+        },
         frame=known.frame,
         scale=known.scale,
         metric=known.metric,
     )
+    tracks, members = model.tracks()
+    for _ in range(3):
+        poses = poses_with_points(poses, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
+        for position, image in enumerate(members):
+            own = poses.track_image_idx == position
+            if image not in fixed and own.any():
+                points, bearings = poses.points_in_world[poses.track_point_idx[own]], poses.track_bearings[own]
+                pose = refine_resection(
+                    poses.cam_from_world(position), points, bearings, scale_rad=float(np.deg2rad(0.1))
+                )
+                poses.rotations[position], poses.translations[position] = pose.rotation, pose.translation
     return poses_with_points(poses, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
-
-
-def _settled(model: GrowingModel, new: list[int]) -> None:
-    """Refine new cameras and points in turn; the other cameras stay fixed."""
-    for _ in range(_ROUNDS if new else 0):
-        model.triangulate()
-        for image in new:
-            points, bearings = model.known_points(image)
-            model.cameras[image] = refine_resection(
-                model.cameras[image], points, bearings, scale_rad=float(np.deg2rad(0.1))
-            )

@@ -3,93 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel
-from pano_mvs.algorithms.poses.placement.places import Placement, agreement
-from pano_mvs.algorithms.poses.placement.resection import MIN_POINTS, points_needed, why_few_known, why_few_seen
+from pano_mvs.algorithms.poses.placement.places import Placement
+from pano_mvs.algorithms.poses.placement.resection import points_needed, why_refused
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
-from pano_mvs.algorithms.poses.verification.aliases import find_aliases
-from pano_mvs.algorithms.poses.verification.camera_checks import (
-    PAIRS_POWER,
-    CameraChecks,
-    check_cameras,
-    correct_cameras,
-)
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
 from pano_mvs.geometry import Rigid3
 
-_MAX_GROWN = 3  # number of seeds from which models are grown
-_LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
-_CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
-_CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
-_RIVALS = 2
+_CLEAR_WITH_IMAGES = 0.4  # a placement is in doubt if the runner-up has more than this share of the best score
 
 
-@dataclass(frozen=True, eq=False)
-class GrownModel:
-    """A model, and the images that could not be added to it."""
-
-    model: PlacedModel  # the cameras
-    refused: dict[int, str]  # position of each image that could not be added, to the reason
-    checks: CameraChecks | None  # result of the check against the images; None if the images were not consulted
-    aliased: bool = False  # whether runner-up geometries of several pairs suggest the same move of a block of cameras
-
-    def is_satisfactory(self) -> bool:
-        """Return whether no other model needs to be tried."""
-        if self.refused or self.aliased:
-            return False
-        if self.checks is None:
-            # The first model is accepted if it explains this share of the pairs.
-            return self.model.explained_share() > 0.85
-        return not self.checks.doubts and not self.checks.removed
-
-    def rank(self) -> tuple[float, float]:
-        """Return the sort key of models: the share of images and pairs that they explain, best first.
-
-        Doubtful cameras do not count as confirmed. A model in which all cameras are confirmed about as expected is
-        better than one in which most are confirmed slightly more and one is hardly confirmed.
-        """
-        confirmed = 0.0
-        if self.checks is not None:
-            shares, doubts = self.checks.shares, self.checks.doubts
-            confirmed = sum(np.nan_to_num(share) for image, share in shares.items() if image not in doubts)
-        return -float(confirmed) * self.model.explained_share() ** PAIRS_POWER, -self.model.explained_weight()
-
-
-def grown_models(
+def grown_model(
     pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
-) -> list[GrownModel]:
-    """Return models of a connected group of images, the model that explains the pairs best first.
+) -> tuple[PlacedModel, dict[int, str]]:
+    """Return a model of a connected group of images, and why images of the group could not be added to it.
+
+    It grows from the best seed or, if no image can be attached to this, from the best one that contradicts it.
 
     Args:
         pairs: all pairs of the capture.
         images: positions of the images of the group.
         adjust: whether all cameras are adjusted as the model grows.
-        confirmation: consulted only where the pairs cannot decide between placements or between models.
+        confirmation: consulted only where the pairs cannot decide between placements.
     """
-    models: list[GrownModel] = []
+    models: list[tuple[PlacedModel, dict[int, str]]] = []
     tried: set[tuple[Edge, int]] = set()
-    while seeds := ranked_seeds(pairs, images, without=tried):
+    while len(models) < 2 and (seeds := ranked_seeds(pairs, images, without=tried)):
         edge, rank = seeds[0]
-        models.append(_grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation))
-        # A seed that agrees with this model would lead to the same model again.
-        tried |= {seeds[0], *models[-1].model.chosen.items()}
-        # Do not try seeds that no image can be attached to.
-        grown = sum(len(found.model.cameras) > 2 for found in models)
-        if models[-1].is_satisfactory() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
+        model, refused = _grown(pairs, images, edge, rank=rank, adjust=adjust, confirmation=confirmation)
+        models.append((model, refused))
+        if not refused or len(model.cameras) > 2:
             break
-    models.sort(key=GrownModel.rank)
-    if models and models[0].checks is not None and confirmation is not None:
-        # Move cameras and blocks of cameras to where the images confirm them best.
-        checks = correct_cameras(models[0].model, confirmation)
-        if checks.moved:
-            settle(models[0].model, adjust=adjust)
-        models[0] = replace(models[0], refused=models[0].refused | checks.removed, checks=checks)
-    return models
+        # A seed that agrees with this model would lead to the same model again.
+        tried |= {seeds[0], *model.chosen.items()}
+    return max(models, key=lambda found: len(found[0].cameras))
 
 
 def ranked_seeds(
@@ -141,14 +92,38 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
 
 def _grown(
     pairs: Pairs, images: Collection[int], edge: Edge, *, rank: int, adjust: bool, confirmation: Confirmation | None
-) -> GrownModel:
+) -> tuple[PlacedModel, dict[int, str]]:
     """Return the model that grows from a seed, and the reasons for images that could not be added."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
+    reasons = extend(model, left, adjust=adjust, confirmation=confirmation)
+    settle(model, adjust=adjust)
+    return model, {image: reasons.get(image, why_nothing(model, image)) for image in sorted(left)}
+
+
+def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Confirmation | None) -> dict[int, str]:
+    """Add images to a model one at a time, the one whose pose its pairs determine most clearly first.
+
+    Args:
+        model: the model, changed in place.
+        left: images to add; those that were added are removed.
+        adjust: whether all cameras are adjusted each time their number has grown by a quarter.
+        confirmation: decides between rival placements by the images; None if the pairs alone decide.
+
+    Returns:
+        Why images could not be added when they were last tried.
+    """
     weights: dict[int, float] = {}
-    for image in edge:
-        _count_pairs(pairs, image, left, weights=weights)
+
+    def count_pairs(image: int) -> None:
+        for partner in model.pairs.partners[image]:
+            if partner in left:
+                edge = min(image, partner), max(image, partner)
+                weights[partner] = weights.get(partner, 0.0) + model.pairs.geometries[edge][0].weight
+
+    for image in model.cameras:
+        count_pairs(image)
     if not adjust:
         model.adjust(cameras=False)
     adjusted = 2
@@ -158,53 +133,11 @@ def _grown(
         model.add(image, pose)
         left.discard(image)
         del weights[image]
-        _count_pairs(pairs, image, left, weights=weights)
-        # All cameras are adjusted each time their number has grown by this factor.
+        count_pairs(image)
         if not adjust or len(model.cameras) > 1.25 * adjusted:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
-    for image in edge:
-        if image in model.cameras and (reason := _unsupported(model, image)):
-            for other in model.held_by([image]):
-                model.remove(other)
-                left.add(other)
-                reasons[other] = "its pairs are all with images that could not be registered"
-            model.remove(image)
-            left.add(image)
-            reasons[image] = reason
-    settle(model, adjust=adjust)
-    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
-    checks = None
-    aliased = confirmation is not None and bool(find_aliases(model))
-    # The images are not consulted if the model explains this share of the pairs.
-    if left or aliased or model.explained_share() < 0.97:
-        checks = check_cameras(model, confirmation)
-    return GrownModel(model, refused, checks, aliased)
-
-
-def _count_pairs(pairs: Pairs, image: int, left: Collection[int], *, weights: dict[int, float]) -> None:
-    """Add the pairs of a newly registered image to the weights of its unregistered partners."""
-    for partner in pairs.partners[image]:
-        if partner in left:
-            edge = min(image, partner), max(image, partner)
-            weights[partner] = weights.get(partner, 0.0) + pairs.geometries[edge][0].weight
-
-
-def _unsupported(model: PlacedModel, image: int) -> str:
-    """Return why an unchecked camera of the seed does not fit the other cameras; "" if it does."""
-    if len(model.cameras) < 4:
-        return ""
-    without = model.copy()
-    without.remove(image)
-    without.learn_ranges()
-    evidence = without.evidence(image)
-    pose = model.cameras[image]
-    agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
-    _, support, known = without.polished(image, evidence, Placement(pose, agrees, 0.0))
-    agreeing = len(set(evidence.partner[agrees].tolist()))
-    if support >= points_needed(known, agreeing=agreeing):
-        return ""
-    return _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
+    return reasons
 
 
 def _next(
@@ -218,24 +151,32 @@ def _next(
         confirmation: decides between rival placements by the images; None if the pairs alone decide.
         reasons: receives why an image cannot be added yet.
     """
+
+    def accepted(image: int, evidence: PairEvidence, placement: Placement) -> Rigid3 | None:
+        pose, why = _polished(model, image, evidence, placement=placement)
+        if why:
+            reasons[image] = why
+        return None if why else pose
+
     order = sorted(weights, key=lambda idx: (-weights[idx], idx))
-    for first in range(0, len(order), _LOOKED_AT):
+    # Six images are placed before the clearest of them is added, if none is clear by itself.
+    for first in range(0, len(order), 6):
         doubtful: list[tuple[float, int, PairEvidence, list[Placement]]] = []
-        for image in order[first : first + _LOOKED_AT]:
+        for image in order[first : first + 6]:
             evidence, found = model.place(image)
             if not found:
-                reasons[image] = _why_nothing(model, image)
+                reasons[image] = why_nothing(model, image)
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / evidence.total
             # Share of an image's pairs, by weight, that must agree with a clear placement.
-            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
-            if clear and (pose := _accepted(model, image, evidence, placement=found[0], reasons=reasons)):
+            clear = rival < (0.8 if confirmation is None else _CLEAR_WITH_IMAGES) and share > 0.5
+            if clear and (pose := accepted(image, evidence, found[0])):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))
         for _, image, evidence, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
             for placement in _by_images(model, image, found, confirmation=confirmation):
-                if pose := _accepted(model, image, evidence, placement=placement, reasons=reasons):
+                if pose := accepted(image, evidence, placement):
                     return image, pose
     return None
 
@@ -244,23 +185,22 @@ def _by_images(
     model: PlacedModel, image: int, found: list[Placement], *, confirmation: Confirmation | None
 ) -> list[Placement]:
     """Return placements in the order in which to try them; the images decide between rivals."""
-    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
+    rivals = [placement for placement in found[:2] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
     if confirmation is None or len(rivals) < 2:
-        return found[:_RIVALS]
+        return found[:2]
     shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
     return [rivals[idx] for idx in np.argsort(-np.nan_to_num(shares), kind="stable")]
 
 
-def _accepted(
-    model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement, reasons: dict[int, str]
-) -> Rigid3 | None:
-    """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
+def _polished(model: PlacedModel, image: int, evidence: PairEvidence, *, placement: Placement) -> tuple[Rigid3, str]:
+    """Return the refined pose of a placement, and why it is refused if too few known points support it."""
     pose, support, known = model.polished(image, evidence, placement)
     agreeing = len(set(evidence.partner[placement.explained].tolist()))
     if support >= points_needed(known, agreeing=agreeing):
-        return pose
-    reasons[image] = _why_refused(model.pairs, image, support, known=known, agreeing=agreeing)
-    return None
+        return pose, ""
+    pairs, partner = model.pairs, model.pairs.partners[image][0]
+    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
+    return pose, why_refused(support, known, agreeing=agreeing, partner=pairs.names[partner], matches=count)
 
 
 def settle(model: PlacedModel, *, adjust: bool) -> None:
@@ -271,15 +211,8 @@ def settle(model: PlacedModel, *, adjust: bool) -> None:
         model.choose_again()
 
 
-def _why_nothing(model: PlacedModel, image: int) -> str:
+def why_nothing(model: PlacedModel, image: int) -> str:
+    """Return why none of the pairs of an image suggests a place for it."""
     if any(idx in model.cameras for idx in model.pairs.partners[image]):
         return "no pair with a registered image shares enough points with a third image to determine the distance"
     return "its pairs are all with images that could not be registered"
-
-
-def _why_refused(pairs: Pairs, image: int, support: int, *, known: int, agreeing: int) -> str:
-    if known >= MIN_POINTS:
-        return why_few_seen(support, known, agreeing=agreeing)
-    partner = pairs.partners[image][0]
-    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return why_few_known(known, partner=pairs.names[partner], matches=count)

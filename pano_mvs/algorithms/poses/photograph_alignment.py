@@ -19,7 +19,7 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_surface import SurfacePoints
+from pano_mvs.algorithms.poses.photograph_panoramas import SurfacePoints
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError

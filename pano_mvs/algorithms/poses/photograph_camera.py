@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 
-# Typical changes of rotation, translation, log focal length and distortion.
-_STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05)
-_RADIAL_STD = 0.1
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
 # Errors beyond this many times the median of the inliers' count less and less (Cauchy's loss).
 _ROBUST = 1.5
 
@@ -38,10 +38,24 @@ class Sightings:
             sum(part.tested for part in parts),
         )
 
-    def errors(self, camera: PhotographCamera, size_hw: tuple[int, int]) -> FloatArray:
-        """Return the errors (N, 2) of a camera in standard deviations."""
-        away = camera.project(self.points_in_world, size_hw)[0] - self.pixels_px
+    def errors(
+        self, camera: PhotographCamera, size_hw: tuple[int, int], *, center_px: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Return the errors (N, 2) of a camera, whose optical centre is off the middle, in standard deviations."""
+        away = camera.project(self.points_in_world, size_hw)[0] + center_px - self.pixels_px
         return np.asarray(np.einsum("nij,nj->ni", self.whitening, away))
+
+    def robust(
+        self, camera: PhotographCamera, size_hw: tuple[int, int], scale: float, *, center_px: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Return vectors (2N,) whose squares are the losses (Cauchy's) of the errors relative to a scale."""
+        errors = self.errors(camera, size_hw, center_px=center_px) / scale
+        squared = (errors**2).sum(axis=1, keepdims=True) + 1e-12
+        return np.asarray((errors * np.sqrt(np.log1p(squared) / squared)).ravel())
+
+    def scale(self, camera: PhotographCamera, size_hw: tuple[int, int]) -> float:
+        """Return the error from which sightings count less and less."""
+        return max(1.0, _ROBUST * float(np.median(np.linalg.norm(self.errors(camera, size_hw), axis=1))))
 
 
 class FocalPrior(NamedTuple):
@@ -113,6 +127,24 @@ def refine_camera(
     return camera
 
 
+def _adjusted(
+    pixels_px: FloatArray,
+    points_in_world: FloatArray,
+    camera: PhotographCamera,
+    *,
+    size_hw: tuple[int, int],
+    prior: FocalPrior,
+    scale_px: float,
+) -> PhotographCamera:
+    """Return the camera with the smallest errors (Cauchy's loss with a scale) to all of some points."""
+
+    def losses(moved: PhotographCamera, _rest: FloatArray) -> FloatArray:
+        errors = (moved.project(points_in_world, size_hw)[0] - pixels_px).ravel() / scale_px
+        return np.asarray(np.sign(errors) * np.sqrt(np.log1p(errors**2)))
+
+    return _moved(camera, _least_squares(camera, prior, losses).x)
+
+
 def refine_by_sightings(
     camera: PhotographCamera, sightings: Sightings, *, size_hw: tuple[int, int], prior: FocalPrior
 ) -> PhotographCamera:
@@ -127,17 +159,9 @@ def refine_by_sightings(
         size_hw: (height, width) of the photograph.
         prior: what is known about the focal length.
     """
-    from scipy.optimize import least_squares
-
-    def residuals(change: FloatArray) -> FloatArray:
-        moved = _moved(camera, change)
-        errors = sightings.errors(moved, size_hw) / scale
-        squared = (errors**2).sum(axis=1, keepdims=True) + 1e-12
-        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
-        return np.concatenate([(errors * np.sqrt(np.log1p(squared) / squared)).ravel(), own])
-
-    scale = max(1.0, _ROBUST * float(np.median(np.linalg.norm(sightings.errors(camera, size_hw), axis=1))))
-    return _moved(camera, least_squares(residuals, np.zeros(8), x_scale=_STEPS).x)
+    scale = sightings.scale(camera, size_hw)
+    found = _least_squares(camera, prior, lambda moved, _rest: sightings.robust(moved, size_hw, scale))
+    return _moved(camera, found.x)
 
 
 def optical_center_offset(
@@ -154,43 +178,44 @@ def optical_center_offset(
         size_hw: (height, width) of the photograph.
         prior: what is known about the focal length.
     """
-    from scipy.optimize import least_squares
-
-    def residuals(change: FloatArray) -> FloatArray:
-        moved = _moved(camera, change[:8])
-        away = moved.project(sightings.points_in_world, size_hw)[0] + max(size_hw) * change[8:] - sightings.pixels_px
-        errors = np.einsum("nij,nj->ni", sightings.whitening, away) / scale
-        squared = (errors**2).sum(axis=1, keepdims=True) + 1e-12
-        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
-        return np.concatenate([(errors * np.sqrt(np.log1p(squared) / squared)).ravel(), own])
-
-    scale = max(1.0, _ROBUST * float(np.median(np.linalg.norm(sightings.errors(camera, size_hw), axis=1))))
-    found = least_squares(residuals, np.zeros(10), x_scale=(*_STEPS, 0.02, 0.02))
+    scale = sightings.scale(camera, size_hw)
+    found = _least_squares(
+        camera,
+        prior,
+        lambda moved, shift: sightings.robust(moved, size_hw, scale, center_px=max(size_hw) * shift),
+        more=(0.02, 0.02),
+    )
     variance = 2 * found.cost / max(1, len(found.fun) - len(found.x))
     jacobian: FloatArray = np.asarray(found.jac, np.float64)
     covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)
     return np.asarray(found.x[8:]), np.sqrt(np.diag(covariance)[8:])
 
 
-def _adjusted(
-    pixels_px: FloatArray,
-    points_in_world: FloatArray,
+def _least_squares(
     camera: PhotographCamera,
-    *,
-    size_hw: tuple[int, int],
     prior: FocalPrior,
-    scale_px: float,
-) -> PhotographCamera:
-    """Return the camera with the smallest errors (Cauchy's loss with a scale) to all of some points."""
+    errors_of: Callable[[PhotographCamera, FloatArray], FloatArray],
+    *,
+    more: tuple[float, ...] = (),
+) -> OptimizeResult:
+    """Minimise errors, given the prior, over small changes of a camera and of further parameters.
+
+    Args:
+        camera: the camera to start from.
+        prior: what is known about the focal length.
+        errors_of: errors of a camera with the further parameters.
+        more: typical values of these, which start at 0.
+    """
     from scipy.optimize import least_squares
 
     def residuals(change: FloatArray) -> FloatArray:
-        moved = _moved(camera, change)
-        errors = (moved.project(points_in_world, size_hw)[0] - pixels_px).ravel() / scale_px
-        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / _RADIAL_STD]
-        return np.concatenate([np.sign(errors) * np.sqrt(np.log1p(errors**2)), own])
+        moved = _moved(camera, change[:8])
+        own = [np.log(moved.focal_px / prior.focal_px) / prior.log_std, moved.radial / 0.1]
+        return np.concatenate([errors_of(moved, change[8:]), own])
 
-    return _moved(camera, least_squares(residuals, np.zeros(8), x_scale=_STEPS).x)
+    # Typical changes of rotation, translation, log focal length and distortion.
+    steps = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01, 0.05, 0.05, *more)
+    return least_squares(residuals, np.zeros(len(steps)), x_scale=steps)
 
 
 def _moved(camera: PhotographCamera, change: FloatArray) -> PhotographCamera:

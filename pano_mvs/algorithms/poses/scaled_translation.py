@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.growth import GrownModel, grown_models, settle
+from pano_mvs.algorithms.poses.frame.gauge import no_poses, normalised_poses
+from pano_mvs.algorithms.poses.growth import grown_model, settle
 from pano_mvs.algorithms.poses.joining.join_groups import join_models
-from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator
+from pano_mvs.algorithms.poses.placement.pair_evidence import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.placement.resection import why_no_pair
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
@@ -43,8 +44,8 @@ def solve_scaled_translation(
     views that all see the first image to an unordered set. Starting from a seed pair, each image is placed by the
     rotations and directions of its pairs with registered images. The length of a translation is the one that puts
     points with known ranges at these ranges. All geometries of a pair are considered, not only the one with most
-    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses, or several
-    models, agree with the pairs about equally well, the images decide (see `Confirmation`).
+    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses agree with
+    the pairs about equally well, the images decide (see `Confirmation`).
 
     Args:
         features: key points by image name, in the capture's order.
@@ -61,61 +62,50 @@ def solve_scaled_translation(
     """
     del rng
     names = tuple(features)
-    pairs = pairs_of(features, two_views, estimator=scale_estimator, kappa=kappa)
+    pairs = pairs_of(features, two_views, scale_of=partial(estimate_scale, estimator=scale_estimator, kappa=kappa))
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
     if confirmation is not None:
         pairs = weighed_by_images(pairs, confirmation)
-    models, reasons = _grown_and_joined(pairs, adjust=adjust, confirmation=confirmation)
-    groups = [_finished(grown, adjust=adjust) for grown in models]
+    models, reasons = solved_models(pairs, adjust=adjust, confirmation=confirmation)
+    groups = [_finished(model, adjust=adjust) for model in models]
     rejected = {
         name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
     }
     if not groups:
-        return Poses.without_points(
-            {},
-            rejected=rejected,
-            frame="the first registered camera",
-            scale="none: no image is registered",
-            metric=False,
-        )
+        return no_poses(rejected)
     return join_groups(groups, order=names, rejected=rejected)
 
 
-def _grown_and_joined(
-    pairs: Pairs, *, adjust: bool, confirmation: Confirmation | None
-) -> tuple[list[GrownModel], dict[int, str]]:
+def solved_models(
+    pairs: Pairs, *, adjust: bool = True, confirmation: Confirmation | None = None
+) -> tuple[list[PlacedModel], dict[int, str]]:
     """Return the models of all groups, the largest first, and the reasons for images that were refused at least once.
 
     Images that could not be added to any model are tried as models of one camera when models are joined.
     """
-    grown: list[GrownModel] = []
+    grown: list[PlacedModel] = []
     reasons: dict[int, str] = {}
     waiting = [group for group in connected_groups(pairs.geometries, len(pairs.names)) if len(group) > 1]
     while waiting:
-        grown.append(grown_models(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)[0])
-        refused = grown[-1].refused
+        model, refused = grown_model(pairs, waiting.pop(0), adjust=adjust, confirmation=confirmation)
+        grown.append(model)
         reasons |= refused
         left = {edge for edge in pairs.geometries if edge[0] in refused and edge[1] in refused}
         waiting += [group for group in connected_groups(left, len(pairs.names)) if len(group) > 1]
-    placed = {image for one in grown for image in one.model.cameras}
+    placed = {image for model in grown for image in model.cameras}
     alone = [PlacedModel(pairs, {image: Rigid3.identity()}) for image in range(len(pairs.names)) if image not in placed]
-    found: list[GrownModel] = []
-    for model, numbers in join_models([*(one.model for one in grown), *alone]) if grown else []:
+    found: list[PlacedModel] = []
+    for model, numbers in join_models([*grown, *alone]) if grown else []:
         if len(numbers) > 1:
             settle(model, adjust=adjust)
-            found.append(GrownModel(model, {}, check_cameras(model, confirmation)))
-        elif numbers[0] < len(grown):
-            found.append(grown[numbers[0]])
-    return sorted(found, key=lambda one: (-len(one.model.cameras), min(one.model.cameras))), reasons
+        if len(model.cameras) > 1:
+            found.append(model)
+    return sorted(found, key=lambda model: (-len(model.cameras), min(model.cameras))), reasons
 
 
-def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
-    """Return a finished model as poses of one group, with points."""
-    model = grown.model
+def _finished(model: PlacedModel, *, adjust: bool) -> Poses:
+    """Return a finished model as poses of one group, with points and with what its pairs say for its cameras."""
     if adjust:
         model.adjust()
-    poses = normalised_poses(poses_of(model))
-    if grown.checks is not None:
-        poses = with_camera_checks(poses, model.pairs, grown.checks)
-    return poses
+    return with_camera_checks(normalised_poses(poses_of(model)), model.pairs, check_cameras(model))

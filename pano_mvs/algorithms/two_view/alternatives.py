@@ -14,24 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.minimal_solvers import essentials_from_five
+from pano_mvs.algorithms.two_view.minimal_solvers import draw_samples, essentials_from_five
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
-from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
-from pano_mvs.algorithms.two_view.sampling import draw_samples
-from pano_mvs.algorithms.two_view.significance import (
-    MAX_LOG10_FALSE_ALARMS,
-    chance_of_pose,
-    independent_count,
-    log10_false_alarms,
-)
+from pano_mvs.algorithms.two_view.refinement import refined_on_agreeing
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, significance_of_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 
-BoolArray = NDArray[np.bool_]
-
 _TWINS = 16  # number of samples among the matches of a known geometry
 _PEAKS = 6  # number of candidates of each kind that are refined
-_MIN_OWN_SHARE = 0.08  # own matches, relative to the matches of the best geometry
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
 _MIN_DIRECTION_RAD = float(np.deg2rad(2.5))
 
@@ -41,7 +32,7 @@ class _Geometry:
     """A relative pose, and which matches agree with it, (M,)."""
 
     pose: Rigid3
-    agreeing: BoolArray
+    agreeing: NDArray[np.bool_]
 
 
 def distinct_geometries(
@@ -129,7 +120,7 @@ class _Search:
         """Return the geometry with most matches of its own; None unless these are more than chance."""
         searched = ~np.any([geometry.agreeing for geometry in known], axis=0)
         # Own independent matches, relative to the number that a best geometry needs.
-        needed = max(0.6 * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
+        needed = max(0.6 * self.min_inliers, 0.08 * float(known[0].agreeing.sum()))
         rest = self.rng.permutation(np.flatnonzero(searched))
         if len(rest) < needed:
             return None
@@ -172,41 +163,30 @@ class _Search:
 
     def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, *, widths: Sequence[float]) -> Rigid3:
         """Refine on the matches within successively narrower bands, in units of the threshold."""
-        for widen in widths:
-            near = agreement(pose, p, q, threshold_rad=widen * self.threshold_rad)[1]
-            # Minimum number of matches for refinement.
-            if near.sum() < 8:
-                break
-            scale_rad = 0.5 * widen * self.threshold_rad
-            pose = refine_relative_pose(pose, p[near], q[near], scale_rad=scale_rad, max_iterations=6)
-        return pose
+        bands = [widen * self.threshold_rad for widen in widths]
+        return refined_on_agreeing(pose, p, q, thresholds_rad=bands, max_iterations=6)[0]
 
     def _significant(
-        self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, *, needed: float
+        self, geometry: _Geometry, known: Sequence[_Geometry], searched: NDArray[np.bool_], *, needed: float
     ) -> bool:
-        own = geometry.agreeing & searched
-        own_p, own_q = self.first[own], self.second[own]
-        witnesses = independent_count(own_p, own_q) if own.any() else 0
-        if witnesses < needed:
-            return False
-        p, q = self.first[searched], self.second[searched]
         turn = min(float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known)
         # Two matches determine the direction if the rotation is known.
         sample, models = (2, 1) if turn < float(np.deg2rad(2.0)) else (5, 10)
-        false_alarms = log10_false_alarms(
-            witnesses,
-            max(independent_count(p, q), witnesses),
-            chance=max(
-                chance_of_pose(geometry.pose, *rays, rng=self.rng, threshold_rad=self.threshold_rad)
-                for rays in ((p, q), (own_p, own_q))
-            ),
+        _, false_alarms = significance_of_pose(
+            geometry.pose,
+            self.first[searched],
+            self.second[searched],
+            agreeing=geometry.agreeing[searched],
+            rng=self.rng,
+            threshold_rad=self.threshold_rad,
+            fewest=needed,
             sample=sample,
             models_per_sample=models,
         )
         return false_alarms <= MAX_LOG10_FALSE_ALARMS
 
 
-def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray) -> bool:
+def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: NDArray[np.bool_]) -> bool:
     """Return whether a geometry differs from all known ones, and is not one of them adapted to a few more matches."""
     mostly_own = 2 * (geometry.agreeing & searched).sum() > geometry.agreeing.sum()
     for other in known:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 
-BoolArray = NDArray[np.bool_]
-
 
 def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3:
     """Return the decomposition of an essential matrix with most inliers in front of both cameras.
@@ -32,7 +30,7 @@ def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, *,
 
 def agreement(
     pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float
-) -> tuple[FloatArray, BoolArray]:
+) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the Sampson errors, (M,), and which matches agree with a pose, |t| = 1.
 
     A match agrees if its error is small and it lies in front of both cameras, or is so far away (the angle between its

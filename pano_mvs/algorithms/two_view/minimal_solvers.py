@@ -1,4 +1,4 @@
-"""Essential matrices from minimal samples: the five-point and the eight-point solver, by name."""
+"""Minimal samples of matches, and essential matrices from them: the five-point and the eight-point solver."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.essential import essential_from_bearings
 from pano_mvs.core.arrays import FloatArray
 
 Solver: TypeAlias = Literal["five_point", "eight_point"]
-
-_SAMPLE = 5
-_MAX_SOLUTIONS = 10  # maximum number of essential matrices from one sample
 
 
 @dataclass(frozen=True)
@@ -47,8 +43,8 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
     from pano_mvs.algorithms.two_view.kernels_five_point import solve_five
 
     count = len(first)
-    essentials, sample_idx = np.empty((_MAX_SOLUTIONS * count, 3, 3)), np.empty(_MAX_SOLUTIONS * count, np.int64)
-    samples = np.arange(_SAMPLE * count).reshape(count, _SAMPLE)
+    essentials, sample_idx = np.empty((10 * count, 3, 3)), np.empty(10 * count, np.int64)
+    samples = np.arange(5 * count).reshape(count, 5)
     found = solve_five(
         np.ascontiguousarray(first, np.float64).reshape(-1, 3),
         np.ascontiguousarray(second, np.float64).reshape(-1, 3),
@@ -59,11 +55,46 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
     return essentials[:found], sample_idx[:found]
 
 
-def _five(first: FloatArray, second: FloatArray) -> FloatArray:
-    return essentials_from_five(first, second)[0]
+def essential_from_bearings(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the essential matrices that solve qᵀ E p = 0 in the least-squares sense (8-point method).
+
+    Unit bearings need no normalisation as in Hartley's method.
+
+    Args:
+        first: (..., M, 3) unit bearings p, M ≥ 8.
+        second: (..., M, 3) unit bearings q.
+
+    Returns:
+        (..., 3, 3) matrices with singular values 1, 1, 0.
+    """
+    # The coefficients of E's nine entries in qᵀ E p.
+    products = (second[..., :, None] * first[..., None, :]).reshape(*first.shape[:-1], 9)
+    vectors = np.linalg.eigh(np.swapaxes(products, -1, -2) @ products)[1]
+    u, _, vt = np.linalg.svd(vectors[..., 0].reshape(*products.shape[:-2], 3, 3))
+    essential: FloatArray = (u * [1.0, 1.0, 0.0]) @ vt
+    return essential
 
 
 SOLVERS: dict[Solver, MinimalSolver] = {
-    "five_point": MinimalSolver(sample=5, batch=64, solve=_five, models=10),
-    "eight_point": MinimalSolver(sample=8, batch=256, solve=essential_from_bearings, models=1),
+    "five_point": MinimalSolver(
+        sample=5, batch=64, solve=lambda first, second: essentials_from_five(first, second)[0], models=10
+    ),
+    "eight_point": MinimalSolver(8, 256, essential_from_bearings, models=1),
 }
+
+
+def draw_samples(rng: np.random.Generator, count: int, *, batch: int, sample: int) -> NDArray[np.int64]:
+    """Return positions of distinct matches among `count` matches, (batch, sample)."""
+    samples = rng.integers(count, size=(batch, sample))
+    repeated = np.flatnonzero((np.diff(np.sort(samples, axis=1), axis=1) == 0).any(axis=1))
+    for row in repeated:
+        samples[row] = rng.choice(count, sample, replace=False)
+    return samples
+
+
+def samples_needed(inlier_ratio: float, confidence: float, *, sample: int) -> float:
+    """Return the number of samples after which one without outliers has been drawn with the given probability."""
+    clean = inlier_ratio**sample
+    if clean >= 1:
+        return 0.0
+    return float(np.log1p(-confidence) / np.log1p(-clean)) if clean > 0 else np.inf

@@ -1,4 +1,4 @@
-"""Robust estimation of the essential matrix on the sphere: MSAC with local optimisation."""
+"""Robust estimation of the essential matrix on the sphere: MSAC with local optimisation; and of a rotation alone."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
-from pano_mvs.algorithms.two_view.essential import essential_from_bearings
-from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, MinimalSolver, Solver
+from pano_mvs.algorithms.two_view.minimal_solvers import (
+    SOLVERS,
+    MinimalSolver,
+    Solver,
+    draw_samples,
+    essential_from_bearings,
+    samples_needed,
+)
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
-from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, angle_between, nearest_rotation
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
 _SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
-_LAG_SIGMAS = 3.0  # hypotheses that are worse than the best by more than this are rejected early
 _LEADERS = 6  # number of hypotheses whose direction is estimated again
 _POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
@@ -32,8 +36,6 @@ class RelativePose:
 
     second_from_first: Rigid3  # rotation, and translation of length 1
     inliers: NDArray[np.bool_]  # (M,) bool, True for matches with a small residual in front of both cameras
-    residuals_rad: FloatArray  # (M,) spherical Sampson error of all matches
-    iterations: int  # number of hypotheses
     reason: str = ""  # why there is no pose
 
     def __bool__(self) -> bool:
@@ -88,7 +90,7 @@ def estimate_two_view(
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     # Stop when a better model would have been found with this probability.
-    leaders, iterations = search.run(confidence=0.9999, max_iterations=max_iterations)
+    leaders = search.run(confidence=0.9999, max_iterations=max_iterations)
     if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
     pose: Rigid3 | None = leaders[0]
@@ -97,12 +99,11 @@ def estimate_two_view(
         pose = _refined(pose, first, second, threshold_rad=threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is supported by eight matches")
-    residuals, inliers = agreement(pose, first, second, threshold_rad=threshold_rad)
-    return RelativePose(pose, inliers, residuals, iterations)
+    return RelativePose(pose, agreement(pose, first, second, threshold_rad=threshold_rad)[1])
 
 
 def _none(count: int, reason: str) -> RelativePose:
-    return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), np.full(count, np.pi / 2), 0, reason)
+    return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), reason)
 
 
 def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3 | None:
@@ -128,8 +129,8 @@ class _Search:
     solver: MinimalSolver
     optimise: bool
 
-    def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
-        """Return the leading poses, best first, and the number of hypotheses.
+    def run(self, *, confidence: float, max_iterations: int) -> list[Rigid3]:
+        """Return the leading poses, best first.
 
         There is one pose if a better one would have been found by now, and several if the search reached its limit.
         """
@@ -147,7 +148,7 @@ class _Search:
                 ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
                 needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
             leaders = sorted([*leaders, (cost, tried, pose)], key=lambda item: item[:2])[:_LEADERS]
-        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)], tried
+        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)]
 
     def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
         """Return the best pose of a batch if it costs less than `worst`, its cost, and the number of trials."""
@@ -165,7 +166,7 @@ class _Search:
             threshold_rad=self.threshold_rad,
             # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
-            sigmas=_LAG_SIGMAS if self.optimise else np.inf,
+            sigmas=3.0 if self.optimise else np.inf,
             count=4,
         )
         if not len(finalists):
@@ -215,3 +216,30 @@ class _Search:
 
     def _residuals(self, pose: Rigid3) -> FloatArray:
         return agreement(pose, self.first, self.second, threshold_rad=self.threshold_rad)[0]
+
+
+def estimate_rotation(
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Estimate second_from_first's rotation, (3, 3), without translation, and its inliers, (M,).
+
+    Two-point samples, then the least-squares rotation of the inliers (Kabsch).
+
+    Args:
+        first: (M, 3) unit bearings, M ≥ 2.
+        second: (M, 3) unit bearings.
+        rng: draws the samples.
+        threshold_rad: maximum angle between the rotated and the observed ray of an inlier.
+    """
+    from pano_mvs.algorithms.two_view.kernels_agreement import best_turn
+
+    samples = rng.integers(len(first), size=(200, 2))
+    rotation = np.eye(3)
+    squared_chord = (2 * np.sin(threshold_rad / 2)) ** 2
+    best_turn(np.ascontiguousarray(first), np.ascontiguousarray(second), samples, squared_chord, rotation)
+    for _ in range(4):
+        inliers = angle_between(first @ rotation.T, second) < threshold_rad
+        if inliers.sum() < 2:
+            break
+        rotation = nearest_rotation(second[inliers].T @ first[inliers])
+    return rotation, angle_between(first @ rotation.T, second) < threshold_rad

@@ -1,15 +1,13 @@
-"""Escape local optima of relative poses: keep the rotation, estimate the direction again, and refine both."""
+"""Relative poses from a rotation: the direction is estimated given the rotation, of a pose or of upright images."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pano_mvs.algorithms.two_view.cheirality import facing_costs
-from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose
+from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose, refined_on_agreeing
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3
-
-_ROUNDS = 2
+from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 
 
 def best_redirected(
@@ -32,7 +30,7 @@ def best_redirected(
     for pose in poses:
         moved = pose
         # There is a single pose if the search has converged with certainty.
-        for _ in range(_ROUNDS if len(poses) > 1 else 1):
+        for _ in range(2 if len(poses) > 1 else 1):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
     costs = facing_costs(candidates, first, second, threshold_rad=threshold_rad)
@@ -90,3 +88,41 @@ def direction_candidates(
     direction_costs(rotated, np.ascontiguousarray(q), directions, threshold_rad, costs)
     signs = np.where(costs[:, 0] <= costs[:, 1], 1.0, -1.0)
     return directions * signs[:, None], costs.min(axis=1)
+
+
+def upright_poses(
+    first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> list[Rigid3]:
+    """Return at most four relative poses of two upright images, |t| = 1, best first.
+
+    With a known vertical, a heading and two matches determine a relative pose, so that one true match in ten is enough
+    to find it, where five matches at random would hardly ever all be true. The poses are refined without the
+    assumption, so a slight tilt does not matter.
+
+    Args:
+        first: (M, 3) unit rays in the first image.
+        second: (M, 3) in the second.
+        rng: draws the matches.
+        threshold_rad: Sampson error from which a match costs 1 after refinement.
+    """
+    if len(first) < 6:
+        return []
+    # Allows for the tilt of the cameras and for the steps between headings.
+    wide_rad = max(float(np.deg2rad(0.6)), threshold_rad)
+    rough: list[tuple[float, Rigid3]] = []
+    for heading in np.deg2rad(np.arange(0.0, 360.0, 2.0)):
+        rotation = rotation_from_rotvec(np.array([0.0, heading, 0.0]))
+        directions, costs = direction_candidates(rotation, first, second, rng=rng, threshold_rad=wide_rad, count=100)
+        if len(directions):
+            best = int(np.argmin(costs))
+            rough.append((float(costs[best]), Rigid3(rotation, directions[best])))
+    poses: list[Rigid3] = []
+    for _, pose in sorted(rough, key=lambda item: item[0]):
+        if len(poses) == 4:
+            break
+        if all(float(geodesic_angle(pose.rotation, other.rotation)) > float(np.deg2rad(3.0)) for other in poses):
+            poses.append(pose)
+    bands = [widen * threshold_rad for widen in (3.0, 2.0, 1.0)]
+    refined = [refined_on_agreeing(pose, first, second, thresholds_rad=bands, least=12)[0] for pose in poses]
+    costs = facing_costs(refined, first, second, threshold_rad=threshold_rad)
+    return [refined[idx] for idx in np.argsort(costs, kind="stable")]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from pano_mvs.algorithms.two_view.cheirality import agreement
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, skew
 
@@ -28,6 +31,38 @@ def refine_relative_pose(
     p, q = np.ascontiguousarray(first, np.float64), np.ascontiguousarray(second, np.float64)
     refine_pose(rotation, translation, p, q, scale_rad, max_iterations)
     return Rigid3(rotation, translation)
+
+
+def refined_on_agreeing(
+    pose: Rigid3,
+    first: FloatArray,
+    second: FloatArray,
+    *,
+    thresholds_rad: Sequence[float],
+    least: int = 8,
+    max_iterations: int = 20,
+) -> tuple[Rigid3, bool]:
+    """Refine a pose on the matches that agree with it within successive thresholds, until one has too few.
+
+    Args:
+        pose: initial pose, |t| = 1.
+        first: (M, 3) unit bearings in the first image.
+        second: (M, 3) unit bearings in the second.
+        thresholds_rad: maximum Sampson errors.
+        least: minimum number of matches.
+        max_iterations: maximum number of steps for each threshold.
+
+    Returns:
+        The pose, and whether each threshold had enough matches.
+    """
+    for threshold_rad in thresholds_rad:
+        near = agreement(pose, first, second, threshold_rad=threshold_rad)[1]
+        if near.sum() < least:
+            return pose, False
+        pose = refine_relative_pose(
+            pose, first[near], second[near], scale_rad=0.5 * threshold_rad, max_iterations=max_iterations
+        )
+    return pose, True
 
 
 def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noise_rad: float) -> tuple[float, float]:

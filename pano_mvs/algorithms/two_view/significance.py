@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3
 
 MAX_LOG10_FALSE_ALARMS = -6.0
+CELL_RAD = 0.025
+"""Matches in one cell of an image are right or wrong together."""
 
 
 def log10_false_alarms(
@@ -63,8 +66,45 @@ def chance_of_pose(
     return float((agreeing + 1) / (drawn + 1))
 
 
+def significance_of_pose(
+    pose: Rigid3,
+    first: FloatArray,
+    second: FloatArray,
+    *,
+    agreeing: NDArray[np.bool_],
+    rng: np.random.Generator,
+    threshold_rad: float,
+    fewest: float,
+    sample: int,
+    models_per_sample: int,
+) -> tuple[int, float]:
+    """Return the number of independent matches that agree with a relative pose, and log₁₀ of its false alarms.
+
+    Args:
+        pose: second_from_first, |t| = 1.
+        first: (M, 3) unit bearings of the matches in the first image.
+        second: (M, 3) in the second.
+        agreeing: (M,) which of them agree.
+        rng: draws false matches.
+        threshold_rad: maximum Sampson error of a match that agrees.
+        fewest: with fewer independent matches, the false alarms are infinite.
+        sample: number of matches that determine such a pose.
+        models_per_sample: maximum number of poses from one sample.
+    """
+    own = first[agreeing], second[agreeing]
+    witnesses = independent_count(*own) if agreeing.any() else 0
+    if witnesses < fewest:
+        return witnesses, np.inf
+    # Also among the agreeing ones alone: if they are clustered along one epipolar circle, any match would agree.
+    chance = max(chance_of_pose(pose, *rays, rng=rng, threshold_rad=threshold_rad) for rays in ((first, second), own))
+    candidates = max(independent_count(first, second), witnesses)
+    return witnesses, log10_false_alarms(
+        witnesses, candidates, chance=chance, sample=sample, models_per_sample=models_per_sample
+    )
+
+
 def independent_count(first: FloatArray, second: FloatArray) -> int:
-    """Return the number of independent matches: at most one from each cell, 0.025 rad wide, of either image.
+    """Return the number of independent matches: at most one from each cell of either image.
 
     The matches of a cluster of key points on one detail are right or wrong together, so they count as one.
 
@@ -72,14 +112,10 @@ def independent_count(first: FloatArray, second: FloatArray) -> int:
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
     """
-    return min(_cells(bearings, 0.025) for bearings in (first, second))
-
-
-def _cells(bearings: FloatArray, cell_rad: float) -> int:
-    """Return the number of cells that contain bearings; one number per cell, since rows of three are slow to sort."""
-    cells = np.floor(bearings / cell_rad).astype(np.int64)
-    side = 2 * int(np.ceil(1 / cell_rad)) + 3
-    return len(np.unique(cells @ np.array([side * side, side, 1])))
+    # One number per cell, since rows of three are slow to sort.
+    side = 2 * int(np.ceil(1 / CELL_RAD)) + 3
+    cells = (np.floor(bearings / CELL_RAD).astype(np.int64) @ [side * side, side, 1] for bearings in (first, second))
+    return min(len(np.unique(numbers)) for numbers in cells)
 
 
 def _log_binomial(n: int, k: int) -> float:

@@ -22,16 +22,10 @@ from pano_mvs.algorithms.two_view.learned_pairs import (
     weight_of_learned,
 )
 from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver
-from pano_mvs.algorithms.two_view.ransac import estimate_two_view
-from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
-from pano_mvs.algorithms.two_view.significance import (
-    MAX_LOG10_FALSE_ALARMS,
-    chance_of_pose,
-    independent_count,
-    log10_false_alarms,
-)
-from pano_mvs.algorithms.two_view.upright import upright_poses
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation, estimate_two_view
+from pano_mvs.algorithms.two_view.redirection import upright_poses
+from pano_mvs.algorithms.two_view.refinement import pose_uncertainty, refine_relative_pose, refined_on_agreeing
+from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS, independent_count, significance_of_pose
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
@@ -42,8 +36,6 @@ MIN_MATCHES = 16
 """Fewest matches of which a pair is verified."""
 
 _THRESHOLD_RAD = float(np.deg2rad(0.2))
-_MIN_WITH_PARALLAX = 8
-_NEAR, _MIN_NEAR = (10.0, 5.0, 2.0, 1.0), 8  # units of the threshold, inliers: refinement of a pose from other pairs
 
 
 @checks_settings
@@ -115,7 +107,7 @@ def verify_pair(
         return pair.failed(pose.reason)
     best = pair.judged(tried[0])
     if not best:
-        hypotheses = [pair.view(one)[0] for one in tried if np.isfinite(one.log10_false_alarms)]
+        hypotheses = [pair.view(one) for one in tried if np.isfinite(one.log10_false_alarms)]
         alarms = min((one.log10_false_alarms for one in hypotheses), default=0.0)
         return replace(best, log10_false_alarms=alarms).with_alternatives(hypotheses)
     if not (refine and max_alternatives):
@@ -175,24 +167,20 @@ def pose_near(
         The pose, |t| = 1; log₁₀ of its false alarms among all poses; and its weight (see `weight_of_pair`). None if
         hardly any match agrees, or those that do leave the direction open.
     """
-    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, _MIN_NEAR)
+    pair = _Pair(first, second, matches_idx, np.random.default_rng(0), _THRESHOLD_RAD, 8)
     p, q = pair.p, pair.q
     length = float(np.linalg.norm(pose.translation))
     if length <= 0:
         return None
-    near = Rigid3(pose.rotation, pose.translation / length)
-    for widen in _NEAR:
-        agree = agreement(near, p, q, threshold_rad=widen * pair.threshold_rad)[1]
-        if agree.sum() < _MIN_NEAR:
-            return None
-        near = refine_relative_pose(near, p[agree], q[agree], scale_rad=0.5 * widen * pair.threshold_rad)
-    evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
-    if not np.isfinite(evidence.log10_false_alarms):
+    bands = [widen * pair.threshold_rad for widen in (10.0, 5.0, 2.0, 1.0)]
+    near, enough = refined_on_agreeing(Rigid3(pose.rotation, pose.translation / length), p, q, thresholds_rad=bands)
+    if not enough:
         return None
-    if pair.why_open(evidence):
+    evidence = pair.evidence(near, sample=5, models=10)  # as if five matches had found it
+    if not np.isfinite(evidence.log10_false_alarms) or pair.why_open(evidence):
         return None
     alarms = evidence.log10_false_alarms
-    return near, alarms, weight_of_pair(first, second, pair.view(evidence)[0], log10_false_alarms=alarms)
+    return near, alarms, weight_of_pair(first, second, pair.view(evidence), log10_false_alarms=alarms)
 
 
 def weight_of_pair(first: Features, second: Features, view: TwoView, *, log10_false_alarms: float) -> float:
@@ -286,55 +274,64 @@ class _Pair:
         """
         inliers = agreement(pose, self.p, self.q, threshold_rad=self.threshold_rad)[1]
         count = int(inliers.sum())
-        witnesses = independent_count(self.p[inliers], self.q[inliers]) if count else 0
-        if witnesses <= sample:
-            return _Evidence(pose, count, witnesses, np.inf, enough=False)
-        # Also check among the inliers alone: if they are clustered along one epipolar circle, any match would agree.
-        chance = max(
-            chance_of_pose(pose, first, second, rng=self.rng, threshold_rad=self.threshold_rad)
-            for first, second in ((self.p, self.q), (self.p[inliers], self.q[inliers]))
-        )
-        alarms = log10_false_alarms(
-            witnesses,
-            max(independent_count(self.p, self.q), witnesses),
-            chance=chance,
+        witnesses, alarms = significance_of_pose(
+            pose,
+            self.p,
+            self.q,
+            agreeing=inliers,
+            rng=self.rng,
+            threshold_rad=self.threshold_rad,
+            fewest=sample + 1,
             sample=sample,
             models_per_sample=models,
         )
+        if witnesses <= sample:
+            return _Evidence(pose, count, witnesses, np.inf, enough=False)
         enough = witnesses >= self.min_inliers
         found = _Evidence(pose, count, witnesses, alarms, enough)
         if self.known or not (self.first.learned and self.second.learned):
             return found
-        marks = pair_marks(self.first, self.second, self.view(found)[0])
+        marks = pair_marks(self.first, self.second, self.view(found))
         log_odds = log_odds_of(alarms, marks)
         return replace(found, log_odds=log_odds, likely=log_odds >= ACCEPTED_ODDS or alarms <= CERTAIN)
 
-    def view(self, evidence: _Evidence) -> tuple[TwoView, FloatArray]:
-        """Return the geometry of a pose with inliers, and the parallax of each inlier in radians."""
+    def view(self, evidence: _Evidence) -> TwoView:
+        """Return the geometry of a pose with inliers."""
         pose = evidence.pose
         residuals, kept = agreement(pose, self.p, self.q, threshold_rad=self.threshold_rad)
         p, q, residuals = self.p[kept], self.q[kept], residuals[kept]
         rotation_std_deg, direction_std_deg = _determination(pose, (p, q), residuals, threshold_rad=self.threshold_rad)
-        parallax = angle_between(p @ pose.rotation.T, q)
-        view = TwoView(
+        return TwoView(
             matches_idx=self.matches_idx[kept],
             rotation=pose.rotation,
             direction=pose.translation,
             residuals_rad=residuals.astype(np.float32),
             geometry="general",
             candidates=len(self.p),
-            parallax_deg=float(np.rad2deg(np.median(parallax))),
+            parallax_deg=float(np.rad2deg(np.median(angle_between(p @ pose.rotation.T, q)))),
             rotation_std_deg=rotation_std_deg,
             direction_std_deg=direction_std_deg,
             log10_false_alarms=evidence.log10_false_alarms,
             unverified_idx=self.matches_idx[~kept],
         )
-        return view, parallax
 
     def why_open(self, evidence: _Evidence) -> str:
         """Return a reason if the matches that agree with a pose do not determine it; "" otherwise."""
-        view, parallax = self.view(evidence)
-        return _why_no_parallax(parallax, self.threshold_rad) or _why_open(view.direction_std_deg)
+        view = self.view(evidence)
+        rays = self.first.bearings[view.matches_idx[:, 0]], self.second.bearings[view.matches_idx[:, 1]]
+        parallax = angle_between(rays[0] @ view.rotation.T, rays[1])
+        moved = int((parallax > 4.0 * self.threshold_rad).sum())  # by more than the noise
+        if moved < 8:
+            return (
+                f"only {moved} of {len(parallax)} inliers {plural(moved, 'has', 'have')} parallax, 8 needed: the "
+                "images were taken too close together relative to the distance of the scene"
+            )
+        if view.direction_std_deg > 3.0:
+            return (
+                f"the matches determine the direction between the images only to {view.direction_std_deg:.0f}°: they "
+                "lie too close together, or have too little parallax"
+            )
+        return ""
 
     def judged(self, evidence: _Evidence) -> TwoView:
         """Return the geometry of a pose, or why its matches do not determine it."""
@@ -346,7 +343,7 @@ class _Pair:
                 chance = "but the images may show two things that look alike"
             return self.failed(f"{agreeing} on a relative pose, {chance if evidence.enough else few}")
         reason = self.why_open(evidence)
-        return self.failed(reason) if reason else self.view(evidence)[0]
+        return self.failed(reason) if reason else self.view(evidence)
 
 
 def _upright(pair: _Pair) -> list[_Evidence]:
@@ -400,11 +397,11 @@ def _most_probable(pair: _Pair, found: list[_Evidence], *, most: int, reason: st
         if all(are_distinct(one.pose, other.pose) for other in ranked):
             ranked.append(one)
     first, *others = [one for one in ranked if one] or ranked
-    views = [pair.view(one)[0] for one in others[:most]]
+    views = [pair.view(one) for one in others[:most]]
     if first:
-        return pair.view(first)[0].with_alternatives(views)
+        return pair.view(first).with_alternatives(views)
     failed = replace(pair.judged(first), log10_false_alarms=first.log10_false_alarms)
-    return failed.with_alternatives([pair.view(first)[0], *views])
+    return failed.with_alternatives([pair.view(first), *views])
 
 
 def _from_one_place(
@@ -424,24 +421,3 @@ def _from_one_place(
 
 def _agreeing(witnesses: int, count: int) -> str:
     return f"{witnesses} independent {plural(witnesses, f'match of {count} agrees', f'matches of {count} agree')}"
-
-
-def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
-    """Return a reason if hardly any inlier moved by more than the noise; "" otherwise."""
-    moved = int((parallax > 4.0 * threshold_rad).sum())  # in units of the threshold
-    if moved >= _MIN_WITH_PARALLAX:
-        return ""
-    return (
-        f"only {moved} of {len(parallax)} inliers {plural(moved, 'has', 'have')} parallax, {_MIN_WITH_PARALLAX} "
-        "needed: the images were taken too close together relative to the distance of the scene"
-    )
-
-
-def _why_open(direction_std_deg: float) -> str:
-    """Return a reason if the inliers do not determine the direction; "" otherwise."""
-    if direction_std_deg <= 3.0:
-        return ""
-    return (
-        f"the matches determine the direction between the images only to {direction_std_deg:.0f}°: they lie too close "
-        "together, or have too little parallax"
-    )

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.nearest_two import (
+    Comparable,
     NearestTwo,
     can_compare_as_integers,
     nearest_two,
-    nearest_two_integers,
 )
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
-from pano_mvs.core.errors import UsageError
 from tests.algorithms.features.test_matching import features
 from tests.oracles.features import match_one_by_one
 
@@ -40,7 +39,7 @@ def test_kernel_equals_the_plain_products(counts: tuple[int, int], size: int) ->
     """Counts at and beside full blocks of rows and columns; an odd number of components."""
     rng = np.random.default_rng([*counts, size])
     first, second = (draw(rng, count, size) for count in counts)
-    assert_same(nearest_two_integers(first, second), nearest_two(first, second))
+    assert_same(Comparable(first).nearest_two(Comparable(second)), nearest_two(first, second))
 
 
 @pytest.mark.kernel("matching.kernels_vector_match")
@@ -51,7 +50,7 @@ def test_kernel_settles_ties_as_the_plain_products_do() -> None:
     first, second = draw(rng, 90, 4, high=3), draw(rng, 300, 4, high=3)
     expected = nearest_two(first, second)
     assert np.sum(expected.squared == expected.next_squared) > 60
-    assert_same(nearest_two_integers(first, second), expected)
+    assert_same(Comparable(first).nearest_two(Comparable(second)), expected)
 
 
 @pytest.mark.kernel("matching.kernels_vector_match")
@@ -61,7 +60,7 @@ def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit() -> None:
     rng = np.random.default_rng(9)
     first, second = draw(rng, 40, 128, low=900, high=1025), draw(rng, 70, 128, low=-1024, high=-900)
     assert can_compare_as_integers(first)
-    found = nearest_two_integers(first, second)
+    found = Comparable(first).nearest_two(Comparable(second))
     exact = ((first[:, None].astype(np.int64) - second.astype(np.int64)) ** 2).sum(axis=2)
     np.testing.assert_array_equal(found.nearest, exact.argmin(axis=1))
     np.testing.assert_array_equal(found.squared, exact.min(axis=1).astype(np.float32))
@@ -89,14 +88,3 @@ def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual: b
     assert [tuple(match) for match in found.tolist()] == match_one_by_one(
         base, second, metric="l2", ratio=0.9, mutual=mutual
     )
-
-
-@needs_vector
-def test_refuses_what_it_cannot_compare() -> None:
-    whole = np.ones((4, 8), np.float32)
-    with pytest.raises(UsageError, match="nearest two among"):
-        nearest_two_integers(whole, whole[:1])
-    with pytest.raises(UsageError, match="nearest two among"):
-        nearest_two_integers(whole, np.ones((4, 6), np.float32))
-    with pytest.raises(UsageError, match="small integers"):
-        nearest_two_integers(whole, whole + np.float32(0.5))

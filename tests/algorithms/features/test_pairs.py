@@ -157,7 +157,7 @@ def test_compiled_and_plain_comparison_count_the_same(monkeypatch: pytest.Monkey
     rng = np.random.default_rng(6)
     samples = [rng.integers(0, 12, (50, 8)).astype(np.int16) for _ in range(4)]
     compiled = sample_matches(samples, np.zeros((4, 4)), neighbours=3)
-    monkeypatch.setattr("pano_mvs.algorithms.matching.neighbours.can_compare_as_integers", lambda _: False)
+    monkeypatch.setattr("pano_mvs.algorithms.matching.nearest_two.can_compare_as_integers", lambda _: False)
     np.testing.assert_array_equal(sample_matches(samples, np.zeros((4, 4)), neighbours=3), compiled)
 
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.adjustment import patch_alignment as alignment
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.kernels_patch_alignment import sample_patches
 from pano_mvs.algorithms.poses.adjustment.patch_alignment import align_tracks, aligned_shifts, smoothed_gray, window
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
@@ -278,8 +278,8 @@ def test_weighted_adjustment_beats_the_unweighted_one() -> None:
     for _ in range(12):
         bundle, sigmas = drawn_bundle(rng)
         # From the truth any step may look worse and be refused, whatever the weights.
-        alike = adjust_bundle(bundle, loss="huber", scale_rad=1.0)
-        weighed = adjust_bundle(replace(alike, sigmas=sigmas), loss="huber", scale_rad=1.0)
+        alike = adjust_bundle(bundle, RobustLoss("huber", 1.0))
+        weighed = adjust_bundle(replace(alike, sigmas=sigmas), RobustLoss("huber", 1.0))
         errors.append([rotation_error(found, bundle) for found in (alike, weighed)])
     plain, weighted = np.mean(errors, axis=0)
     assert weighted < 0.7 * plain
@@ -288,8 +288,8 @@ def test_weighted_adjustment_beats_the_unweighted_one() -> None:
 def test_equal_sigmas_are_another_scale_of_the_loss() -> None:
     bundle, _ = drawn_bundle(np.random.default_rng(8))
     twice = replace(bundle, sigmas=np.full(len(bundle.point_idx), 2.0))
-    first = adjust_bundle(bundle, loss="huber", scale_rad=2e-3)
-    second = adjust_bundle(twice, loss="huber", scale_rad=1e-3)
+    first = adjust_bundle(bundle, RobustLoss("huber", 2e-3))
+    second = adjust_bundle(twice, RobustLoss("huber", 1e-3))
     np.testing.assert_allclose(first.centers, second.centers, atol=1e-6)
 
 

@@ -85,7 +85,7 @@ def test_one_known_camera_gives_no_points_to_see(capture: Capture) -> None:
     poses = extend_poses(known_of(truth, ["0.jpg"]), features, two_views)
     assert poses.names == ("0.jpg",)
     assert len(poses.rejected) == 5
-    assert all("known from two other images" in reason for reason in poses.rejected.values())
+    assert all("shares enough points with a third image" in reason for reason in poses.rejected.values())
 
 
 def test_wrong_known_poses_reject_the_new_one(capture: Capture) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.refine import floor_lengths
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import rotation_from_rotvec
@@ -61,7 +61,7 @@ def longer_second_room(bundle: Bundle, factor: float) -> Bundle:
 
 def adjusted(bundle: Bundle, *, lengths: bool = True) -> Bundle:
     known = floor_lengths(bundle, scale_rad=SCALE_RAD) if lengths else None
-    return adjust_bundle(replace(bundle, lengths=known), loss="cauchy", scale_rad=SCALE_RAD, max_iterations=200)
+    return adjust_bundle(replace(bundle, lengths=known), RobustLoss("cauchy", SCALE_RAD), max_iterations=200)
 
 
 def size(bundle: Bundle, room: int) -> float:

@@ -12,7 +12,7 @@ import pytest
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.joining.alignment import Alignment
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, errors_and_residuals, match_errors, vector_of
+from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches
 from pano_mvs.algorithms.poses.joining.floors import height_above_floor
 from pano_mvs.algorithms.poses.joining.join_groups import _is_rival, _is_significant, _Joint, _PairEvidence
 from pano_mvs.algorithms.poses.placement.pair_evidence import significant_length
@@ -262,7 +262,6 @@ def test_pairs_decide_between_alignments_that_as_many_matches_support(
     ray = np.array([0.0, 0.0, 1.0])
     matches = CrossMatches(
         cameras=np.zeros((8, 2), np.intp),
-        keypoints=np.zeros((8, 2), np.int32),
         centers=np.tile(ray - ray, (8, 2, 1)),
         rays=np.tile(ray, (8, 2, 1)),
         ranges=np.ones((8, 2)),
@@ -275,12 +274,10 @@ def _alignment(log10_false_alarms: float) -> Alignment:
     return Alignment(
         Similarity3(1.0, np.eye(3), np.array([0.0, 0.0, -1.0])),
         inliers=np.zeros(8, np.bool_),
-        witnesses=0,
         log10_false_alarms=log10_false_alarms,
         rotation_std_deg=0.1,
         offset_std_deg=0.1,
         scale_std=0.01,
-        threshold_rad=0.01,
     )
 
 
@@ -321,8 +318,7 @@ def _drawn(count: int = 60) -> tuple[Similarity3, CrossMatches]:
     ranges = np.linalg.norm(offsets, axis=2)
     ranges[::3, 0] = np.nan
     ranges[::4, 1] = np.nan
-    numbers = np.zeros((count, 2), np.int32)
-    return similarity, CrossMatches(numbers.astype(np.intp), numbers, centers, rays, ranges)
+    return similarity, CrossMatches(np.zeros((count, 2), np.intp), centers, rays, ranges)
 
 
 def _plain_error(similarity: Similarity3, matches: CrossMatches, idx: int) -> float:
@@ -346,8 +342,8 @@ def test_errors_are_those_of_plain_geometry() -> None:
     similarity, matches = _drawn()
     plain = np.array([_plain_error(similarity, matches, idx) for idx in range(len(matches))])
     assert np.isnan(matches.ranges).all(axis=1).any()
-    np.testing.assert_allclose(match_errors(similarity, matches), plain, rtol=1e-6, atol=1e-9)
-    errors, residuals = errors_and_residuals(vector_of(similarity), matches)
+    errors, residuals = matches.errors(similarity)
+    np.testing.assert_allclose(errors, plain, rtol=1e-6, atol=1e-9)
     unknown = np.isnan(matches.ranges)
     assert (residuals[unknown[:, 0], :3] == 0).all()
     assert (residuals[unknown[:, 1], 3:6] == 0).all()
@@ -368,7 +364,7 @@ def _models(features: dict[str, Features], truth: dict[str, Rigid3], *, unit: fl
                 rays = features[name].bearings @ truth[name].rotation
                 middle = np.array([-2.0 if room == "a" else 2.0, 0.0, 0.0])
                 reach = (np.sign(rays) * (1.9, 1.3, 2.0) + middle - truth[name].center) / rays
-                model.set_ranges(image, scale * reach.min(axis=1))
+                model.known_ranges(image)[:] = scale * reach.min(axis=1)
         found.append(model)
     return found
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.camera_system import (
     camera_order,
     camera_solver,
@@ -130,8 +130,8 @@ def test_adjustment_does_not_depend_on_the_numbers_of_the_cameras() -> None:
         centers=bent.centers[order],
         image_idx=place[bent.image_idx].astype(np.int32),
     )
-    plain = adjust_bundle(bent, loss="cauchy", scale_rad=0.01, fixed_camera=4)
-    other = adjust_bundle(shuffled, loss="cauchy", scale_rad=0.01, fixed_camera=int(place[4]))
+    plain = adjust_bundle(bent, RobustLoss("cauchy", 0.01), fixed_camera=4)
+    other = adjust_bundle(shuffled, RobustLoss("cauchy", 0.01), fixed_camera=int(place[4]))
     np.testing.assert_allclose(other.centers[place], plain.centers, atol=1e-5)
     np.testing.assert_array_equal(plain.rotations[4], bundle.rotations[4])
     assert np.rad2deg(plain.errors_rad().max()) < 1e-3

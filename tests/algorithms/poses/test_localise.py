@@ -12,7 +12,7 @@ from pano_mvs.algorithms.faces.render import face_image
 from pano_mvs.algorithms.features.tangent import PhotographKeypoints, extract_orb, extract_sift, photograph_keypoints
 from pano_mvs.algorithms.poses.colmap.localise import Localised, localise_photograph
 from pano_mvs.algorithms.poses.photograph_alignment import PanoramaPatches, PhotographPatches
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints, has_sift, known_points, surface_points
+from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints, has_sift, known_points, surface_points
 from pano_mvs.core.arrays import Picture
 from pano_mvs.geometry import PinholeView, Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
@@ -63,7 +63,6 @@ def localised(
     focal_px: float | None = None,
     patches: PanoramaPatches | None = None,
     max_keypoints: int = 6000,
-    candidates: int = 20,
 ) -> Localised | str:
     size_hw = (picture.shape[0], picture.shape[1])
     return localise_photograph(
@@ -72,7 +71,6 @@ def localised(
         panoramas,
         focal_px=focal_px,
         patches=None if patches is None else PhotographPatches(picture, patches),
-        candidates=candidates,
         rng=np.random.default_rng(0),
     )
 
@@ -137,46 +135,6 @@ def test_patches_do_not_confirm_another_room(model: Model) -> None:
     pose = Rigid3.from_center(rotation_from_rotvec(np.array([0.1, 0.6, -0.2])), np.array([0.2, 0.1, 0.1]))
     picture = render_photograph(default_room(5), pose, PHOTO_HW, focal_px=FOCAL_PX, supersample=1)
     assert isinstance(localised(picture, model[0], focal_px=FOCAL_PX, patches=model[1]), str)
-
-
-@pytest.fixture(scope="module")
-def many(panoramas: dict[str, KnownPoints]) -> dict[str, KnownPoints]:
-    """The panoramas among those of another room, 20 units away."""
-    pose = Rigid3.from_center(np.eye(3), np.array([20.0, 0.0, 0.0]))
-    picture, ranges = render(default_room(5), Rigid3.identity(), SIZE_HW, supersample=1)
-    features = extract_sift(picture, np.ones(SIZE_HW, np.bool_))
-    range_map = RangeMap(ranges.astype(np.float32), np.full(SIZE_HW, 255, np.uint8))
-    other = known_points(features, pose, range_map, min_confidence=128)
-    names = ["w", *panoramas, "x", "y", "z"]
-    return {name: panoramas.get(name, other) for name in names}
-
-
-@pytest.mark.slow
-def test_a_large_capture_gives_the_pose_of_the_panoramas_that_show_the_place(
-    panoramas: dict[str, KnownPoints], many: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]
-) -> None:
-    expected = localised(taken[0], panoramas)
-    found = localised(taken[0], many, candidates=3)
-    assert isinstance(expected, Localised)
-    assert isinstance(found, Localised), found
-    assert_same(found, expected)
-    assert isinstance(localised(taken[0], {name: many[name] for name in "wxyz"}, candidates=3), str)
-
-
-def test_small_captures_are_matched_completely(
-    panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]
-) -> None:
-    expected, *found = (localised(taken[0], panoramas, candidates=candidates) for candidates in (0, 3, 20))
-    assert isinstance(expected, Localised)
-    for each in found:
-        assert isinstance(each, Localised)
-        assert_same(each, expected)
-
-
-def assert_same(found: Localised, expected: Localised) -> None:
-    assert found[1:] == expected[1:]
-    assert found.cam_from_world.rotation.tobytes() == expected.cam_from_world.rotation.tobytes()
-    assert found.cam_from_world.translation.tobytes() == expected.cam_from_world.translation.tobytes()
 
 
 def test_distortion_is_found(panoramas: dict[str, KnownPoints], taken: tuple[Picture, Rigid3]) -> None:

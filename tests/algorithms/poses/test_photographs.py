@@ -30,9 +30,14 @@ from pano_mvs.algorithms.poses.photograph_camera import (
     optical_center_offset,
     refine_by_sightings,
 )
-from pano_mvs.algorithms.poses.photograph_panoramas import LocatedPanoramas
+from pano_mvs.algorithms.poses.photograph_panoramas import (
+    KnownPoints,
+    LocatedPanoramas,
+    SurfacePoints,
+    known_points,
+    surface_points,
+)
 from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas as similar_to_each
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints, SurfacePoints, known_points, surface_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, RangeMap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.growth import grown_models, ranked_seeds
+from pano_mvs.algorithms.poses.growth import grown_model, ranked_seeds
 from pano_mvs.algorithms.poses.placement.placed_model import (
     Pairs,
     PlacedModel,
@@ -42,18 +42,14 @@ def model(capture: AliasedCapture, pairs: Pairs) -> PlacedModel:
 
 def test_true_cameras_choose_the_true_geometry_of_every_pair(model: PlacedModel) -> None:
     assert model.chosen == {edge: int(edge in FALSE) for edge in model.pairs.geometries}
-    assert model.explained_weight() == pytest.approx(
-        sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items())
-    )
-    assert 0.5 < model.explained_share() < 1
 
 
 def test_a_camera_that_stands_elsewhere_agrees_with_less(model: PlacedModel, capture: AliasedCapture) -> None:
-    before = model.explained_share()
+    before = dict(model.chosen)
     model.add(4, shifted_pose(capture.poses["4.jpg"], 3))
-    assert model.explained_share() < before
+    assert len(model.chosen) < len(before)
     model.add(4, capture.poses["4.jpg"])
-    assert model.explained_share() == pytest.approx(before)
+    assert model.chosen == before
 
 
 def test_a_copy_is_independent(model: PlacedModel, capture: AliasedCapture) -> None:
@@ -137,10 +133,9 @@ def test_the_first_seed_is_true_although_a_false_one_has_more_matches(pairs: Pai
 
 
 def test_a_grown_model_has_all_images_and_needs_no_rival(pairs: Pairs, capture: AliasedCapture) -> None:
-    best = grown_models(pairs, range(6), adjust=True, confirmation=None)[0]
-    assert best.refused == {}
-    assert best.is_satisfactory()
-    assert _error_deg(best.model, capture) < 0.5
+    grown, refused = grown_model(pairs, range(6), adjust=True, confirmation=None)
+    assert refused == {}
+    assert _error_deg(grown, capture) < 0.5
 
 
 def test_pairs_know_the_partners_with_most_matches_first(pairs: Pairs) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.adjustment.uncertainty import OffsetScale, estimate_offset_scale
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_poses
@@ -143,7 +143,7 @@ def ball_bundle(units_per_m: float, *, noise_rad: float, seed: int = 0) -> Bundl
 @pytest.mark.parametrize("start", [0.0, 0.5, 1.6])
 def test_one_step_finds_the_unit_from_any_start(start: float) -> None:
     bundle = ball_bundle(1.5, noise_rad=0.0)
-    scale = estimate_offset_scale(replace(bundle, units_per_m=start), loss="huber", scale_rad=0.1, neighbour=1)
+    scale = estimate_offset_scale(replace(bundle, units_per_m=start), RobustLoss("huber", 0.1), neighbour=1)
     assert scale.units_per_m == pytest.approx(1.5, rel=0.02)
 
 
@@ -151,10 +151,10 @@ def test_the_stated_uncertainty_is_that_of_the_unit() -> None:
     errors = []
     for seed in range(12):
         bundle = ball_bundle(1.5, noise_rad=0.002, seed=seed)
-        adjusted = adjust_bundle(bundle, loss="huber", scale_rad=0.1)
+        adjusted = adjust_bundle(bundle, RobustLoss("huber", 0.1))
         held = np.linalg.norm(adjusted.centers[1] - adjusted.centers[0])
         unit = held / np.linalg.norm(bundle.centers[1] - bundle.centers[0])
-        scale = estimate_offset_scale(adjusted, loss="huber", scale_rad=0.1, neighbour=1)
+        scale = estimate_offset_scale(adjusted, RobustLoss("huber", 0.1), neighbour=1)
         errors.append((scale.units_per_m / unit - 1.5) / (scale.std / unit))
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 2
 
@@ -162,9 +162,9 @@ def test_the_stated_uncertainty_is_that_of_the_unit() -> None:
 def test_without_offsets_there_is_no_unit() -> None:
     bundle = replace(ball_bundle(1.0, noise_rad=0.0), offsets_m=None)
     with pytest.raises(UsageError, match="without offsets of its rays has no unit"):
-        estimate_offset_scale(bundle, loss="huber", scale_rad=0.1, neighbour=1)
+        estimate_offset_scale(bundle, RobustLoss("huber", 0.1), neighbour=1)
     zero = replace(ball_bundle(1.0, noise_rad=0.0), offsets_m=np.zeros((750, 3)))
-    assert estimate_offset_scale(zero, loss="huber", scale_rad=0.1, neighbour=1).std == np.inf
+    assert estimate_offset_scale(zero, RobustLoss("huber", 0.1), neighbour=1).std == np.inf
     assert OffsetScale(-1.0, 0.1).relative_std == np.inf
 
 

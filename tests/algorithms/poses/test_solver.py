@@ -9,10 +9,9 @@ import pytest
 
 from pano_mvs.algorithms.poses.adjustment.bundle import (
     Bundle,
+    RobustLoss,
     adjust_bundle,
     reduced_cameras,
-    robust_cost,
-    robust_weights,
 )
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_span, dense_from_band
 from pano_mvs.algorithms.poses.adjustment.kernels_bundle import moved_points, ray_errors, reduced_system
@@ -325,7 +324,7 @@ def test_adjustment_finds_back_from_a_disturbed_start(loss: Literal["huber", "ca
         centers=true.centers + moves,
         points=true.points + 0.02 * rng.normal(size=true.points.shape),
     )
-    found = adjust_bundle(start, loss=loss, scale_rad=0.01, max_iterations=100)
+    found = adjust_bundle(start, RobustLoss(loss, 0.01), max_iterations=100)
     assert np.rad2deg(found.errors_rad().max()) < 1e-3
     np.testing.assert_array_equal(found.rotations[0], true.rotations[0])
     np.testing.assert_array_equal(found.centers[0], true.centers[0])
@@ -339,30 +338,30 @@ def test_a_camera_without_observations_stays() -> None:
     lonely = replace(
         bundle, point_idx=bundle.point_idx[kept], image_idx=bundle.image_idx[kept], bearings=bundle.bearings[kept]
     )
-    found = adjust_bundle(lonely, loss="cauchy", scale_rad=0.002)
+    found = adjust_bundle(lonely, RobustLoss("cauchy", 0.002))
     np.testing.assert_allclose(found.centers[3], bundle.centers[3], atol=1e-12)
     assert np.isfinite(found.points).all()
 
 
 def test_adjustment_never_raises_the_cost() -> None:
     bundle = bundle_of(np.random.default_rng(19), noise_deg=1.0)
-    found = adjust_bundle(bundle, loss="cauchy", scale_rad=0.01)
-    costs = [robust_cost(b.errors_rad(), loss="cauchy", scale_rad=0.01) for b in (found, bundle)]
+    found = adjust_bundle(bundle, RobustLoss("cauchy", 0.01))
+    costs = [RobustLoss("cauchy", 0.01).cost(b.errors_rad()) for b in (found, bundle)]
     assert costs[0] < costs[1]
 
 
 def test_adjustment_wants_observations_sorted_by_point() -> None:
     bundle = bundle_of(np.random.default_rng(20))
     with pytest.raises(UsageError, match="sorted by point"):
-        adjust_bundle(replace(bundle, point_idx=bundle.point_idx[::-1].copy()), loss="huber", scale_rad=0.01)
+        adjust_bundle(replace(bundle, point_idx=bundle.point_idx[::-1].copy()), RobustLoss("huber", 0.01))
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_weights_are_the_derivative_of_the_loss(loss: Literal["huber", "cauchy"]) -> None:
     for error in (0.001, 0.009, 0.02, 0.3):
         h = 1e-7
-        above, below = (robust_cost(np.array([error + s * h]), loss=loss, scale_rad=0.01) for s in (1, -1))
-        weight = robust_weights(np.array([error]), loss=loss, scale_rad=0.01)[0]
+        above, below = (RobustLoss(loss, 0.01).cost(np.array([error + s * h])) for s in (1, -1))
+        weight = RobustLoss(loss, 0.01).weights(np.array([error]))[0]
         assert (above - below) / (2 * h) == pytest.approx(2 * weight * error / 0.01**2, rel=1e-4)
 
 

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, triangulate_tracks
+from pano_mvs.algorithms.poses.adjustment.tracks import (
+    Tracks,
+    build_tracks,
+    triangulate_observations,
+    triangulate_tracks,
+)
 from pano_mvs.algorithms.poses.placement.pair_evidence import estimate_scale
-from pano_mvs.algorithms.poses.placement.view_graph import connected_groups, consistent_edges, relative_pose
+from pano_mvs.algorithms.poses.placement.view_graph import connected_groups, consistent_edges
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
@@ -143,13 +147,9 @@ def many_tracks(
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_points")
-@pytest.mark.parametrize("shuffled", [False, True])
-def test_triangulation_is_that_of_numpy(shuffled: bool) -> None:
+def test_triangulation_is_that_of_numpy() -> None:
     rng = np.random.default_rng(31)
     given = many_tracks(rng)
-    if shuffled:
-        order = rng.permutation(len(given[0]))
-        given = given[0][order], given[1][order], given[2][order]
     limits: dict[str, Any] = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
     found, expected = triangulate_observations(*given, **limits), triangulate_numpy(*given, **limits)
     assert 150 < expected.valid.sum() < 350
@@ -221,13 +221,11 @@ def test_edges_are_the_same_whichever_way_a_pair_is_stored() -> None:
     there = consistent_edges((a, b), {(a, b): view_of(poses, a, b)})
     back = consistent_edges((a, b), {(b, a): view_of(poses, b, a)})
     for edges in (there, back):
-        for first, second, names in ((0, 1, (a, b)), (1, 0, (b, a))):
-            found = relative_pose(edges, first, second)
-            true = poses[names[1]] @ poses[names[0]].inverse()
-            np.testing.assert_allclose(found.rotation, true.rotation, atol=1e-12)
-            np.testing.assert_allclose(
-                found.translation, true.translation / np.linalg.norm(true.translation), atol=1e-12
-            )
+        true = poses[b] @ poses[a].inverse()
+        np.testing.assert_allclose(edges[0, 1].rotation, true.rotation, atol=1e-12)
+        np.testing.assert_allclose(
+            edges[0, 1].direction, true.translation / np.linalg.norm(true.translation), atol=1e-12
+        )
 
 
 def test_groups_are_sorted_by_size() -> None:

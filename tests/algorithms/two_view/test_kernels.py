@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.minimal_solvers import essentials_from_five
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation
 from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import chance_of_pose
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec, skew
 from tests.algorithms.poses.synthetic_capture import random_rotation

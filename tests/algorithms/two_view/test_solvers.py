@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
-from pano_mvs.algorithms.two_view.essential import sampson_angles
-from pano_mvs.algorithms.two_view.minimal_solvers import SOLVERS, Solver, essentials_from_five
-from pano_mvs.algorithms.two_view.sampling import draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.minimal_solvers import (
+    SOLVERS,
+    Solver,
+    draw_samples,
+    essentials_from_five,
+    samples_needed,
+)
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
 from tests.algorithms.poses.synthetic_capture import (
@@ -22,7 +26,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_matches,
 )
 from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_of
-from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front
+from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front, sampson_angles
 
 
 def samples_of_five(

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
-from pano_mvs.algorithms.two_view.essential import essential_from_bearings, sampson_angles
+from pano_mvs.algorithms.two_view.minimal_solvers import essential_from_bearings
+from pano_mvs.algorithms.two_view.ransac import estimate_rotation
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import _linearised, pose_uncertainty, tangent_basis
-from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import independent_count, log10_false_alarms
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, rotation_from_rotvec, skew
@@ -22,7 +22,7 @@ from tests.algorithms.poses.synthetic_capture import (
     random_rotation,
     synthetic_matches,
 )
-from tests.oracles.two_view import in_front, moved_pose, poses_from_essential
+from tests.oracles.two_view import in_front, moved_pose, poses_from_essential, sampson_angles
 
 HARD = {
     "along x": ((0.5, 0, 0), (0, 0, 0)),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.two_view.upright import upright_poses
+from pano_mvs.algorithms.two_view.redirection import upright_poses
 from pano_mvs.algorithms.two_view.verification import verify_pair, verify_pose
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features

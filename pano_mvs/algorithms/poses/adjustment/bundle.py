@@ -17,6 +17,28 @@ from pano_mvs.geometry import rotation_from_rotvec
 
 Loss: TypeAlias = Literal["cauchy", "huber"]
 
+
+@dataclass(frozen=True, slots=True)
+class RobustLoss:
+    """The loss of errors r: Huber's min(r², 2 s r − s²), or Cauchy's s² log(1 + r²/s²)."""
+
+    kind: Loss
+    scale_rad: float  # s, the error at which an observation with sigma 1 starts to lose influence
+
+    def weights(self, errors_rad: FloatArray) -> FloatArray:
+        """Return the weight of each observation in the reweighted least-squares problem, (T,) in (0, 1]."""
+        relative = errors_rad / self.scale_rad
+        weights: FloatArray = 1 / (1 + relative**2) if self.kind == "cauchy" else 1 / np.maximum(relative, 1.0)
+        return weights
+
+    def cost(self, errors_rad: FloatArray) -> float:
+        """Return the loss summed over all observations, in units of the squared scale."""
+        relative = errors_rad / self.scale_rad
+        if self.kind == "cauchy":
+            return float(np.sum(np.log1p(relative**2)))
+        return float(np.sum(np.where(relative < 1, relative**2, 2 * relative - 1)))
+
+
 _LENGTH_PULL = 3.0  # standard deviations at which an expected length starts to lose influence
 
 
@@ -108,17 +130,16 @@ class Bundle:
         errors = self.errors_rad()
         return errors if self.sigmas is None else errors / self.sigmas
 
-    def weights(self, scaled_errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
+    def weights(self, scaled_errors_rad: FloatArray, loss: RobustLoss) -> FloatArray:
         """Return the weight of each squared error in the reweighted least-squares problem, (T,)."""
-        weights = robust_weights(scaled_errors_rad, loss=loss, scale_rad=scale_rad)
+        weights = loss.weights(scaled_errors_rad)
         return weights if self.sigmas is None else weights / self.sigmas**2
 
 
 def adjust_bundle(
     bundle: Bundle,
+    loss: RobustLoss,
     *,
-    loss: Loss,
-    scale_rad: float,
     max_iterations: int = 50,
     tolerance: float = 1e-7,
     fixed_camera: int = 0,
@@ -131,8 +152,7 @@ def adjust_bundle(
 
     Args:
         bundle: initial values.
-        loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
-        scale_rad: s, the error at which an observation with sigma 1 starts to lose influence.
+        loss: of the errors.
         max_iterations: maximum number of steps.
         tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
         fixed_camera: position of the camera that stays fixed.
@@ -147,8 +167,7 @@ def adjust_bundle(
     place = np.argsort(order)
     ordered = _adjust_ordered(
         with_camera_order(bundle, order, place),
-        loss=loss,
-        scale_rad=scale_rad,
+        loss,
         max_iterations=max_iterations,
         tolerance=tolerance,
         fixed_camera=int(place[fixed_camera]),
@@ -168,7 +187,7 @@ def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np
 
 
 def _adjust_ordered(
-    bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, tolerance: float, fixed_camera: int
+    bundle: Bundle, loss: RobustLoss, *, max_iterations: int, tolerance: float, fixed_camera: int
 ) -> Bundle:
     # Importing numba takes most of a second, so import it only where it is used.
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import ray_errors
@@ -182,13 +201,13 @@ def _adjust_ordered(
 
     def cost_of(of: Bundle, errors: FloatArray) -> float:
         lengths = 0.0 if of.lengths is None else of.lengths.cost(of.centers)
-        return robust_cost(errors, loss=loss, scale_rad=scale_rad) + lengths
+        return loss.cost(errors) + lengths
 
     errors = scaled_errors_rad(bundle)
     cost, damping = cost_of(bundle, errors), 1e-4
     for _ in range(max_iterations):
-        weights = bundle.weights(errors, loss=loss, scale_rad=scale_rad)
-        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera, scale_rad=scale_rad)
+        weights = bundle.weights(errors, loss)
+        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera, scale_rad=loss.scale_rad)
         moved_errors = scaled_errors_rad(moved)
         moved_cost = cost_of(moved, moved_errors)
         if not moved_cost < cost:
@@ -201,21 +220,6 @@ def _adjust_ordered(
         if converged:
             break
     return bundle
-
-
-def robust_weights(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
-    """Return the weight of each observation in the reweighted least-squares problem, (T,) in (0, 1]."""
-    relative = errors_rad / scale_rad
-    weights: FloatArray = 1 / (1 + relative**2) if loss == "cauchy" else 1 / np.maximum(relative, 1.0)
-    return weights
-
-
-def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> float:
-    """Return the robust loss summed over all observations, in units of the squared scale."""
-    relative = errors_rad / scale_rad
-    if loss == "cauchy":
-        return float(np.sum(np.log1p(relative**2)))
-    return float(np.sum(np.where(relative < 1, relative**2, 2 * relative - 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,14 +251,13 @@ class _Layout:
         return _Layout(starts, width, tangent_basis(bundle.bearings), bundle.origins)
 
 
-def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
+def reduced_cameras(
+    bundle: Bundle, weights: FloatArray, *, damping: float, layout: _Layout | None = None
+) -> ReducedCameras:
     """Return the reduced camera system of a weighted bundle; points are damped, cameras are not."""
-    return _reduced_cameras(bundle, _Layout.of(bundle), weights, damping=damping)
-
-
-def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float) -> ReducedCameras:
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import reduced_system
 
+    layout = layout or _Layout.of(bundle)
     return ReducedCameras(
         *reduced_system(
             bundle.rotations,
@@ -277,7 +280,7 @@ def _step(
     """Return the bundle after one damped step."""
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import moved_points
 
-    system = _reduced_cameras(bundle, layout, weights, damping=damping)
+    system = reduced_cameras(bundle, weights, damping=damping, layout=layout)
     if bundle.lengths is not None:
         bundle.lengths.add_to(system, bundle.centers, scale_rad=scale_rad)
     # The small constant keeps a camera without observations in place.

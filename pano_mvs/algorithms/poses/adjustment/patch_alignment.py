@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
@@ -25,8 +26,6 @@ _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
 _FLOOR = 0.1  # samples: error that the deviation of the aligned patches does not include
-_NOT_ALIGNED = 0.3  # samples: sigma of an observation that does not align and keeps its detected position …
-_NOT_TRIED = 0.15  # … and of an observation of a track beyond the maximum that is aligned
 _MAX_PER_IMAGE = 1500  # observations: if there are more, their number gives enough precision
 _AT_ONCE = 100_000  # observations whose patches are in memory at a time
 
@@ -66,7 +65,8 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     chosen = np.zeros(len(lengths), np.bool_)
     chosen[order[np.cumsum(lengths[order]) <= _MAX_PER_IMAGE * len(poses.names)]] = True
     chosen = chosen[poses.track_point_idx]  # observations of the longest tracks
-    sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
+    # In samples: of an observation that does not align and keeps its detected position, and of one that is not tried.
+    sigmas_rad = np.where(chosen, 0.3, 0.15) * step_rad
     for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
         _align_block(poses, sightings, block, load=load, step_rad=step_rad, bearings=bearings, sigmas_rad=sigmas_rad)
     return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))
@@ -190,12 +190,10 @@ def _masked(mask: NDArray[np.bool_], rays: tuple[FloatArray, FloatArray, FloatAr
     masked = np.zeros(len(middles), np.bool_)
     if mask.all():
         return masked
-    height, width = mask.shape
     steps = np.linspace(-(SIZE - 1) / 2, (SIZE - 1) / 2, 5)
     for across in steps:
         for down in steps:
-            pixels = pixel_from_ray(middles + across * first_axes + down * second_axes, mask.shape).astype(np.intp)
-            masked |= ~mask[pixels[:, 1].clip(max=height - 1), pixels[:, 0] % width]
+            masked |= ~mask[pixels_containing(middles + across * first_axes + down * second_axes, mask.shape)]
     return masked
 
 

@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, ReducedCameras, reduced_cameras, with_camera_order
+from pano_mvs.algorithms.poses.adjustment.bundle import (
+    Bundle,
+    ReducedCameras,
+    RobustLoss,
+    reduced_cameras,
+    with_camera_order,
+)
 from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, held
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.arrays import FloatArray
@@ -30,12 +36,12 @@ class HeldCameras:
     variance: float  # of a residual with weight 1
 
 
-def held_cameras(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> HeldCameras:
+def held_cameras(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> HeldCameras:
     """Return the system of an adjusted bundle; the parameters are those of `camera_deviations`."""
     order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
     place = np.argsort(order)
     ordered = with_camera_order(bundle, order, place)
-    weights = ordered.weights(ordered.scaled_errors_rad(), loss=loss, scale_rad=scale_rad)
+    weights = ordered.weights(ordered.scaled_errors_rad(), loss)
     errors = ordered.errors_rad()
     system = reduced_cameras(ordered, weights, damping=0.0)
     band, _ = held(system.band, system.gradient, int(place[0]))
@@ -47,7 +53,7 @@ def held_cameras(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int
     return HeldCameras(ordered, place, weights, system, band, unseen, variance)
 
 
-def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> tuple[FloatArray, FloatArray]:
+def camera_deviations(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations of camera centres and rotations, given the first camera and first baseline.
 
     The covariance is σ² S⁻¹, where S is the reduced system of the cameras with the robust weights w at the optimum
@@ -58,7 +64,6 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
     Args:
         bundle: an adjusted bundle.
         loss: the loss of the adjustment.
-        scale_rad: the scale of that loss.
         neighbour: position of the camera whose distance to the first is the unit of length.
 
     Returns:
@@ -66,7 +71,7 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
         in radians. Zero for the first camera; NaN if unknown: for a camera without observations, or if the system is
         singular.
     """
-    held_system = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
+    held_system = held_cameras(bundle, loss, neighbour=neighbour)
     place, band, unseen = held_system.place, held_system.band, held_system.unseen
     variance = held_system.variance
     try:
@@ -115,17 +120,15 @@ class OffsetScale:
         return self.std / self.units_per_m if self.units_per_m > 0 else float("inf")
 
 
-def estimate_offset_scale(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> OffsetScale:
+def estimate_offset_scale(bundle: Bundle, loss: RobustLoss, *, neighbour: int) -> OffsetScale:
     """Return the units per metre that fit the rays best, by one Gauss–Newton step from the bundle's own value.
 
-    Residuals are r(u) ≈ r + g (u − u₀), where u is the units per metre and g = −Bᵀ (I − x̂ x̂ᵀ) o / |x|. Of g, only the
-    part counts that no movement of the cameras and points explains (variable projection; Golub & Pereyra 1973). The
-    first camera and the length of the first baseline are held, because without offsets they define the unit.
+    Residuals are r(u) ≈ r + g (u − u₀), where u is the units per metre and g = −Bᵀ (I − x̂ x̂ᵀ) o / |x|. The first
+    camera and the length of the first baseline are held, because without offsets they define the unit.
 
     Args:
         bundle: an adjusted bundle with offsets.
         loss: the loss of the adjustment.
-        scale_rad: the scale of that loss.
         neighbour: position of the camera whose distance to the first is held.
 
     Raises:
@@ -133,19 +136,37 @@ def estimate_offset_scale(bundle: Bundle, *, loss: Loss, scale_rad: float, neigh
     """
     if bundle.offsets_m is None:
         raise UsageError("a bundle without offsets of its rays has no unit of length")
-    held = held_cameras(bundle, loss=loss, scale_rad=scale_rad, neighbour=neighbour)
+    held = held_cameras(bundle, loss, neighbour=neighbour)
     derivatives = ray_derivatives(held.bundle)
     assert held.bundle.offsets_m is not None
     by_unit = -np.einsum("tij,tj->ti", derivatives.by_ray, held.bundle.offsets_m)
+    step, covariance = parameter_step(held, derivatives, by_unit[..., None])
+    return OffsetScale(bundle.units_per_m + float(step[0]), float(np.sqrt(covariance[0, 0])))
+
+
+def parameter_step(
+    held: HeldCameras, derivatives: RayDerivatives, by_parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss–Newton step of parameters of all rays, (K,), and its covariance; 0 and inf if it is unknown.
+
+    Of the derivatives, only the part counts that no movement of cameras and points explains (variable projection;
+    Golub & Pereyra 1973).
+
+    Args:
+        held: the system of the cameras.
+        derivatives: those of the bundle of the system.
+        by_parameters: (T, 2, K) derivatives of the residuals by the parameters.
+    """
+    count = by_parameters.shape[2]
     try:
-        own = unexplained(held, derivatives, by_unit)
+        own = np.stack([unexplained(held, derivatives, by) for by in np.moveaxis(by_parameters, 2, 0)], axis=-1)
+        information = np.einsum("t,tik,til->kl", held.weights, own, own)
+        covariance = held.variance * np.linalg.inv(information)
     except LinAlgError:
-        return OffsetScale(bundle.units_per_m, float("inf"))
-    information = float(np.sum(held.weights[:, None] * own**2))
-    if not information > 0:
-        return OffsetScale(bundle.units_per_m, float("inf"))
-    step = -float(np.sum(held.weights[:, None] * own * derivatives.residuals)) / information
-    return OffsetScale(bundle.units_per_m + step, float(np.sqrt(held.variance / information)))
+        return np.zeros(count), np.full((count, count), np.inf)
+    step = -np.linalg.solve(information, np.einsum("t,tik,ti->k", held.weights, own, derivatives.residuals))
+    known = np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()
+    return (step, covariance) if known else (np.zeros(count), np.full((count, count), np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

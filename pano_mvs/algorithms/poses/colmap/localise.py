@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,22 +14,14 @@ from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.algorithms.poses.colmap.mapping import colmap_seed
 from pano_mvs.algorithms.poses.photograph_alignment import Aligned, PhotographPatches
 from pano_mvs.algorithms.poses.photograph_camera import FocalPrior, PhotographCamera, refine_camera
-from pano_mvs.algorithms.poses.photograph_panoramas import similar_panoramas
-from pano_mvs.algorithms.poses.photograph_surface import KnownPoints
+from pano_mvs.algorithms.poses.photograph_panoramas import KnownPoints
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
 _FOV_BOUNDS_DEG = (15.0, 120.0)
-# How well EXIF's focal length, or a guessed one, is known: the standard deviation of its natural logarithm.
-_EXIF_LOG_STD, _GUESSED_LOG_STD = 0.1, 0.4
-# With a pose, key points within this many times the maximum error of a point's place are compared with it.
-_GUIDED_ROUNDS, _GUIDED, _GUIDED_RATIO, _MAX_DISTANCE = 2, 2.0, 0.9, 300.0
-# The inliers must spread over the picture: the standard deviation of their pixels, as a share of its diagonal.
-_MIN_SPREAD = 0.05
-_FEW, _SINGLE_PANORAMAS, _LOOSE_RATIO = 8, 5, 0.9
-# Patches refine a pose if there are at least this many, and if they turn the camera by less than this.
-_MIN_ALIGNED, _MAX_TURN = 40, float(np.radians(2.0))
+_FEW = 8
+_MIN_ALIGNED = 40  # patches that refine a pose
 
 
 class Localised(NamedTuple):
@@ -51,16 +43,13 @@ def localise_photograph(
     focal_px: float | None,
     patches: PhotographPatches | None = None,
     learned: Mapping[str, NDArray[np.int32]] | None = None,
-    candidates: Annotated[
-        int, Setting("number of most similar panoramas to match each photograph with; 0: all", ge=0)
-    ] = 20,
     min_inliers: Annotated[int, Setting("minimum number of key points that agree with the pose", ge=6)] = 30,
     max_error_deg: Annotated[float, Setting("maximum error of a key point that agrees", gt=0, le=5)] = 0.4,
     rng: np.random.Generator,
 ) -> Localised | str:
     """Estimate the pose and the focal length of a photograph, or return the reason why that is not possible.
 
-    Its key points are matched with those of the most similar panoramas. LO-RANSAC finds the pose, with the focal length
+    Its key points are matched with those of the panoramas. LO-RANSAC finds the pose, with the focal length
     unless it is known (as implemented by COLMAP). Pose, focal length and one coefficient of radial distortion are then
     refined, with more matches, which are looked for near the places that the pose predicts, and with patches of the
     panoramas. If the key points alone are too few, the patches decide: also between the poses that single panoramas
@@ -77,7 +66,6 @@ def localise_photograph(
     """
     if patches is not None and patches.too_narrow:
         return f"it is {size_hw[1]} × {size_hw[0]} pixels, which is too narrow to be compared with panoramas"
-    panoramas = _similar(keypoints, panoramas, candidates)
     by_network = learned or {}
     each = {name: _matches(keypoints, known, learned=by_network.get(name)) for name, known in panoramas.items()}
     matches = _joined(each.values())
@@ -87,9 +75,9 @@ def localise_photograph(
         )
     if focal_px is None:
         # Without a focal length in the file, a picture is taken to be as wide as most phones' for the first guess.
-        prior = FocalPrior(max(size_hw) / 2 / float(np.tan(np.radians(65.0) / 2)), _GUESSED_LOG_STD)
+        prior = FocalPrior(max(size_hw) / 2 / float(np.tan(np.radians(65.0) / 2)), 0.4)
     else:
-        prior = FocalPrior(focal_px, _EXIF_LOG_STD)
+        prior = FocalPrior(focal_px, 0.1)
     search = _Search(
         keypoints=keypoints,
         size_hw=size_hw,
@@ -103,19 +91,9 @@ def localise_photograph(
     found = search.located(matches, seed=colmap_seed(rng))
     if isinstance(found, Localised | _Cropped) or patches is None:
         return found
-    most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:_SINGLE_PANORAMAS]
-    singly = [_matches(keypoints, panoramas[name], ratio=_LOOSE_RATIO, learned=by_network.get(name)) for name in most]
+    most = sorted(panoramas, key=lambda name: -len(each[name].pixels_px))[:5]
+    singly = [_matches(keypoints, panoramas[name], ratio=0.9, learned=by_network.get(name)) for name in most]
     return search.confirmed([matches, *(one for one in singly if len(one.pixels_px) >= _FEW)], rng) or found
-
-
-def _similar(
-    keypoints: PhotographKeypoints, panoramas: Mapping[str, KnownPoints], count: int
-) -> dict[str, KnownPoints]:
-    if not 0 < count < len(panoramas):
-        return dict(panoramas)
-    described = ((name, known.descriptors) for name, known in panoramas.items())
-    (chosen,) = similar_panoramas([keypoints.descriptors], described, count=count)
-    return {name: panoramas[name] for name in chosen}
 
 
 class _Matches(NamedTuple):
@@ -225,7 +203,9 @@ class _Search:
         found = pycolmap.estimate_absolute_pose(matches.pixels_px, matches.points_in_world, camera, estimation)
         if found is None:
             return None
-        return PhotographCamera(_rigid(found["cam_from_world"]), float(camera.params[0]), 0.0)
+        pose = found["cam_from_world"]
+        cam_from_world = Rigid3(pose.rotation.matrix(), np.array(pose.translation))
+        return PhotographCamera(cam_from_world, float(camera.params[0]), 0.0)
 
     def refined(self, matches: _Matches, camera: PhotographCamera) -> PhotographCamera:
         """Return the camera with the smallest errors of its inliers."""
@@ -239,11 +219,9 @@ class _Search:
     def guided(self, matches: _Matches, camera: PhotographCamera) -> tuple[_Matches, list[str], PhotographCamera]:
         """Return matches near the places that a camera predicts, the panoramas with most of them, and the camera."""
         names: list[str] = []
-        for _ in range(_GUIDED_ROUNDS):
+        for _ in range(2):
             each = {
-                name: _guided_matches(
-                    self.keypoints, known, camera, size_hw=self.size_hw, max_error=_GUIDED * self.max_error
-                )
+                name: _guided_matches(self.keypoints, known, camera, size_hw=self.size_hw, max_error=2 * self.max_error)
                 for name, known in self.panoramas.items()
             }
             matches = _joined([matches, *each.values()])
@@ -267,11 +245,7 @@ class _Search:
     def _close(self, camera: PhotographCamera, aligned: PhotographCamera) -> bool:
         """Return whether patches left the camera about where key points had put it."""
         turn = geodesic_angle(camera.cam_from_world.rotation, aligned.cam_from_world.rotation)
-        return bool(turn < _MAX_TURN) and _FOV_BOUNDS_DEG[0] < aligned.fov_deg(self.size_hw) < _FOV_BOUNDS_DEG[1]
-
-
-def _rigid(pose: Any) -> Rigid3:
-    return Rigid3(pose.rotation.matrix(), np.array(pose.translation))
+        return bool(turn < np.radians(2.0)) and _FOV_BOUNDS_DEG[0] < aligned.fov_deg(self.size_hw) < _FOV_BOUNDS_DEG[1]
 
 
 def _matches(
@@ -312,7 +286,7 @@ def _guided_matches(
         for idx in inside.tolist():
             nearby = tree.query_ball_point(seen[idx], camera.focal_px * max_error, return_sorted=True)
             distance, key = _most_similar(keypoints.descriptors, nearby, known.descriptors[idx].astype(np.float32))
-            if distance < chosen.get(key, (_MAX_DISTANCE, 0))[0]:
+            if distance < chosen.get(key, (300.0, 0))[0]:
                 chosen[key] = distance, idx
     return _Matches(
         keypoints.pixels_px[list(chosen)].reshape(-1, 2),
@@ -328,7 +302,7 @@ def _most_similar(
         return np.inf, -1
     distances = np.linalg.norm(descriptors[candidates] - wanted, axis=1)
     best = int(distances.argmin())
-    if len(distances) > 1 and distances[best] > _GUIDED_RATIO * np.partition(distances, 1)[1]:
+    if len(distances) > 1 and distances[best] > 0.9 * np.partition(distances, 1)[1]:
         return np.inf, -1
     return float(distances[best]), candidates[best]
 
@@ -362,6 +336,7 @@ def _implausible(
     if not _FOV_BOUNDS_DEG[0] <= fov_deg <= _FOV_BOUNDS_DEG[1] or abs(camera.radial) > 0.5:
         return f"its matches give an implausible camera: {fov_deg:.0f}° wide, distortion {camera.radial:.2f}"
     spread = np.linalg.svd(inliers_px - inliers_px.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(inliers_px))
-    if spread < _MIN_SPREAD * np.hypot(*size_hw):
+    # The standard deviation of the pixels, as a share of the diagonal.
+    if spread < 0.05 * np.hypot(*size_hw):
         return "its matches lie on a line or in one spot, which does not determine a pose"
     return ""

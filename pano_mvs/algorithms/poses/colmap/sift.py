@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.colmap.mapping import THREADS, quiet_colmap
-from pano_mvs.algorithms.two_view.essential import sampson_angles
+from pano_mvs.algorithms.two_view.cheirality import agreement
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
+from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.scene import Features, TwoView
 
 
@@ -122,13 +122,13 @@ def _two_view(geometry: Any, first: Features, second: Features) -> TwoView:
     if length == 0 or not len(matches):
         return TwoView.failed("COLMAP found no relative pose", candidates=len(matches))
     second_from_first = Rigid3(pose.rotation.matrix(), np.array(pose.translation) / length)
-    essential = skew(second_from_first.translation) @ second_from_first.rotation
-    residuals = sampson_angles(essential, first.bearings[matches[:, 0]], second.bearings[matches[:, 1]])
+    rays = first.bearings[matches[:, 0]], second.bearings[matches[:, 1]]
+    residuals, _ = agreement(second_from_first, *rays, threshold_rad=1.0)
     return TwoView(
         matches_idx=matches,
         rotation=second_from_first.rotation,
         direction=second_from_first.translation,
-        residuals_rad=np.abs(residuals).astype(np.float32),
+        residuals_rad=residuals.astype(np.float32),
         geometry="general",
         candidates=len(matches),
     )

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.poses.colmap.mapping import (
     registered_panoramas,
     run_mapper,
 )
-from pano_mvs.algorithms.poses.frame.gauge import moved_poses, normalised_poses
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses, no_poses, normalised_poses
 from pano_mvs.algorithms.poses.placement.resection import best_pair, why_no_pair
 from pano_mvs.core.settings import Setting
 from pano_mvs.geometry import Similarity3
@@ -67,7 +67,7 @@ def solve_colmap(
             width_px=_width_px(features),
         )
     except (RuntimeError, ValueError, IndexError) as error:
-        return _nothing(features, f"COLMAP's {mapper} mapper failed: {error}")
+        return no_poses(dict.fromkeys(features, f"COLMAP's {mapper} mapper failed: {error}"))
     groups: list[Poses] = []
     registered: set[str] = set()
     for model in models:
@@ -77,7 +77,7 @@ def solve_colmap(
             groups.append(normalised_poses(group))
             registered.update(group.names)
     if not groups:
-        return _nothing(features, f"COLMAP's {mapper} mapper found no model of two or more panoramas")
+        return no_poses(dict.fromkeys(features, f"COLMAP's {mapper} mapper found no model of two or more panoramas"))
     return join_groups(groups, order=tuple(features), rejected=_rejected(features, two_views, registered))
 
 
@@ -156,16 +156,6 @@ def _in_world_of(known: Poses, poses: Poses) -> Poses:
 
 def _width_px(features: Mapping[str, Features]) -> float:
     return float(np.median([found.size_hw[1] for found in features.values()])) if features else 1024.0
-
-
-def _nothing(features: Mapping[str, Features], reason: str) -> Poses:
-    return Poses.without_points(
-        {},
-        rejected=dict.fromkeys(features, reason),
-        frame="the first registered camera",
-        scale="none: no image is registered",
-        metric=False,
-    )
 
 
 def _rejected(features: Mapping[str, Features], two_views: TwoViews, registered: Collection[str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,17 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Similarity3, similarity_from_points
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
+
+
+def no_poses(rejected: Mapping[str, str]) -> Poses:
+    """Return the poses of a capture of which no image is registered, with the reason for each."""
+    return Poses.without_points(
+        {},
+        rejected=rejected,
+        frame="the first registered camera",
+        scale="none: no image is registered",
+        metric=False,
+    )
 
 
 def normalised_poses(poses: Poses) -> Poses:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,8 +17,10 @@ from pano_mvs.algorithms.poses.frame.upside_down import most_probable_up, upside
 from pano_mvs.algorithms.poses.frame.vertical_lines import (
     Picture,
     Segments,
-    directions_around,
+    Upward,
+    contrast_of,
     find_segments,
+    most_supported,
     orthogonal_directions,
     up_from_lines,
 )
@@ -31,11 +34,6 @@ Evidence = Literal["auto", "sensors", "lines", "structure", "cameras"]
 
 SURE = 0.8
 """Probability from which a capture is taken to be upside down. Of upright ones that were measured, none reaches .01."""
-
-# Errors that all sensors of a type, or all cameras of one person, have in common; that of a single reading.
-_SENSOR_BIAS_DEG, _CAMERA_BIAS_DEG, _SINGLE_READING_DEG = 0.5, 1.0, 1.0
-# Of the median of the angles between directions and their mean, in terms of the standard deviation of the direction.
-_STD_PER_MEDIAN = 0.85 * np.sqrt(2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +112,8 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
     states = plural(int(kept.sum()), "states", "state")
     evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas {states}{agreement}"
     if len(measured) == 1:
-        return Vertical(up, "sensors", evidence, uncertainty_deg=_SINGLE_READING_DEG)
-    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, int(kept.sum()), _SENSOR_BIAS_DEG)
+        return Vertical(up, "sensors", evidence, uncertainty_deg=1.0)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, int(kept.sum()), 0.5)
     return Vertical(up, "sensors", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
@@ -131,7 +129,7 @@ def vertical_from_cameras(poses: Poses) -> Vertical:
             f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
         )
     evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
-    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), _CAMERA_BIAS_DEG)
+    uncertainty_deg = _mean_uncertainty_deg(disagreement_deg, len(poses.names), 1.0)
     return Vertical(up, "cameras", evidence, disagreement_deg, uncertainty_deg=uncertainty_deg)
 
 
@@ -146,13 +144,9 @@ def vertical_from_lines(poses: Poses, pictures: Mapping[str, Picture]) -> Vertic
     if not prior:
         return _of_turned_cameras(poses, pictures, find_segments(pictures, rotations)) if pictures else prior
     lines = up_from_lines(find_segments(pictures, rotations, prior.up_in_world), prior.up_in_world)
-    if not lines:
-        return _unknown(lines.reason)
-    reason = _too_far(lines.up, prior, "vertical lines are")
-    if reason:
-        return _unknown(reason)
-    evidence = f"{lines.count} vertical lines in the pictures"
-    return Vertical(lines.up, "lines", evidence, prior.disagreement_deg, uncertainty_deg=lines.uncertainty_deg)
+    return _near_cameras(
+        lines, prior, "lines", what="vertical lines are", evidence=f"{lines.count} vertical lines in the pictures"
+    )
 
 
 def _of_turned_cameras(poses: Poses, pictures: Mapping[str, Picture], segments: Segments) -> Vertical:
@@ -181,17 +175,24 @@ def vertical_from_structure(poses: Poses) -> Vertical:
     if not prior:
         return prior
     layers = sharpest_up(poses.points_in_world, poses.centers, prior.up_in_world)
-    if not layers:
-        return _unknown(layers.reason)
-    reason = _too_far(layers.up, prior, "layers of sparse points are")
-    if reason:
-        return _unknown(reason)
     moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
     evidence = (
         f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
         f"of {len(poses.names)} cameras"
     )
-    return Vertical(layers.up, "structure", evidence, prior.disagreement_deg, uncertainty_deg=layers.uncertainty_deg)
+    return _near_cameras(layers, prior, "structure", what="layers of sparse points are", evidence=evidence)
+
+
+def _near_cameras(found: Upward, prior: Vertical, source: str, *, what: str, evidence: str) -> Vertical:
+    """Return a direction as the vertical, unless it is too far from that of the cameras."""
+    moved_deg = float(np.rad2deg(angle_between(found.up, prior.up_in_world)))
+    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
+    # ramp.
+    if found and moved_deg > 2.0 + 3 * 1.4826 * prior.disagreement_deg:
+        return _unknown(f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction")
+    if not found:
+        return _unknown(found.reason)
+    return Vertical(found.up, source, evidence, prior.disagreement_deg, uncertainty_deg=found.uncertainty_deg)
 
 
 def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -221,17 +222,10 @@ def _of_one_camera(poses: Poses) -> Vertical:
     return Vertical(poses.rotations[0].T @ UP, "cameras", "a single camera", 2.0)
 
 
-def _too_far(up: FloatArray, prior: Vertical, what: str) -> str:
-    """Return why a direction cannot be the vertical, if it is too far from that of the cameras; else ""."""
-    moved_deg = float(np.rad2deg(angle_between(up, prior.up_in_world)))
-    # Lines or surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a
-    # ramp.
-    limit_deg = 2.0 + 3 * 1.4826 * prior.disagreement_deg
-    return f"the {what} tilted by {moved_deg:.1f}° against the cameras' up direction" if moved_deg > limit_deg else ""
-
-
 def _mean_uncertainty_deg(disagreement_deg: float, count: int, bias_deg: float) -> float:
-    return float(np.hypot(bias_deg, _STD_PER_MEDIAN * disagreement_deg / np.sqrt(count)))
+    """Return the standard deviation of a mean, with an error that all sensors, or all cameras, have in common."""
+    # 0.85 √2: of the median of the angles between directions and their mean, in standard deviations of a direction.
+    return float(np.hypot(bias_deg, 0.85 * np.sqrt(2.0) * disagreement_deg / np.sqrt(count)))
 
 
 def _unknown(reason: str) -> Vertical:
@@ -240,26 +234,9 @@ def _unknown(reason: str) -> Vertical:
 
 # Search around a given up direction: half width and step in degrees, layer thickness relative to the typical range.
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
-_MIN_POINTS = 100
-_PARTS = 4
-_CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
-_BINS_PER_WIDTH = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class Layers:
-    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none."""
-
-    up: FloatArray  # (3,) unit vector
-    contrast: float  # sharpness of the layers relative to the median direction within 8°
-    reason: str = ""  # why there is none; else ""
-    uncertainty_deg: float = float("nan")  # standard deviation of the direction, from four parts of the points
-
-    def __bool__(self) -> bool:
-        return not self.reason
-
-
-def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Layers:
+def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Upward:
     """Return the direction within 20° of `up` along which the points' heights are most concentrated.
 
     Concentration is the integral of the squared density of heights (the exponential of the negative Rényi entropy of
@@ -270,48 +247,37 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
         centers: (N, 3) camera centres in the world.
         up: (3,) unit vector around which to search.
     """
-    if len(points) < _MIN_POINTS:
-        return Layers(up, 0.0, f"{len(points)} sparse points are too few for level surfaces; {_MIN_POINTS} are needed")
+    if len(points) < 100:
+        return Upward(up, reason=f"{len(points)} sparse points are too few for level surfaces; 100 are needed")
     offsets = points - np.median(centers, axis=0)
     ranges = np.linalg.norm(offsets, axis=1)
     typical = float(np.median(ranges))
     near = offsets[ranges < 3 * typical] / typical
-    best, width = up, 0.0
-    for half_deg, step_deg, width in _ROUNDS:
-        candidates = directions_around(best, half_deg, step_deg)
-        best = candidates[int(np.argmax([_concentration(near @ candidate, width) for candidate in candidates]))]
-    others = directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
-    usual = np.median([_concentration(near @ other, width) for other in others])
-    contrast = float(_concentration(near @ best, width) / usual)
+    best = most_supported(partial(_concentrations, near), up, _ROUNDS)
+    contrast = contrast_of(partial(_concentrations, near), best, _ROUNDS[-1][2])
     # Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms,
     # 200 to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
     if contrast < 1.3:
-        return Layers(up, contrast, f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
-    return Layers(best, contrast, uncertainty_deg=_scatter_deg(near, best))
+        return Upward(up, reason=f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
+    # The standard deviation of the mean of the directions of four parts of the points.
+    parts = [most_supported(partial(_concentrations, near[part::4]), best, _ROUNDS[1:]) for part in range(4)]
+    offs = [float(np.rad2deg(angle_between(found, best))) for found in parts]
+    return Upward(best, uncertainty_deg=float(np.hypot(np.sqrt(np.mean(np.square(offs)) / 4), _ROUNDS[-1][1])))
 
 
-def _scatter_deg(points: FloatArray, up: FloatArray) -> float:
-    """Return the standard deviation of the mean of the directions of four parts of the points."""
-    offs = []
-    for part in range(_PARTS):
-        found = up
-        for half_deg, step_deg, width in _ROUNDS[1:]:
-            candidates = directions_around(found, half_deg, step_deg)
-            sharpness = [_concentration(points[part::_PARTS] @ candidate, width) for candidate in candidates]
-            found = candidates[int(np.argmax(sharpness))]
-        offs.append(float(np.rad2deg(angle_between(found, up))))
-    return float(np.hypot(np.sqrt(np.mean(np.square(offs)) / _PARTS), _ROUNDS[-1][1]))
+def _concentrations(points: FloatArray, candidates: FloatArray, width: float) -> FloatArray:
+    return np.array([_concentration(points @ candidate, width) for candidate in candidates])
 
 
 def _concentration(heights: FloatArray, width: float) -> float:
     """Return the integral of the squared density of heights, smoothed to a given width."""
-    step = width / _BINS_PER_WIDTH
+    step = width / 2
     positions = (heights - heights.min()) / step
     lower = positions.astype(np.int64)
     fractions = positions - lower
     size = int(lower.max()) + 2
     counts = np.bincount(lower, 1 - fractions, size) + np.bincount(lower + 1, fractions, size)
-    smooth = gaussian_filter1d(counts, _BINS_PER_WIDTH, mode="constant")
+    smooth = gaussian_filter1d(counts, 2.0, mode="constant")
     return float(np.sum(smooth**2)) / (step * len(heights) ** 2)
 
 

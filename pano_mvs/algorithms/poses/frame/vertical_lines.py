@@ -24,12 +24,13 @@ from pano_mvs.geometry import UP, PinholeView, rotation_from_rotvec, rotation_fr
 Picture = Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 """Returns a panorama (H, W, 3) uint8 and its valid pixels (H, W)."""
 
+Support = Callable[[FloatArray, float], FloatArray]
+
 SIDES = 4
 """Views of a panorama around the horizon; the other two look up and down."""
-# Search around the given up direction, as for level surfaces: half width, step and tolerance in degrees.
+# Search around the given up direction: half width, step and tolerance in degrees.
 _ROUNDS = ((20.0, 2.0, 3.0), (2.0, 0.5, 1.0), (0.5, 0.1, 0.5))
 _MIN_SEGMENTS = 20
-_CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +50,12 @@ class Segments:
 
 
 @dataclass(frozen=True, eq=False)
-class VerticalLines:
-    """The direction that vertical lines agree on; falsy, with the reason, if there is none."""
+class Upward:
+    """The direction near a given one on which lines or points agree; falsy, with the reason, if there is none."""
 
     up: FloatArray  # (3,) unit vector
     count: int = 0  # number of segments that agree on it
-    # standard deviation of the direction, from leaving out one view at a time, and 0.1° for what all views have in
-    # common
-    uncertainty_deg: float = float("nan")
-    contrast: float = 0.0  # weight of agreeing segments relative to the median direction within 8°
+    uncertainty_deg: float = float("nan")  # standard deviation of the direction
     reason: str = ""  # why there is none; else ""
 
     def __bool__(self) -> bool:
@@ -90,7 +88,7 @@ def find_segments(
     return segments if up is None else segments.nearly_vertical(up, groups=len(found))
 
 
-def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
+def up_from_lines(segments: Segments, up: FloatArray) -> Upward:
     """Return the direction within 20° of `up` that most segments point to.
 
     Args:
@@ -98,20 +96,37 @@ def up_from_lines(segments: Segments, up: FloatArray) -> VerticalLines:
         up: (3,) unit vector around which to search.
     """
     if len(segments.weights) < _MIN_SEGMENTS:
-        return VerticalLines(up, reason=_few(len(segments.weights)))
-    best = up
-    for half_deg, step_deg, tolerance_deg in _ROUNDS:
-        candidates = directions_around(best, half_deg, step_deg)
-        best = candidates[int(np.argmax(_support(segments, candidates, tolerance_deg)))]
-    tolerance_deg = _ROUNDS[-1][2]
-    others = _support(segments, directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG), tolerance_deg)
-    contrast = float(_support(segments, best[None], tolerance_deg)[0] / max(float(np.median(others)), 1e-12))
+        return Upward(up, reason=_few(len(segments.weights)))
+
+    def support(candidates: FloatArray, tolerance_deg: float) -> FloatArray:
+        return _support(segments, candidates, tolerance_deg)
+
+    best = most_supported(support, up, _ROUNDS)
+    contrast = contrast_of(support, best, _ROUNDS[-1][2])
     # Minimum ratio of the weight of agreeing segments to the median over all directions within 8°.
     if contrast < 1.5:
-        return VerticalLines(
-            up, contrast=contrast, reason=f"the pictures have no clear vertical lines ({contrast:.1f})"
-        )
-    return _refined(segments, best, contrast)
+        return Upward(up, reason=f"the pictures have no clear vertical lines ({contrast:.1f})")
+    return _refined(segments, best)
+
+
+def most_supported(support: Support, up: FloatArray, rounds: Sequence[tuple[float, float, float]]) -> FloatArray:
+    """Return the direction with most support, from coarse to fine.
+
+    Args:
+        support: returns the support of directions (K, 3), given a tolerance.
+        up: (3,) unit vector around which to search.
+        rounds: half width and step in degrees, and tolerance.
+    """
+    for half_deg, step_deg, tolerance in rounds:
+        candidates = directions_around(up, half_deg, step_deg)
+        up = candidates[int(np.argmax(support(candidates, tolerance)))]
+    return up
+
+
+def contrast_of(support: Support, up: FloatArray, tolerance: float) -> float:
+    """Return the support of a direction relative to the median over all directions within 8°."""
+    usual = float(np.median(support(directions_around(up, 8.0, 1.0), tolerance)))
+    return float(support(up[None], tolerance)[0] / max(usual, 1e-12))
 
 
 def orthogonal_directions(segments: Segments) -> FloatArray | None:
@@ -193,7 +208,7 @@ def _support(segments: Segments, candidates: FloatArray, tolerance_deg: float) -
     return support
 
 
-def _refined(segments: Segments, up: FloatArray, contrast: float) -> VerticalLines:
+def _refined(segments: Segments, up: FloatArray) -> Upward:
     """Return the least-squares direction of the agreeing segments, with its standard deviation by the jackknife."""
     tolerance = np.sin(np.deg2rad(_ROUNDS[-1][2]))
     groups = int(segments.groups.max()) + 1
@@ -209,17 +224,17 @@ def _refined(segments: Segments, up: FloatArray, contrast: float) -> VerticalLin
         up = _weakest(moments.sum(axis=0), up)
     count = int(near.sum())
     if count < _MIN_SEGMENTS:
-        return VerticalLines(up, count, contrast=contrast, reason=_few(count))
+        return Upward(up, count, reason=_few(count))
     spread = np.linalg.eigvalsh(moments.sum(axis=0))
     # The rest of the weight must not be in one plane: edges at one azimuth leave the tilt towards them unknown.
     if spread[1] < 0.05 * spread[2]:
-        return VerticalLines(up, count, contrast=contrast, reason="all vertical lines are in one direction")
+        return Upward(up, count, reason="all vertical lines are in one direction")
     used = [number for number in range(groups) if moments[number].any()]
     without = np.array([_weakest(moments.sum(axis=0) - moments[number], up) for number in used])
     deviations = without - without.mean(axis=0)
     variance = (len(used) - 1) / len(used) * float((deviations**2).sum())
-    # Rendered rooms: errors of 0.03° to 0.13°, whatever the number of lines.
-    return VerticalLines(up, count, float(np.hypot(0.1, np.rad2deg(np.sqrt(variance)))), contrast)
+    # 0.1° for what all views have in common. Rendered rooms: errors of 0.03° to 0.13°, whatever the number of lines.
+    return Upward(up, count, float(np.hypot(0.1, np.rad2deg(np.sqrt(variance)))))
 
 
 def _weakest(moment: FloatArray, up: FloatArray) -> FloatArray:

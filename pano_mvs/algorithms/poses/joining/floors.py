@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pano_mvs.algorithms.points.floor import floor_below
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.geometry import Rigid3, ranges_from_bearings
+from pano_mvs.geometry import Rigid3, Similarity3, ranges_from_bearings
 
-_MAX_TILT_RAD = float(np.deg2rad(3.0))  # of a typical camera against all: others are not known to be upright
-# Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
-_MAX_SPREAD = 0.05
 LENGTH_STD = 0.06
 """Relative standard deviation of a length by the floor that a pair sees. 45 pairs of a real tour: 1.33 to 1.58 m."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownLengths:
+    """What is known of lengths between two models without matches."""
+
+    scale: float | None = None  # of first_from_second; None if unknown
+    # (K, 2, 3) camera centres of pairs with a known length, each in its own model
+    centers: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    lengths: FloatArray = field(default_factory=lambda: np.zeros(0))  # (K,) in the unit of the first model
+
+    @classmethod
+    def between(
+        cls, first: PlacedModel, second: PlacedModel, lengths: Mapping[Edge, float], *, scale: float | None
+    ) -> KnownLengths:
+        """Return the lengths of pairs of an image of either model."""
+        centers = [[first.cameras[i].center, second.cameras[j].center] for i, j in lengths]
+        return cls(scale, np.array(centers).reshape(-1, 2, 3), np.array(list(lengths.values())))
+
+    def deviations(self, similarity: Similarity3) -> FloatArray:
+        """Return how far the lengths of an alignment are from the known ones, (K,), in standard deviations."""
+        found = np.linalg.norm(similarity.apply(self.centers[:, 1]) - self.centers[:, 0], axis=1)
+        return np.asarray(np.log(np.maximum(found, 1e-12) / self.lengths) / LENGTH_STD)
 
 
 def height_above_floor(model: PlacedModel) -> float:
@@ -63,8 +85,10 @@ def _height(points: FloatArray, cameras: Sequence[Rigid3], ups_in_cam: Sequence[
     ups = np.array([camera.rotation.T @ up for camera, up in zip(cameras, ups_in_cam, strict=True)])
     up = ups.mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
-    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > _MAX_TILT_RAD:
+    # Of a typical camera against all: others are not known to be upright.
+    if np.median(np.arccos(np.clip(ups @ up, -1, 1))) > np.deg2rad(3.0):
         return 0.0
     centers = np.array([camera.center for camera in cameras])
     floor = floor_below(points, centers, up)
-    return floor.depth if floor and np.std(centers @ up) <= _MAX_SPREAD * floor.depth else 0.0
+    # Of heights within a model, relative to the floor; .4 to 1.3 % in a real tour, whose five models agree within 4 %.
+    return floor.depth if floor and np.std(centers @ up) <= 0.05 * floor.depth else 0.0

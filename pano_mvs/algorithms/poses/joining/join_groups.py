@@ -8,13 +8,11 @@ from itertools import count
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.joining.alignment import Alignment, KnownLengths, align_models
-from pano_mvs.algorithms.poses.joining.cross_matches import CrossMatches, match_errors, stacked
-from pano_mvs.algorithms.poses.joining.floors import LENGTH_STD, height_above_floor, length_by_floor
-from pano_mvs.algorithms.poses.joining.proposals import PairHypothesis
-from pano_mvs.algorithms.poses.placement.pair_evidence import oriented, significant_length
+from pano_mvs.algorithms.poses.joining.alignment import Alignment, PairHypothesis, align_models
+from pano_mvs.algorithms.poses.joining.cross_matches import THRESHOLD_RAD, CrossMatches
+from pano_mvs.algorithms.poses.joining.floors import LENGTH_STD, KnownLengths, height_above_floor, length_by_floor
+from pano_mvs.algorithms.poses.placement.pair_evidence import AGREEING, oriented, significant_length
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
 from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.two_view.significance import MAX_LOG10_FALSE_ALARMS
@@ -22,14 +20,9 @@ from pano_mvs.algorithms.two_view.verification import pose_near, weight_of_pair
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle
 from pano_mvs.scene import TwoView
 
-_THRESHOLD_RAD = float(np.deg2rad(0.4))
 _MAX_LOG10_FALSE_ALARMS = -10.0
-_MAX_TURN_STD_DEG, _MAX_OFFSET_STD_DEG, _MAX_SCALE_STD = 1.0, 3.0, 0.1
 _SAME_TURN_RAD, _SAME_DIRECTION_RAD = float(np.deg2rad(2.0)), float(np.deg2rad(4.0))
-_MAX_LOG10_OF_LENGTH, _LENGTH = -1.0, float(np.log(1.25))
-_OWN_OF_RIVAL, _MIN_OWN = 2.0, 5  # evidence for the best alignment, such as matches, that a rival does not explain
-_PAIRS = 12  # number of pairs of images whose matches align two models, the most significant ones
-_NEIGHBOURS = 5  # number of models with which each one is aligned
+_OWN_OF_RIVAL = 2.0  # evidence for the best alignment, such as matches, that a rival does not explain
 
 Part = tuple[PlacedModel, tuple[int, ...]]
 
@@ -74,17 +67,13 @@ def _promising(models: Mapping[int, PlacedModel]) -> Iterator[tuple[int, int]]:
         if one is None or other is None or one == other or not len(view.all_matches_idx):
             continue
         if max(len(models[one].cameras), len(models[other].cameras)) > 1:
-            pair = _larger_first(models, one, other)
+            pair = max((one, other), (other, one), key=lambda each: (len(models[each[0]].cameras), -each[0]))
             evidence[pair] = min(evidence.get(pair, np.inf), view.log10_false_alarms)
     chosen = set()
     for idx in models:
         partners = sorted((pair for pair in evidence if idx in pair), key=lambda pair: (evidence[pair], pair))
-        chosen |= {*partners[:_NEIGHBOURS]}
+        chosen |= {*partners[:5]}
     yield from sorted(chosen)
-
-
-def _larger_first(models: Mapping[int, PlacedModel], a: int, b: int) -> tuple[int, int]:
-    return (a, b) if (len(models[a].cameras), -a) >= (len(models[b].cameras), -b) else (b, a)
 
 
 class _Joint(NamedTuple):
@@ -107,26 +96,14 @@ def _certain_joint(first: PlacedModel, second: PlacedModel) -> _Joint | None:
     Their heights above the floor are equal where both are known, which determines lengths that matches hardly do.
     """
     views = _views_between(first, second)
-    matches = cross_matches(
-        first, second, {(i, j): view.all_matches_idx[:, :: 1 if i < j else -1] for (i, j), view in views.items()}
-    )
+    matches = CrossMatches.between(first, second, views)
+    learned = _is_learned(first)
+    has_scale = len(second.cameras) > 1
     heights = None
-    if _is_learned(first) and any(views.values()):
+    if learned and any(views.values()):
         height = height_above_floor(first)
-        both = height, height_above_floor(second) if len(second.cameras) > 1 else height
+        both = height, height_above_floor(second) if has_scale else height
         heights = both if all(both) else None
-    return _by_matches(first, second, matches, views=views, heights=heights)
-
-
-def _by_matches(
-    first: PlacedModel,
-    second: PlacedModel,
-    matches: CrossMatches,
-    *,
-    views: Mapping[Edge, TwoView],
-    heights: tuple[float, float] | None = None,
-) -> _Joint | None:
-    """Return the certain alignment of two models, with equal heights above the floor if these are given."""
     scale = heights[0] / heights[1] if heights else None
     lengths = _lengths_by_floor(first, views, height=heights[0]) if heights else {}
     hypotheses = {pair: _hypotheses((first, second), pair, view) for pair, view in views.items()}
@@ -135,17 +112,11 @@ def _by_matches(
             own, *others = hypotheses[pair]
             hypotheses[pair] = [replace(own, lengths=(length, length / scale)), *others]
     known = KnownLengths.between(first, second, lengths, scale=scale)
-    learned = _is_learned(first)
-    has_scale = len(second.cameras) > 1
     # Of the alignments with which many learned matches agree, the most significant one; the others may rival it.
-    found = _aligned(matches, hypotheses, known, has_scale=has_scale)
+    found = align_models(matches, hypotheses=hypotheses, known=known, has_scale=has_scale)
     certain: list[_Joint] = []
     for one in _distinct(found, first, second) if learned else found[:1]:
-        if (
-            one.rotation_std_deg > _MAX_TURN_STD_DEG
-            or one.offset_std_deg > _MAX_OFFSET_STD_DEG
-            or one.scale_std > _MAX_SCALE_STD
-        ):
+        if one.rotation_std_deg > 1.0 or one.offset_std_deg > 3.0 or one.scale_std > 0.1:
             continue
         evidence = _evidence_of_pairs(one, first, second, views=views)
         if scale and _has_known_length(one, first, second, views=views, lengths=lengths):
@@ -156,7 +127,8 @@ def _by_matches(
         return None
     best = max(certain, key=lambda joint: joint.strength)
     # Where structure repeats, an alignment with another, similar place has matches of its own.
-    rest = _aligned(matches[np.flatnonzero(~best.alignment.inliers)], hypotheses, known, has_scale=has_scale)
+    unexplained = matches[np.flatnonzero(~best.alignment.inliers)]
+    rest = align_models(unexplained, hypotheses=hypotheses, known=known, has_scale=has_scale)
     rivals = [
         *certain,
         *(_Joint(other, _evidence_of_pairs(other, first, second, views=views), learned) for other in rest[:1]),
@@ -308,10 +280,10 @@ def _has_lengths(
         _lengths(models, pair, view), (length, length / similarity.scale), models, strict=True
     ):
         if len(model.cameras) > 1:
-            if not abs(np.log(found / expected)) < _LENGTH:
+            if not abs(np.log(found / expected)) < np.log(AGREEING):
                 return False
             log10_alarms += alarms
-    return log10_alarms < _MAX_LOG10_OF_LENGTH
+    return log10_alarms < -1.0
 
 
 def _views_between(first: PlacedModel, second: PlacedModel) -> dict[Edge, TwoView]:
@@ -324,7 +296,7 @@ def _views_between(first: PlacedModel, second: PlacedModel) -> dict[Edge, TwoVie
         if (min(i, j), max(i, j)) in compared
     }
     ranked = sorted(found, key=lambda pair: (found[pair].log10_false_alarms, pair))
-    return {pair: found[pair] for pair in ranked[:_PAIRS]}
+    return {pair: found[pair] for pair in ranked[:12]}
 
 
 def _hypotheses(models: tuple[PlacedModel, PlacedModel], pair: Edge, view: TwoView) -> list[PairHypothesis]:
@@ -353,18 +325,6 @@ def _lengths(
     return found[0], found[1]
 
 
-def _aligned(
-    matches: CrossMatches,
-    hypotheses: Mapping[Edge, Sequence[PairHypothesis]],
-    known: KnownLengths,
-    *,
-    has_scale: bool,
-) -> list[Alignment]:
-    if not matches.known.any() and not len(known.lengths):
-        return []
-    return align_models(matches, threshold_rad=_THRESHOLD_RAD, has_scale=has_scale, hypotheses=hypotheses, known=known)
-
-
 def _is_rival(best: _Joint, other: _Joint, matches: CrossMatches) -> bool:
     """Return whether another alignment of two models explains nearly as much of its own as the best one.
 
@@ -378,46 +338,10 @@ def _is_rival(best: _Joint, other: _Joint, matches: CrossMatches) -> bool:
         return own < _OWN_OF_RIVAL * others
     if other.alignment.log10_false_alarms > 0:
         return False
-    explained: NDArray[np.bool_] = (
-        match_errors(other.alignment.first_from_second, matches) < best.alignment.threshold_rad
-    )
+    explained = matches.errors(other.alignment.first_from_second)[0] < THRESHOLD_RAD
     own_matches = int((best.alignment.inliers & ~explained & matches.known).sum())
     others_matches = int((explained & ~best.alignment.inliers & matches.known).sum())
-    return own_matches < _OWN_OF_RIVAL * others_matches + _MIN_OWN
-
-
-def cross_matches(
-    first: PlacedModel, second: PlacedModel, matches: Mapping[tuple[int, int], NDArray[np.int32]]
-) -> CrossMatches:
-    """Return matches between the images of two models, with the rays and known ranges of both.
-
-    Args:
-        first: a model.
-        second: another model of the same capture, which shares no image with the first one.
-        matches: (image of the first model, image of the second one) to (M, 2) positions of key points.
-    """
-    parts = []
-    for (one, other), found in sorted(matches.items()):
-        cameras = first.cameras[one], second.cameras[other]
-        both = ((first, one, cameras[0]), (second, other, cameras[1]))
-        parts.append(
-            CrossMatches(
-                cameras=np.tile(np.array([[one, other]], np.intp), (len(found), 1)),
-                keypoints=np.asarray(found, np.int32),
-                centers=np.tile(np.stack([camera.center for camera in cameras])[None], (len(found), 1, 1)),
-                rays=np.stack(
-                    [
-                        model.pairs.bearings[image][found[:, side]] @ camera.rotation
-                        for side, (model, image, camera) in enumerate(both)
-                    ],
-                    axis=1,
-                ),
-                ranges=np.stack(
-                    [model.known_ranges(image)[found[:, side]] for side, (model, image, _) in enumerate(both)], axis=1
-                ),
-            )
-        )
-    return stacked(parts)
+    return own_matches < _OWN_OF_RIVAL * others_matches + 5
 
 
 def joined_model(first: PlacedModel, second: PlacedModel, first_from_second: Similarity3) -> PlacedModel:
@@ -429,7 +353,7 @@ def joined_model(first: PlacedModel, second: PlacedModel, first_from_second: Sim
     for image, camera in second.cameras.items():
         center = first_from_second.apply(camera.center[None])[0]
         model.cameras[image] = Rigid3.from_center(camera.rotation @ turn.T, center)
-        model.set_ranges(image, scale * second.known_ranges(image))
+        model.known_ranges(image)[:] = scale * second.known_ranges(image)
     model.chosen |= second.chosen
     return model
 

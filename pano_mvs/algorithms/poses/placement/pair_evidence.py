@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -18,9 +18,13 @@ from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
 ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
+ScaleOf: TypeAlias = Callable[[FloatArray, FloatArray], float]
+"""`estimate_scale` with an estimator: ratios of single features and their weights to one scale factor."""
 
 
-def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
+def estimate_scale(
+    ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator = "cauchy", kappa: float = 0.01
+) -> float:
     """Estimate one scale factor from the ratios of single features.
 
     "kappa" is the paper's estimator: the ratio with most other ratios within κ (absolute). "log_median" is the median
@@ -68,11 +72,9 @@ def _median(values: FloatArray) -> float:
     return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))
 
 
-MIN_RATIOS = 6
-# Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
-# ratios.
-_AGREEING, MIN_AGREEING = 1.25, 0.4
-_TOLERANCES = np.log(_AGREEING) / 2.0 ** np.arange(4)
+_MIN_RATIOS = 6
+AGREEING = 1.25
+"""Lengths within this factor agree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +160,7 @@ def gather_pair_evidence(
     geometries: Mapping[Edge, tuple[Geometry, ...]],
     cameras: Mapping[int, Rigid3],
     ranges: Sequence[FloatArray],
-    estimator: ScaleEstimator,
-    kappa: float,
+    scale_of: ScaleOf = estimate_scale,
 ) -> PairEvidence:
     """Return the evidence of the pairs of an image with registered partners.
 
@@ -169,8 +170,7 @@ def gather_pair_evidence(
         geometries: of all pairs (i, j), i < j.
         cameras: cam_from_world of registered images.
         ranges: (N,) known range of every image's key points in scene units, NaN where unknown.
-        estimator: see `estimate_scale`.
-        kappa: see `estimate_scale`.
+        scale_of: estimates a length from the ratios of known ranges.
     """
     rows = []
     for partner in partners:
@@ -181,8 +181,7 @@ def gather_pair_evidence(
                 ranges[partner][matches[:, 0]],
                 geometry.unit_ranges[int(partner > image)],
                 geometry.parallax_rad,
-                estimator=estimator,
-                kappa=kappa,
+                scale_of=scale_of,
             )
             rows.append(
                 (
@@ -221,23 +220,16 @@ def oriented(view: TwoView, first: int, second: int) -> tuple[Rigid3, NDArray[np
     return pose.inverse(), reversed_matches
 
 
-def _length(
-    known_ranges: FloatArray,
-    unit_ranges: FloatArray,
-    parallax: FloatArray,
-    *,
-    estimator: ScaleEstimator,
-    kappa: float,
-) -> float:
+def _length(known_ranges: FloatArray, unit_ranges: FloatArray, parallax: FloatArray, *, scale_of: ScaleOf) -> float:
     """Return the length of the translation that puts points at their known ranges; NaN if it is not determined."""
     ratios = known_ranges / unit_ranges
     known = np.isfinite(ratios)
     ratios = ratios[known]
-    if len(ratios) < MIN_RATIOS:
+    if len(ratios) < _MIN_RATIOS:
         return np.nan
-    length = estimate_scale(ratios, np.sin(parallax[known]) ** 2, estimator=estimator, kappa=kappa)
-    agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
-    return length if agreeing >= max(MIN_RATIOS, MIN_AGREEING * len(ratios)) else np.nan
+    length = scale_of(ratios, np.sin(parallax[known]) ** 2)
+    agreeing = int((np.abs(np.log(ratios / length)) < np.log(AGREEING)).sum())
+    return length if agreeing >= max(_MIN_RATIOS, 0.4 * len(ratios)) else np.nan
 
 
 def significant_length(
@@ -260,7 +252,8 @@ def significant_length(
     known, unit, parallax = known_ranges[usable], unit[usable], parallax[usable]
     if len(known) < 2:
         return np.nan, np.inf
-    length = estimate_scale(known / unit, np.sin(parallax) ** 2, estimator="cauchy", kappa=0.0)
+    length = estimate_scale(known / unit, np.sin(parallax) ** 2)
+    tolerances = np.log(AGREEING) / 2.0 ** np.arange(4)
     off = np.abs(np.log(known / unit / length))
     shuffled = np.abs(np.log(rng.permuted(np.tile(known, (50, 1)), axis=1) / unit / length))
     alarms = [
@@ -269,9 +262,9 @@ def significant_length(
             len(known),
             chance=float((shuffled < tolerance).sum() + 1) / (shuffled.size + 1),
             sample=1,
-            models_per_sample=len(_TOLERANCES),
+            models_per_sample=len(tolerances),
         )
-        for tolerance in _TOLERANCES
+        for tolerance in tolerances
     ]
     return length, min(alarms)
 

@@ -9,12 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
-from pano_mvs.algorithms.poses.placement.growing_model import GrowingModel
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, RobustLoss, adjust_bundle
+from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, Triangulated, build_tracks, triangulate_observations
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
     PairEvidence,
-    ScaleEstimator,
+    ScaleOf,
+    estimate_scale,
     gather_pair_evidence,
     geometries_of,
     oriented,
@@ -34,9 +35,7 @@ class Pairs:
 
     features: Mapping[str, Features]  # key points by image name, in the capture's order
     geometries: Mapping[Edge, tuple[Geometry, ...]]  # (i, j), i < j, to the geometries of the pair, the heaviest first
-    # how translation scale factors are estimated from the ratios of single features
-    estimator: ScaleEstimator = "cauchy"
-    kappa: float = 0.01  # the paper's κ
+    scale_of: ScaleOf = estimate_scale  # estimates translation scale factors from the ratios of single features
     # (i, j), i < j, to the two-view geometry of each pair that a matcher has compared, with or without success; None:
     # all, without matches
     compared: Mapping[Edge, TwoView] | None = None
@@ -86,23 +85,21 @@ def pairs_of(
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     *,
-    estimator: ScaleEstimator = "cauchy",
-    kappa: float = 0.01,
+    scale_of: ScaleOf = estimate_scale,
 ) -> Pairs:
     """Return the pairs of a capture, with all geometries; pairs whose rotations contradict other pairs are left out.
 
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
-        estimator: see `estimate_scale`.
-        kappa: see `estimate_scale`.
+        scale_of: estimates translation scale factors from the ratios of single features.
     """
     names = tuple(features)
     geometries = {
         (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
         for (a, b), view in consistent_edges(names, two_views).items()
     }
-    return Pairs(features, geometries, estimator, kappa, views_by_position(names, two_views))
+    return Pairs(features, geometries, scale_of, views_by_position(names, two_views))
 
 
 @dataclass(eq=False)
@@ -130,10 +127,6 @@ class PlacedModel:
         """Return the ranges of all key points of an image, (N,), NaN where unknown; not a copy."""
         return self._ranges[image]
 
-    def set_ranges(self, image: int, ranges: FloatArray) -> None:
-        """Replace the ranges of all key points of an image, (N,)."""
-        self._ranges[image][:] = ranges
-
     def evidence(self, image: int, partners: Sequence[int] | None = None) -> PairEvidence:
         """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
@@ -144,8 +137,7 @@ class PlacedModel:
             geometries=self.pairs.geometries,
             cameras=self.cameras,
             ranges=self._ranges,
-            estimator=self.pairs.estimator,
-            kappa=self.pairs.kappa,
+            scale_of=self.pairs.scale_of,
         )
 
     def place(self, image: int) -> tuple[PairEvidence, list[Placement]]:
@@ -156,18 +148,17 @@ class PlacedModel:
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image, choose the geometries of its pairs that agree, and update ranges from them."""
         self.cameras[image] = cam_from_world
-        evidence = self.evidence(image)
         for edge in [edge for edge in self.chosen if image in edge]:
             del self.chosen[edge]
-        if not len(evidence):
-            return
-        agrees = agreement(evidence, cam_from_world.rotation[None], cam_from_world.center[None])[0]
-        for idx in np.flatnonzero(agrees):
-            edge = _edge(image, int(evidence.partner[idx]))
-            # Geometries are sorted by weight, so the first one that agrees is the heaviest.
-            if edge not in self.chosen:
-                self.chosen[edge] = int(evidence.rank[idx])
-                self._learn_ranges(edge)
+        for edge, rank in self._agreeing(image).items():
+            self.chosen[edge] = rank
+            self._learn_ranges(edge)
+
+    def _agreeing(self, image: int) -> dict[Edge, int]:
+        """Return the pairs of a registered image, each with the rank of its heaviest geometry that agrees."""
+        evidence, pose = self.evidence(image), self.cameras[image]
+        agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
+        return {_edge(image, partner): rank for partner, rank in explained_partners(evidence, agrees).items()}
 
     def remove(self, image: int) -> None:
         """Remove an image from the model."""
@@ -231,28 +222,46 @@ class PlacedModel:
             cameras: False keeps the cameras fixed and only triangulates.
         """
         tracks, members = self.tracks()
-        model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
-        first = next(iter(self.cameras))
-        # The first camera stays fixed.
-        order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
-        model.cameras = {idx: self.cameras[members[idx]] for idx in order}
+        found = self._triangulated(tracks, members)
         if cameras:
-            model.adjust()
-            for idx, image in enumerate(members):
-                self.cameras[image] = model.cameras[idx]
-        else:
-            model.triangulate()
-        for image in members:
-            self._ranges[image][:] = np.nan
-            self._parallax[image][:] = 0
-        points = model.points_in_world[tracks.track_idx]
+            bundle = adjust_bundle(
+                Bundle(
+                    rotations=np.array([self.cameras[image].rotation for image in members]),
+                    centers=np.array([self.cameras[image].center for image in members]),
+                    points=found.points_in_world[found.valid],
+                    point_idx=(np.cumsum(found.valid) - 1)[tracks.track_idx[found.used]].astype(np.int32),
+                    image_idx=tracks.image_idx[found.used],
+                    bearings=tracks.bearings[found.used],
+                ),
+                RobustLoss("cauchy", MAX_ERROR_RAD / 4),
+                max_iterations=20,
+                tolerance=1e-3,  # the finished model is refined anyway
+                fixed_camera=members.index(next(iter(self.cameras))),
+            )
+            for image, rotation, center in zip(members, bundle.rotations, bundle.centers, strict=True):
+                self.cameras[image] = Rigid3.from_center(rotation, center)
+            found = self._triangulated(tracks, members)
+        points = found.points_in_world[tracks.track_idx]
         known = np.isfinite(points[:, 0])
         centers = np.array([self.cameras[image].center for image in members])
         distances = np.linalg.norm(points - centers[tracks.image_idx], axis=1)
         for idx, image in enumerate(members):
             mine = known & (tracks.image_idx == idx)
+            self._ranges[image][:], self._parallax[image][:] = np.nan, 0
             self._ranges[image][tracks.keypoint_idx[mine]] = distances[mine]
             self._parallax[image][tracks.keypoint_idx[mine]] = np.pi
+
+    def _triangulated(self, tracks: Tracks, members: Sequence[int]) -> Triangulated:
+        """Return the points of tracks among registered images."""
+        rotations = np.array([self.cameras[image].rotation for image in members])[tracks.image_idx]
+        return triangulate_observations(
+            np.array([self.cameras[image].center for image in members])[tracks.image_idx],
+            np.einsum("nji,nj->ni", rotations, tracks.bearings),
+            tracks.track_idx,
+            count=tracks.count,
+            max_error_rad=MAX_ERROR_RAD,
+            min_angle_rad=float(np.deg2rad(1.0)),
+        )
 
     def tracks(self) -> tuple[Tracks, list[int]]:
         """Return the tracks that the chosen geometries form among registered images, and the position of each image."""
@@ -273,13 +282,8 @@ class PlacedModel:
         """Choose the geometry of every pair of registered images again, by the current cameras."""
         self.chosen = {}
         for image in sorted(self.cameras):
-            evidence = self.evidence(image)
-            if not len(evidence):
-                continue
-            pose = self.cameras[image]
-            agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
-            for idx in np.flatnonzero(agrees):
-                self.chosen.setdefault(_edge(image, int(evidence.partner[idx])), int(evidence.rank[idx]))
+            for edge, rank in self._agreeing(image).items():
+                self.chosen.setdefault(edge, rank)
 
     def verify_again(self) -> None:
         """Verify pairs of registered images that no geometry explains again, by the relative poses of their cameras.
@@ -305,16 +309,6 @@ class PlacedModel:
             ranges[:], parallax[:] = np.nan, 0
         for edge in sorted(self.chosen):
             self._learn_ranges(edge)
-
-    def explained_share(self) -> float:
-        """Return the share of all pairs of registered images, by weight, that have a geometry that agrees."""
-        pairs = self.pairs.geometries
-        total = sum(found[0].weight for edge, found in pairs.items() if self.cameras.keys() >= {*edge})
-        return self.explained_weight() / total if total else 1.0
-
-    def explained_weight(self) -> float:
-        """Return the total weight of the geometries that agree with the cameras."""
-        return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
 
     def _learn_ranges(self, edge: Edge) -> None:
         """Use the ranges of a pair's matches where their parallax is larger than that of the known ranges."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence, best_by_partner
+from pano_mvs.algorithms.poses.placement.pair_evidence import AGREEING, PairEvidence, best_by_partner
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, nearest_rotation
 
@@ -82,7 +82,7 @@ def agreement(
     turned = np.arccos(np.clip((traces - 1) / 2, -1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         stretch = np.abs(np.log(distances / evidence.lengths))
-    fits = np.isnan(evidence.lengths) | (stretch < np.log(1.25))
+    fits = np.isnan(evidence.lengths) | (stretch < np.log(AGREEING))
     agrees: NDArray[np.bool_] = (
         (angles < evidence.tolerance_rad + loose_rad) & (turned < float(np.deg2rad(2.0))) & fits & (distances > 0)
     )

@@ -15,9 +15,6 @@ from pano_mvs.scene import TwoView
 MAX_ERROR_RAD = float(np.deg2rad(0.5))
 """Largest error of a point that an image sees where it should."""
 
-FIRST_GUESS_RAD = float(np.deg2rad(2.0))
-"""The same at a pose that is not yet refined."""
-
 MIN_POINTS = 15
 
 
@@ -29,7 +26,7 @@ def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearin
 def refined_on_points(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> tuple[Rigid3, int]:
     """Return a pose refined with limits that narrow, and the number of points that it sees where they should be."""
     pose = cam_from_world
-    for scale_rad in (FIRST_GUESS_RAD / 2, MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
+    for scale_rad in (float(np.deg2rad(1.0)), MAX_ERROR_RAD / 2, MAX_ERROR_RAD / 4):
         pose = refine_resection(pose, points_in_world, bearings, scale_rad=scale_rad)
     return pose, int((resection_errors(pose, points_in_world, bearings) < MAX_ERROR_RAD).sum())
 
@@ -114,17 +111,22 @@ def why_no_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> str:
     return f"it has no reliable pair; its best partner is {partner!r}: {two_views[pair].reason}"
 
 
-def why_few_seen(support: int, known: int, *, agreeing: int = 1) -> str:
-    """Return why a camera is not reliable that sees too few known points where they should be."""
-    return (
-        f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
-        f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, moving "
-        "objects, stitching errors, or an image that is not a panorama"
-    )
+def why_refused(support: int, known: int, *, agreeing: int, partner: str, matches: int) -> str:
+    """Return why a camera is not reliable.
 
-
-def why_few_known(known: int, *, partner: str, matches: int) -> str:
-    """Return why an image cannot be placed that matches too few known points; its best pair is with `partner`."""
+    Args:
+        support: number of known points that it sees where they should be.
+        known: number of known points that it matches.
+        agreeing: number of pairs that agree with its pose.
+        partner: name of the image of its best pair.
+        matches: number of matches of this pair.
+    """
+    if known >= MIN_POINTS:
+        return (
+            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
+            f"should be; {points_needed(known, agreeing=agreeing)} are needed. Possible causes: repeated structure, "
+            "moving objects, stitching errors, or an image that is not a panorama"
+        )
     return (
         f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
         f"needed. Its best partner is {partner!r} with {matches} {plural(matches, 'match', 'matches')}. "

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.geometry import Rigid3, geodesic_angle
 from pano_mvs.scene import TwoView
@@ -51,27 +53,11 @@ def consistent_edges(names: tuple[str, ...], two_views: Mapping[tuple[str, str],
 
 def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
     """Return the connected groups of images, largest first; of equals, the group with the earliest image first."""
-    neighbours: list[set[int]] = [set() for _ in range(count)]
-    for first, second in edges:
-        neighbours[first].add(second)
-        neighbours[second].add(first)
-    groups, left = [], set(range(count))
-    while left:
-        front, group = [min(left)], {min(left)}
-        while front:
-            found = neighbours[front.pop()] - group
-            group |= found
-            front.extend(sorted(found))
-        left -= group
-        groups.append(sorted(group))
+    ends = np.array(list(edges), np.intp).reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), ends.T), (count, count))
+    label = connected_components(graph, directed=False)[1]
+    groups = [np.flatnonzero(label == number).tolist() for number in range(label.max(initial=-1) + 1)]
     return sorted(groups, key=lambda group: (-len(group), group[0]))
-
-
-def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rigid3:
-    """Return second_from_first of an edge, with a translation of length 1, for either order of the images."""
-    if (first, second) in edges:
-        return Rigid3(edges[first, second].rotation, edges[first, second].direction)
-    return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
 
 
 def views_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:

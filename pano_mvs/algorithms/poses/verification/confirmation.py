@@ -27,9 +27,6 @@ _SETTINGS = SURFACE_SETTINGS.replace(planes=64, spacing="inverse")
 _SOURCES = 4
 # With less textured area than this share of the sphere, nothing can be concluded about a pose.
 MIN_TEXTURED = 0.05
-# Maps kept for an image with the same sources; relative poses that differ by less than this give the same map.
-_MAPS_PER_IMAGE, _MAX_KEPT = 3, 400
-_SAME_PLACE, _SAME_TURN_RAD = 0.005, float(np.deg2rad(0.1))
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
 _CLASSES = len(_PARALLAX_EDGES_DEG)
 # Weight, as solid angle, of the overall share in each class.
@@ -166,12 +163,17 @@ class Confirmation:
         known = self._maps.setdefault((image, *sources), [])
         self._maps.move_to_end((image, *sources))
         for before, before_scale, ranges in known:
-            if all(_nearly(a, scale, b, other_scale=before_scale) for a, b in zip(relative, before, strict=True)):
+            # Nearly the same for a sweep at 256 columns.
+            if all(
+                np.linalg.norm(a.translation / scale - b.translation / before_scale) < 0.005
+                and geodesic_angle(a.rotation, b.rotation) < np.deg2rad(0.1)
+                for a, b in zip(relative, before, strict=True)
+            ):
                 return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
         ranges = self._sweep(image, sources, relative)
         known.append((relative, scale, ranges))
-        del known[:-_MAPS_PER_IMAGE]
-        if len(self._maps) > _MAX_KEPT:
+        del known[:-3]
+        if len(self._maps) > 400:
             self._maps.popitem(last=False)
         return ranges
 
@@ -208,12 +210,6 @@ def _confirmed(
         min_support=0.5,
         min_motion_rad=0.05 * px_rad,
     )[0]
-
-
-def _nearly(pose: Rigid3, scale: float, other: Rigid3, *, other_scale: float) -> bool:
-    """Return whether two relative poses, each in its own unit, are equivalent for a sweep at 256 columns."""
-    moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
-    return moved < _SAME_PLACE and float(geodesic_angle(pose.rotation, other.rotation)) < _SAME_TURN_RAD
 
 
 @contextmanager

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
-from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.placement.view_graph import Edge, connected_groups
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, nearest_cameras
-from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
+from pano_mvs.algorithms.ranges.agreement import pixels_containing
+from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 
 FloatArray = NDArray[np.float64]
-
-_CAMERAS, _PARTNERS = 3, 2  # cameras of a part that are compared, the nearest to the other part; partners of each
 
 
 @dataclass(frozen=True)
@@ -54,40 +54,22 @@ def linked_parts(model: PlacedModel) -> list[list[int]]:
     matches is a part of two images.
     """
     views = {edge: model.pairs.geometries[edge][rank].view for edge, rank in model.chosen.items()}
-    of_image: dict[int, list[Edge]] = {image: [] for image in model.cameras}
-    for edge in sorted(views, key=lambda edge: (-len(views[edge]), edge)):
-        for image in edge:
-            of_image[image].append(edge)
-    label = {image: image for image in model.cameras}
-
-    def union(images: Collection[int]) -> None:
-        labels = {label[image] for image in images}
-        for image, one in label.items():
-            if one in labels:
-                label[image] = min(labels)
-
-    for image, edges in sorted(of_image.items()):
+    order = sorted(views, key=lambda edge: (-len(views[edge]), edge))
+    linked = set[Edge]()
+    for image in sorted(model.cameras):
+        edges = [edge for edge in order if image in edge]
         mine = {edge: np.unique(views[edge].matches_idx[:, edge.index(image)]) for edge in edges}
-        for number, one in enumerate(edges):
-            for other in edges[:number]:
-                images = {*one, *other}
-                if len({label[idx] for idx in images}) > 1:
-                    shared = np.intersect1d(mine[one], mine[other], assume_unique=True)
-                    # Two pairs of an image that share this many key points have a common scale.
-                    if len(shared) >= 30:
-                        union(images)
-    for edge in sorted(views, key=lambda edge: (-len(views[edge]), edge)):
-        alone = [sum(one == label[image] for one in label.values()) == 1 for image in edge]
-        if all(alone):
-            union(edge)
-    return sorted(_groups(label), key=lambda part: (-len(part), part))
-
-
-def _groups(label: Mapping[int, int]) -> list[list[int]]:
-    groups: dict[int, list[int]] = {}
-    for image, one in sorted(label.items()):
-        groups.setdefault(one, []).append(image)
-    return list(groups.values())
+        for one, other in combinations(edges, 2):
+            # Two pairs of an image that share this many key points have a common scale.
+            if not linked >= {one, other} and len(np.intersect1d(mine[one], mine[other], assume_unique=True)) >= 30:
+                linked |= {one, other}
+    alone = model.cameras.keys() - {image for edge in linked for image in edge}
+    for edge in order:
+        if alone >= {*edge}:
+            linked.add(edge)
+            alone -= {*edge}
+    groups = connected_groups(linked, len(model.pairs.names))
+    return [group for group in groups if group[0] in model.cameras]
 
 
 def _meeting(model: PlacedModel, parts: Sequence[list[int]]) -> Iterator[tuple[list[int], list[int]]]:
@@ -109,16 +91,21 @@ def _contradicting(
 ) -> float:
     """Return the share of what two parts see by themselves that the other part looks through."""
     sides = _nearest(cameras, *parts), _nearest(cameras, *parts[::-1])
-    ranges = {
-        image: _own_range(confirmation, cameras, image, partners=_partners(cameras, image, part))
-        for part, side in zip(parts, sides, strict=True)
-        for image in side
-    }
+    ranges = {}
+    for part, side in zip(parts, sides, strict=True):
+        for image in side:
+            found = np.full(confirmation.small(image).mask.shape, np.nan)
+            others = {idx: cameras[idx] for idx in part if idx != image}
+            for partner in nearest_cameras(cameras[image], others, count=2):
+                found = np.where(np.isfinite(found), found, confirmation.range_with(image, partner, cameras))
+            ranges[image] = found
     agreeing = contradicting = 0.0
     for a, b in (pair for one in sides[0] for other in sides[1] for pair in ((one, other), (other, one))):
-        agrees, contradicts = _compared(ranges[a], ranges[b], cameras[b] @ cameras[a].inverse())
-        agreeing += _solid_angle(agrees)
-        contradicting += _solid_angle(contradicts)
+        masks = _compared(ranges[a], ranges[b], cameras[b] @ cameras[a].inverse())
+        solid_angle = pixel_solid_angle((masks[0].shape[0], masks[0].shape[1]))[:, None]
+        agrees, contradicts = (float((solid_angle * mask).sum()) for mask in masks)
+        agreeing += agrees
+        contradicting += contradicts
     return contradicting / (agreeing + contradicting) if agreeing + contradicting > 0 else np.nan
 
 
@@ -138,11 +125,8 @@ def _compared(
     height, width = own.shape
     known = np.isfinite(own)
     seen = other_from_own.apply((ray_grid((height, width)) * np.where(known, own, 1.0)[..., None]).reshape(-1, 3))
-    distances = np.maximum(np.linalg.norm(seen, axis=1), 1e-12)
-    pixels = np.floor(pixel_from_ray(seen / distances[:, None], (height, width))).astype(np.intp)
-    pixels = pixels.reshape(height, width, 2)
-    distances = distances.reshape(height, width)
-    x, y = pixels[..., 0] % width, pixels[..., 1].clip(0, height - 1)
+    distances = np.maximum(np.linalg.norm(seen, axis=1), 1e-12).reshape(height, width)
+    y, x = pixels_containing(seen.reshape(height, width, 3) / distances[..., None], (height, width))
     around = np.stack([other[(y + dy).clip(0, height - 1), (x + dx) % width] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     with np.errstate(invalid="ignore"):
         agrees = known & (np.abs(around / distances - 1) < 0.1).any(axis=0)
@@ -151,32 +135,13 @@ def _compared(
     return agrees, contradicts & ~agrees
 
 
-def _own_range(
-    confirmation: Confirmation, cameras: Mapping[int, Rigid3], image: int, *, partners: Collection[int]
-) -> FloatArray:
-    """Return the ranges (H, W) of an image that one of its partners confirms, NaN elsewhere."""
-    found = np.full(confirmation.small(image).mask.shape, np.nan)
-    for partner in partners:
-        found = np.where(np.isfinite(found), found, confirmation.range_with(image, partner, cameras))
-    return found
-
-
-def _partners(cameras: Mapping[int, Rigid3], image: int, part: Collection[int]) -> list[int]:
-    return nearest_cameras(cameras[image], {idx: cameras[idx] for idx in part if idx != image}, count=_PARTNERS)
-
-
 def _matches_of(model: PlacedModel, one: int, other: int) -> int:
     """Return the number of matches of two images with which their cameras agree."""
     edge = min(one, other), max(one, other)
     return len(model.pairs.geometries[edge][model.chosen[edge]].view) if edge in model.chosen else 0
 
 
-def _solid_angle(mask: NDArray[np.bool_]) -> float:
-    """Return the solid angle of a mask (H, W)."""
-    return float((pixel_solid_angle((mask.shape[0], mask.shape[1]))[:, None] * mask).sum())
-
-
 def _nearest(cameras: Mapping[int, Rigid3], part: Collection[int], other: Collection[int]) -> list[int]:
     """Return the cameras of a part that are nearest to another part."""
     middle = np.mean([cameras[image].center for image in other], axis=0)
-    return sorted(part, key=lambda image: (float(np.linalg.norm(cameras[image].center - middle)), image))[:_CAMERAS]
+    return sorted(part, key=lambda image: (float(np.linalg.norm(cameras[image].center - middle)), image))[:3]

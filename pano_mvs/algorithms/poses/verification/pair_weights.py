@@ -45,7 +45,7 @@ def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
         else:
             # Factor on the weight of an ambiguous pair that is not checked because other pairs suffice.
             geometries[edge] = tuple(replace(one, weight=0.3 * one.weight) for one in found)
-    return Pairs(pairs.features, geometries, pairs.estimator, pairs.kappa, pairs.compared)
+    return replace(pairs, geometries=geometries)
 
 
 def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
@@ -54,19 +54,12 @@ def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
     return len(found) > 1 and found[1].weight > 0.25 * found[0].weight
 
 
-def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> list[float]:
-    """Return the mean share of their texture that two images confirm of each other under each of their geometries."""
-    first, second = edge
+def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
+    """Return the geometries of a pair, weighted by what both images confirm under each, the heaviest first."""
     shares = []
     for one in found:
-        poses = {first: Rigid3.identity(), second: Rigid3(one.view.rotation, one.view.direction)}
+        poses = {edge[0]: Rigid3.identity(), edge[1]: Rigid3(one.view.rotation, one.view.direction)}
         shares.append(float(np.nan_to_num([confirmation.share(image, poses[image], poses) for image in edge]).mean()))
-    return shares
-
-
-def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
-    """Return the geometries of a pair, weighted by the images, the heaviest first."""
-    shares = pair_shares(edge, found, confirmation)
     most = max(shares)
     if most <= 0:
         return found

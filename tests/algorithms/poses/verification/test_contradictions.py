@@ -90,7 +90,7 @@ def test_both_sides_are_named_if_they_are_equally_large() -> None:
 
 def test_cameras_of_a_contradicted_part_are_doubtful_with_the_pair_that_speaks_against_them() -> None:
     model = placed(consecutive() | {pair: wrong(*pair) for pair in ((2, 5), (3, 5), (4, 5))})
-    checks: CameraChecks = check_cameras(model, None)
+    checks: CameraChecks = check_cameras(model)
     assert [image for image, why in checks.doubts.items() if "evidence of pairs" in why] == [5]
     assert "2.png and 5.png" in checks.doubts[5]
 

@@ -116,21 +116,6 @@ def test_a_turned_camera_is_put_back_and_the_others_keep_their_poses_to_the_last
 
 
 @pytest.mark.slow
-def test_a_shifted_block_is_put_back_as_a_whole() -> None:
-    """All pairs across the cut agree with the shift; the images do not. Inside the block nothing changes."""
-    block = ("1.png", "4.png")
-    feigned = room_matches({NAMES.index(name): AWAY for name in block}, false=120)
-    given = displaced(*block)
-    assert not judge_placements(given, TRUTH).right.all()
-    found = verified(given, feigned)
-    assert found.rejected == {}
-    assert found.doubts == {}
-    assert judge_placements(found, TRUTH, center_limit=0.05).right.all()
-    inside = [poses.centers[NAMES.index(block[1])] - poses.centers[NAMES.index(block[0])] for poses in (given, found)]
-    np.testing.assert_allclose(inside[1], inside[0], atol=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("with_matches", [False, True])
 def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: Matches, with_matches: bool) -> None:
     given = displaced("2.png")
@@ -253,9 +238,9 @@ def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
 def test_judging_changes_nothing(matches: Matches) -> None:
     model = model_of(displaced("2.png"), pairs_of(*matches))
     before, chosen = dict(model.cameras), dict(model.chosen)
-    found = check_cameras(model, Confirmation(lambda image: (PICTURES[image], WHOLE)))
+    found = check_cameras(model)
     assert model.cameras == before
     assert model.chosen == chosen
-    assert set(found.doubts) == {2}
     assert not found.moved
-    assert found.shares[2] == min(found.shares.values())
+    assert np.isnan(list(found.shares.values())).all()
+    assert set(found.p_right) == set(before)
