@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import capture, pano_mvs, rendered
+from tests.cli.conftest import capture, pano_mvs, quickstart, rendered
 
-__all__ = ["capture", "pano_mvs", "rendered"]
+__all__ = ["capture", "pano_mvs", "quickstart", "rendered"]
 
 
 @pytest.fixture(scope="session")

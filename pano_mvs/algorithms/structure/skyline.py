@@ -71,22 +71,22 @@ class Skyline:
         """Return how clear one crease of walls is, at a height above the camera that is negative for the floor."""
         seen = np.isfinite(distance)
         distance = np.where(seen, distance, 1.0)
-        clear = self._edge_clarity(distance, height, seen)
+        elevation, other = np.arctan2(height, distance), []
+        clear = self._edge_clarity(elevation, seen)
         if height < 0:
-            elevation, other = np.arctan2(height, distance), []
             for sign in (1, -1):
                 clearest = np.zeros(clear.shape)
                 for part in _SKIRTINGS:
-                    beside = height * (1 - sign * part)
-                    apart = np.abs(np.arctan2(beside, distance) - elevation) > _APART_RAD
-                    clearest = np.maximum(clearest, self._edge_clarity(distance, beside, seen & apart))
+                    beside = np.arctan2(height * (1 - sign * part), distance)
+                    counted = seen & (np.abs(beside - elevation) > _APART_RAD)
+                    clearest = np.maximum(clearest, self._edge_clarity(beside, counted))
                 other.append(clearest)
             clear *= (1 + other[0] - other[1]).astype(np.float32)
         return np.where(seen, clear, -np.inf)
 
-    def _edge_clarity(self, distance: FloatArray, height: float, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Return how clear the edges of walls at a height are, from 0 to 1; 0 where they do not count."""
-        common = mean_along(self._at(np.arctan2(height, distance)) * counted[..., None], self.half_window)
+    def _edge_clarity(self, elevation: FloatArray, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Return how clear the edges of walls at elevations (L, A) are, from 0 to 1; 0 where they do not count."""
+        common = mean_along(self._at(elevation) * counted[..., None], self.half_window)
         red, green, blue = np.moveaxis(common, -1, 0)  # nine times as fast as `np.linalg.norm`
         return np.asarray(np.sqrt(np.minimum(np.sqrt(red * red + green * green + blue * blue) / CLEAR_LEVELS, 1.0)))
 
