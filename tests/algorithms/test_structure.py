@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
+from pano_mvs.algorithms.structure import skyline
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.lay import lay_structure
@@ -151,6 +152,19 @@ def test_the_crease_is_below_the_upper_edge_of_a_skirting_board() -> None:
     right, wrong = np.full((1, 90), distance), np.full((1, 90), distance * down / (down - board))
     clarity = Skyline(changes).crease_clarity(np.concatenate([right, wrong]), -down)
     assert (clarity[0] > clarity[1]).all()
+
+
+@pytest.mark.parametrize("half_window", [1, 4])
+def test_clarity_is_that_of_all_azimuths(half_window: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those at which a wall is not seen are left out: an arc of each of the four, over the seam for one of them."""
+    changes = np.random.default_rng(0).normal(0, 5, (1801, 90, 3)).astype(np.float32)
+    sky = Skyline(changes, half_window)
+    distance = skyline.wall_distances(sky, 0.3, np.array([1.0, 2.0, 4.0]))
+    found = sky.crease_clarity(distance, -1.6)
+    assert 0 < np.isfinite(found).mean() < 0.5
+    assert skyline._arcs(np.isfinite(distance), half_window).shape[1] < 50
+    monkeypatch.setattr(skyline, "_arcs", lambda seen, _: np.broadcast_to(np.arange(seen.shape[1]), seen.shape))
+    np.testing.assert_allclose(found, sky.crease_clarity(distance, -1.6), rtol=1e-6)
 
 
 def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
