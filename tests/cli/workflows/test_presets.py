@@ -79,7 +79,7 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
         *SMALL,
         *PLAIN_RANGES,
         *f"--set scores.truth={rendered / 'truth'} --set images.nadir_deg=20".split(),
-        *"--set scene_planes=null --set structure=null".split(),
+        *["--set", "scene_planes=null", "--set", "structure=null"],
     )
     result = pano_mvs("run", *arguments)
     assert result.code == 0, result.text
