@@ -18,7 +18,7 @@ from tests.synthetic.capture_files import write_capture
 
 __all__ = ["finished", "finished_once", "toy"]
 
-SIZE_HW = (144, 288)
+SIZE_HW = (160, 320)
 SMALL = ("--set", "depth.planes=32", "--set", "features.max_keypoints=1500")
 
 

@@ -130,7 +130,7 @@ def test_output_folder_that_cannot_be_written(pano_mvs: Command, short: Path) ->
 def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: Path) -> None:
     rng = np.random.default_rng(1)
     for name in ("002.png", "003.png"):
-        noise = rng.integers(0, 255, (18, 36, 3), dtype=np.uint8)
+        noise = rng.integers(0, 255, (20, 40, 3), dtype=np.uint8)
         cv2.imwrite(str(capture / "images" / name), cv2.resize(noise, SIZE_HW[::-1], interpolation=cv2.INTER_CUBIC))
     result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *TO_POSES)
     assert result.code == 3, result.text
