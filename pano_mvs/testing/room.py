@@ -125,7 +125,7 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        towards = getattr(surface, "towards", None)  # large scenes have surfaces that say which rays come near them
+        towards = getattr(surface, "towards", None)  # most surfaces say which rays come near them
         rows = None if towards is None else towards(origin, rays)
         distance, normal = surface.hit(origin, rays if rows is None else rays[rows])
         nearer = np.flatnonzero(distance < (best if rows is None else best[rows]))

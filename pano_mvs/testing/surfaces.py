@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 
@@ -38,12 +39,6 @@ class Cuboid:
 
     def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
         """Return the distance along each unit ray (N, 3) from one origin (3,), and the normal there (slab method)."""
-        low, high = np.array(self.low), np.array(self.high)
-        rows, distance, normals = near_rays((low + high) / 2 - origin, rays, float(np.linalg.norm(high - low)) / 2)
-        distance[rows], normals[rows] = self._hit_by(origin, rays[rows])
-        return distance, normals
-
-    def _hit_by(self, origin: FloatArray, rays: FloatArray) -> Hit:
         along = np.ascontiguousarray(rays.T)  # one row for each axis
         with np.errstate(divide="ignore", invalid="ignore"):
             to_low, to_high = ((np.array(corner) - origin)[:, None] / along for corner in (self.low, self.high))
@@ -60,6 +55,11 @@ class Cuboid:
             normals[rows, axis] = -np.sign(rays[rows, axis])
         return np.where(met, np.where(outside, near, far), np.inf), normals
 
+    def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64] | None:
+        """Return which rays (N, 3) come near; None for all."""
+        low, high = np.array(self.low), np.array(self.high)
+        return _near((low + high) / 2 - origin, rays, float(np.linalg.norm(high - low)) / 2)
+
 
 def sum_of_three(vectors: FloatArray) -> FloatArray:
     """Return the sums (N,) of vectors (N, 3), the digits of `np.sum`, which takes several times as long."""
@@ -67,14 +67,12 @@ def sum_of_three(vectors: FloatArray) -> FloatArray:
     return np.asarray(x + y + z)
 
 
-def near_rays(to_center: FloatArray, rays: FloatArray, radius: float) -> tuple[Any, FloatArray, FloatArray]:
-    """Return which unit rays (N, 3) may meet what is within a radius of a point, infinities (N,) and zeros (N, 3)."""
+def _near(to_center: FloatArray, rays: FloatArray, radius: float) -> NDArray[np.int64] | None:
+    """Return which unit rays (N, 3) may meet what is within a radius of a point; None for all."""
     distance = float(np.linalg.norm(to_center))
-    nothing = np.full(len(rays), np.inf), np.zeros_like(rays)
     if distance <= radius:
-        return slice(None), *nothing
-    least = np.sqrt(1 - (radius / distance) ** 2) - 1e-6
-    return np.flatnonzero(rays @ (to_center / distance) > least), *nothing
+        return None
+    return np.flatnonzero(rays @ (to_center / distance) > np.sqrt(1 - (radius / distance) ** 2) - 1e-6)
 
 
 @dataclass(frozen=True)
@@ -88,17 +86,19 @@ class Ball:
     def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
         """Return the distance along each unit ray (N, 3) from one origin (3,), and the normal there."""
         to_center = np.array(self.center) - origin
-        rows, distances, normals = near_rays(to_center, rays, self.radius)
-        middle, rays = (rays @ to_center)[rows], rays[rows]
+        middle = rays @ to_center
         miss_squared = sum_of_three((to_center - middle[:, None] * rays) ** 2)
         half_chord = np.sqrt(np.maximum(self.radius**2 - miss_squared, 0))
         near, far = middle - half_chord, middle + half_chord
         distance = np.where(near > 0, near, far)
         distance = np.where((miss_squared < self.radius**2) & (far > 0), distance, np.inf)
         with np.errstate(invalid="ignore"):
-            outwards = (distance[:, None] * rays - to_center) / self.radius
-        distances[rows], normals[rows] = distance, np.where(near[:, None] > 0, outwards, -outwards)
-        return distances, normals
+            normals = (distance[:, None] * rays - to_center) / self.radius
+        return distance, np.where(near[:, None] > 0, normals, -normals)
+
+    def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64] | None:
+        """Return which rays (N, 3) come near; None for all."""
+        return _near(np.array(self.center) - origin, rays, self.radius)
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,7 @@ class Quad:
         normal = np.cross(u, v)
         area_squared = normal @ normal
         to_corner = np.array(self.corner) - origin
-        radius = max(float(np.linalg.norm(diagonal)) for diagonal in (u + v, u - v)) / 2
-        rows, distances, normals = near_rays(to_corner + (u + v) / 2, rays, radius)
-        along, rays = (rays @ normal)[rows], rays[rows]
+        along = rays @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (to_corner @ normal) / along
             inside = distance[:, None] * rays - to_corner
@@ -126,5 +124,10 @@ class Quad:
             share_v = inside @ np.cross(normal, u) / area_squared
         met = (distance > 0) & (share_u >= 0) & (share_u <= 1) & (share_v >= 0) & (share_v <= 1)
         unit = normal / np.sqrt(area_squared)
-        distances[rows], normals[rows] = np.where(met, distance, np.inf), -np.sign(along)[:, None] * unit
-        return distances, normals
+        return np.where(met, distance, np.inf), -np.sign(along)[:, None] * unit
+
+    def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64] | None:
+        """Return which rays (N, 3) come near; None for all."""
+        u, v = np.array(self.edge_u), np.array(self.edge_v)
+        radius = max(float(np.linalg.norm(diagonal)) for diagonal in (u + v, u - v)) / 2
+        return _near(np.array(self.corner) + (u + v) / 2 - origin, rays, radius)

@@ -132,7 +132,7 @@ def test_a_bound_hides_nothing(seed: int) -> None:
     box = Cuboid(tuple(low), tuple(high), OAK)
     bounded = Bounded(box, tuple((low + high) / 2), float(np.linalg.norm(high - low) / 2))
     origin, rays = rng.uniform(-3, 3, 3), spiral_rays(500)
-    (distance, normals), (expected, true_normals) = bounded.hit(origin, rays), box._hit_by(origin, rays)
+    (distance, normals), (expected, true_normals) = bounded.hit(origin, rays), box.hit(origin, rays)
     np.testing.assert_allclose(distance, expected, rtol=1e-12)
     met = np.isfinite(expected)
     np.testing.assert_array_equal(normals[met], true_normals[met])
