@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
 
 FOLDER = Path(__file__).parent.parent / "plugins" / "pano_mvs_example"
 
@@ -31,7 +34,7 @@ def test_it_is_typed() -> None:
     run("-m", "mypy", "--strict", "--config-file=../../pyproject.toml", "pano_mvs_example", cwd=FOLDER)
 
 
-def test_its_workflow_is_sound(tmp_path: Path) -> None:
+def test_its_workflow_is_sound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The workflow names the package's file, which is what a user does who has not installed it."""
     text = re.search(r"<!-- workflow -->\n```yaml\n(.*?)```", (FOLDER / "README.md").read_text(), re.DOTALL)
     assert text
@@ -39,4 +42,5 @@ def test_its_workflow_is_sound(tmp_path: Path) -> None:
     plugins = f"plugins: [{package / 'sky_mask.py'}, {package / 'xyz_file.py'}]\n"
     (tmp_path / "photos").mkdir()
     (tmp_path / "wf.yaml").write_text(text.group(1).replace("stages:\n", f"{plugins}stages:\n"))
-    assert "no mistakes" in run("-m", "pano_mvs", "check", "wf.yaml", cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert "no mistakes" in CliRunner().invoke(app, ["check", "wf.yaml"]).output

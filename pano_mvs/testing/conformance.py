@@ -18,7 +18,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -36,7 +36,7 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import Cardinality, StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
-from pano_mvs.testing.stage_calls import StageCase, digest_of
+from pano_mvs.testing.stage_calls import Call, StageCase, digest_of
 from pano_mvs.testing.sweep_backends import CASES, agreement, cost_of_case, sweep_case
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
@@ -214,6 +214,35 @@ def check_stage(
         contract_test.check()
 
 
+# Several tests need the results of the same calls, and some stages take seconds.
+@cache
+def _first_call(case: StageCase) -> tuple[Call, list[str], bool]:
+    """Return the result for the ordinary capture, the inputs that changed, and whether the settings did."""
+    arguments = case.arguments(case.capture)
+    before = {name: digest_of(value) for name, value in arguments.items()}
+    params = case.params(case.capture).model_dump_json()
+    call = case.call(case.capture, arguments=arguments)
+    changed = [name for name, value in arguments.items() if digest_of(value) != before[name]]
+    return call, changed, case.params(case.capture).model_dump_json() != params
+
+
+@cache
+def _second_call(case: StageCase) -> tuple[Call, tuple[str, ...], list[str], list[str]]:
+    """Return the same again, what changed in the process, and the names of threads and processes that run on."""
+    _first_call(case)  # what the stage loads at its first call may change more
+    before, threads = ProcessState.now(), set(threading.enumerate())
+    call = case.call(case.capture)
+    changes = before.restore()
+    left = [thread.name for thread in threading.enumerate() if thread not in threads]
+    return call, changes, left, [child.name for child in multiprocessing.active_children()]
+
+
+@cache
+def _call_on(case: StageCase, variant: Variant) -> Call:
+    """Return the result for a variant of the capture."""
+    return _first_call(case)[0] if variant == case.capture.variant else case.call(tiny_capture(variant))
+
+
 def _declares_itself(case: StageCase) -> None:
     """The stage has a name of the form kind.name, a docstring, and a description of every setting."""
     spec = case.spec
@@ -240,20 +269,15 @@ def _settings_are_values(case: StageCase) -> None:
 
 def _result(case: StageCase) -> None:
     """The stage returns what it declares, accepts read-only inputs, and does not modify its inputs and settings."""
-    capture = case.capture
-    arguments = case.arguments(capture)
-    before = {name: digest_of(value) for name, value in arguments.items()}
-    params = case.params(capture).model_dump_json()
-    call = case.call(capture, arguments=arguments)
+    call, changed, settings_changed = _first_call(case)
     assert call.refusal is None, f"{case.spec.name} rejects ordinary inputs: {call.refusal}"
-    changed = [name for name, value in arguments.items() if digest_of(value) != before[name]]
     assert not changed, f"{case.spec.name} modifies its inputs {', '.join(changed)}"
-    assert case.params(capture).model_dump_json() == params, f"{case.spec.name} modifies its settings"
+    assert not settings_changed, f"{case.spec.name} modifies its settings"
 
 
 def _same_bytes(case: StageCase) -> None:
     """The result is the same again and with three threads: random numbers from ctx.rng, sums in a fixed order."""
-    digests = [case.first_call.digest, *(case.call(case.capture, threads=threads).digest for threads in (1, 3))]
+    digests = [_first_call(case)[0].digest, _second_call(case)[0].digest, case.call(case.capture, threads=3).digest]
     assert digests[0] == digests[1], (
         f"{case.spec.name} returns something else when called again: draw from ctx.rng only"
     )
@@ -262,14 +286,9 @@ def _same_bytes(case: StageCase) -> None:
 
 def _leaves_its_process(case: StageCase) -> None:
     """The stage changes nothing that other stages compute with, and leaves no thread or process behind."""
-    assert case.first_call  # what it loads at its first call may change more
-    before, threads = ProcessState.now(), set(threading.enumerate())
-    case.call(case.capture)
-    changes = before.restore()
+    _, changes, threads, left = _second_call(case)
     assert not changes, f"{case.spec.name} changes {', '.join(changes)} in its process; runs undo this after every unit"
-    left = [thread.name for thread in threading.enumerate() if thread not in threads]
-    assert not left, f"{case.spec.name} leaves the threads {', '.join(left)} running; other units run beside them"
-    left = [child.name for child in multiprocessing.active_children()]
+    assert not threads, f"{case.spec.name} leaves the threads {', '.join(threads)} running; other units run beside them"
     assert not left, f"{case.spec.name} leaves the processes {', '.join(left)} running; they end with its worker"
 
 
@@ -293,7 +312,7 @@ def _optional_inputs(case: StageCase) -> None:
 def _masks(case: StageCase) -> None:
     """Masked pixels have no range and no key point, and stay masked."""
     capture = tiny_capture(Variant(masked=True))
-    call = case.call(capture)
+    call = _call_on(case, capture.variant)
     value = call.value
     valid = capture.images[capture.names[0]].load_mask()
     if isinstance(value, RangeMap):
@@ -314,7 +333,7 @@ def _masks(case: StageCase) -> None:
 def _masked_content(case: StageCase) -> None:
     """The result does not depend on the content of masked pixels, which `Panorama.load` hides but the file shows."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
-    first, second = (case.call(tiny_capture(Variant(size_hw, masked=True, scribbled=noise))) for noise in (False, True))
+    first, second = (_call_on(case, Variant(size_hw, masked=True, scribbled=noise)) for noise in (False, True))
     if first.mask is not None and second.mask is not None:
         wrong = int((first.mask != second.mask).sum())
         assert not wrong, f"{case.spec.name} masks {wrong} pixels depending on the content of masked pixels"
@@ -326,7 +345,7 @@ def _masked_content(case: StageCase) -> None:
 def _rolls(case: StageCase) -> None:
     """Rolled images with rotated cameras give the rolled result: there is no border at the seam."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
-    first, second = (case.call(tiny_capture(Variant(size_hw, rolled=columns))) for columns in (0, _ROLL))
+    first, second = (_call_on(case, Variant(size_hw, rolled=columns)) for columns in (0, _ROLL))
     straight, rolled = first.value, second.value
     if first.mask is not None and second.mask is not None:
         share = float((first.mask == np.roll(second.mask, -_ROLL, axis=1)).mean())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_quat_wxyz, rotation_from_rotvec
-from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Surface, Vector, sum_of_three
 
 _RAYS_AT_ONCE = 1 << 14  # their arrays fit into the cache of a core
 
@@ -84,10 +84,13 @@ def render(
     height, width = size_hw
     steps = (np.arange(supersample) + 0.5) / supersample
     colors = np.zeros((height * width, 3))
-    for offset_y in steps:
-        for offset_x in steps:
-            colors += _traced(room, cam_from_world, size_hw, offset_px=(float(offset_x), float(offset_y)))[1]
-    distances, _ = _traced(room, cam_from_world, size_hw, offset_px=(0.5, 0.5), shaded=False)
+    distances = None
+    for offset_px in product(steps.tolist(), steps.tolist()):
+        found, shades = _traced(room, cam_from_world, size_hw, offset_px=offset_px)
+        colors += shades
+        distances = found if offset_px == (0.5, 0.5) else distances
+    if distances is None:
+        distances, _ = _traced(room, cam_from_world, size_hw, offset_px=(0.5, 0.5), shaded=False)
     image = np.rint(colors * (255 / supersample**2)).astype(np.uint8).reshape(height, width, 3)
     ranges = np.where(np.isfinite(distances), distances, np.nan).astype(np.float32)
     return image, ranges.reshape(height, width)
@@ -122,10 +125,10 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        towards = getattr(surface, "towards", None)  # large scenes have surfaces that say which rays come near them
+        towards = getattr(surface, "towards", None)  # most surfaces say which rays come near them
         rows = None if towards is None else towards(origin, rays)
         distance, normal = surface.hit(origin, rays if rows is None else rays[rows])
-        nearer = distance < (best if rows is None else best[rows])
+        nearer = np.flatnonzero(distance < (best if rows is None else best[rows]))
         on = nearer if rows is None else rows[nearer]
         best[on], which[on], normals[on] = distance[nearer], idx, normal[nearer]
     return best, which, normals
@@ -143,8 +146,8 @@ def _shaded(
     distances, surface_idx, normals = hits
     colors = np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        on = surface_idx == idx
-        if not on.any():
+        on = np.flatnonzero(surface_idx == idx)
+        if not len(on):
             continue
         points = origin + distances[on, None] * rays[on]
         texture = room.textures[idx] if room.textures else room.texture
@@ -154,10 +157,10 @@ def _shaded(
             albedo = albedo_at(points, surface.colors_rgb, texture, seed=seed, footprint=footprint)
         else:
             # A pixel on a slanted surface is longer than wide; a value in between neither flickers nor blurs much.
-            slant = np.abs(np.sum(rays[on] * normals[on], axis=1))
+            slant = np.abs(sum_of_three(rays[on] * normals[on]))
             albedo = texture.albedo(points, normals[on], footprint=footprint / np.sqrt(np.maximum(slant, 0.02)))
         to_lamp = np.array(room.lamp) - points
-        facing = np.abs(np.sum(to_lamp * normals[on], axis=1)) / np.maximum(np.linalg.norm(to_lamp, axis=1), 1e-9)
+        facing = np.abs(sum_of_three(to_lamp * normals[on])) / np.maximum(np.sqrt(sum_of_three(to_lamp**2)), 1e-9)
         colors[on] = albedo * (0.55 + 0.45 * facing[:, None])
     if room.sky is not None:
         nothing = surface_idx < 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -49,11 +48,6 @@ class StageCase:
     def capture(self) -> TinyCapture:
         """The ordinary capture."""
         return tiny_capture(Variant(self.size_hw))
-
-    @cached_property
-    def first_call(self) -> Call:
-        """The result for the ordinary capture, which several tests need."""
-        return self.call(self.capture)
 
     def params(self, capture: TinyCapture) -> Params:
         """Return the settings; a required path that is not given is that of the images, or else of the ground truth."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -90,7 +91,8 @@ def found_in(
     )
 
 
-def outdoors(sky: str, *, turned: bool = True) -> Views:
+@cache
+def outdoors(sky: str, *, turned: bool) -> Views:
     zenith, horizon, clouds = SKIES[sky]
     return views_of(
         Room(_SURFACES, "outdoor", 3, lamp=(9.0, -40.0, -20.0), sky=(zenith, horizon), clouds=clouds), turned=turned
@@ -99,7 +101,7 @@ def outdoors(sky: str, *, turned: bool = True) -> Views:
 
 @pytest.fixture(scope="module")
 def blue() -> Views:
-    return outdoors("blue")
+    return outdoors("blue", turned=True)
 
 
 @pytest.mark.parametrize("sky", SKIES)

@@ -111,11 +111,12 @@ def test_a_mirror_is_seen_from_its_front_alone() -> None:
 @pytest.mark.parametrize("min_confidence", [64, 1])
 def test_a_cloud_has_nothing_of_a_mirror_or_of_the_room_behind_it(min_confidence: int) -> None:
     scene = mirror_room(seed=0, views=2, turned=False)
+    seen_by = [scene.view(idx, SIZE, supersample=1) for idx in range(2)]
 
     def fused(given: Structure) -> FloatArray:
         views = []
         for idx, pose in enumerate(scene.poses):
-            picture, ranges = scene.view(idx, SIZE, supersample=1)
+            picture, ranges = seen_by[idx]
             # As if a wall 1 behind the pane were seen in it.
             behind = pane_ranges(ray_grid(SIZE) @ pose.rotation, pose.center, CORNERS[0] + (0.0, 0.0, 1.0))
             seen = as_map(np.where(shows_mirror(scene, idx, ranges), behind, ranges), TRUSTED)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
+from pano_mvs.algorithms.structure import skyline
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.lay import lay_structure
@@ -153,23 +154,48 @@ def test_the_crease_is_below_the_upper_edge_of_a_skirting_board() -> None:
     assert (clarity[0] > clarity[1]).all()
 
 
+@pytest.mark.parametrize("half_window", [1, 4])
+def test_clarity_is_that_of_all_azimuths(half_window: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those at which a wall is not seen are left out: an arc of each of the four, over the seam for one of them."""
+    changes = np.random.default_rng(0).normal(0, 5, (1801, 90, 3)).astype(np.float32)
+    sky = Skyline(changes, half_window)
+    distance = skyline.wall_distances(sky, 0.3, np.array([1.0, 2.0, 4.0]))
+    found = sky.crease_clarity(distance, -1.6)
+    assert 0 < np.isfinite(found).mean() < 0.5
+    assert skyline._arcs(np.isfinite(distance), half_window).shape[1] < 50
+    monkeypatch.setattr(skyline, "_arcs", lambda seen, _: np.broadcast_to(np.arange(seen.shape[1]), seen.shape))
+    np.testing.assert_allclose(found, sky.crease_clarity(distance, -1.6), rtol=1e-6)
+
+
 def test_a_plain_ceiling_is_moved_to_its_creases() -> None:
     """Its ranges are 6 % too large in all views."""
     views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.06)
-    heights = [plane.y for plane in moved_ceilings(views, [floor, ceiling])]
-    assert heights == pytest.approx([HALF[1], -HALF[1]], abs=0.02)
-    assert moved_ceilings(views, [floor, ceiling])[1].uncertainty == 0.05
+    moved = moved_ceilings(views, [floor, ceiling])
+    assert [plane.y for plane in moved] == pytest.approx([HALF[1], -HALF[1]], abs=0.02)
+    assert moved[1].uncertainty == 0.05
     assert moved_ceilings(views, [floor, replace(ceiling, uncertainty=0.01)])[1].y == ceiling.y
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])
-@pytest.mark.parametrize("darker", [0.0, 10.0, None], ids=["no creases", "faint creases", "clear creases"])
-def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float | None, noise: float) -> None:
-    """Its ranges are exact and weak. One faint edge counted as the crease with the floor and as a skirting board."""
+@pytest.mark.parametrize("darker", [0.0, 10.0], ids=["no creases", "faint creases"])
+def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float, noise: float) -> None:
+    """One faint edge counted as the crease with the floor and as a skirting board."""
+    views, planes = _plain_ceiling(_noisy_box(noise, darker), 1.0)
+    assert moved_ceilings(views, planes)[1].y == pytest.approx(-HALF[1], rel=0.012 if darker else 0.003)
+
+
+def test_a_plain_ceiling_stays_where_creases_are_clear() -> None:
+    """Its ranges are exact and weak."""
+    structure = _noisy_box(3.0, None).structure()
+    above = structure.normals_in_world[:, 1] > 0.5
+    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.003)
+
+
+def _noisy_box(noise: float, darker: float | None) -> Box:
+    """Return views with a weak ceiling; if `darker` is given, all that is plain is grey, and the ceiling darker."""
     box, random = Box((256, 512)), np.random.default_rng(1)
     for number, name in enumerate(box.maps):
-        normals = box_range((256, 512), HALF, CENTERS[number])[1]
-        above = normals[..., 1] > 0.5
+        above = box_range((256, 512), HALF, CENTERS[number])[1][..., 1] > 0.5
         colors = box.pictures[name].astype(np.float64)
         if darker is not None:
             colors[above | box.walls[name]] = 200.0
@@ -178,9 +204,7 @@ def test_a_plain_ceiling_stays_where_creases_do_not_contradict(darker: float | N
         box.pictures[name] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
         own = box.maps[name]
         box.maps[name] = replace(own, confidence=np.where(above, SEEN, own.confidence).astype(np.uint8))
-    structure = box.structure()
-    above = structure.normals_in_world[:, 1] > 0.5
-    np.testing.assert_allclose(structure.offsets[above], -HALF[1], rtol=0.012 if darker else 0.003)
+    return box
 
 
 @pytest.mark.parametrize(("grey", "count"), [(True, 0), (False, 1)], ids=["one grey", "clear creases"])
@@ -195,7 +219,11 @@ def test_a_ceiling_is_supposed_only_where_creases_show_its_height(grey: bool, co
 
 def test_a_ceiling_beyond_the_searched_heights_stays() -> None:
     """Its ranges are 20 % too large, so that creases are clearest at the lowest height that is searched."""
-    views, (floor, ceiling) = _plain_ceiling(Box((256, 512)), 1.2)
+    box = Box()
+    for number, name in enumerate(box.maps):
+        above = box_range(SIZE, HALF, CENTERS[number])[1][..., 1] > 0.5
+        box.maps[name] = replace(box.maps[name], range=box.maps[name].range * np.where(above, 1.2, 1.0).astype("f4"))
+    views, (floor, ceiling) = _plain_ceiling(box, 1.2)
     assert moved_ceilings(views, [floor, ceiling])[1] == ceiling
 
 

@@ -58,6 +58,13 @@ def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return folder / "out", result.output
 
 
+@pytest.fixture(scope="session")
+def sample_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache for all that runs the quickstart on the sample, in all processes of the test run: it is computed once."""
+    folder = tmp_path_factory.getbasetemp()
+    return (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "sample-cache"
+
+
 @pytest.fixture
 def capture(rendered: Path, tmp_path: Path) -> Path:
     """A copy of the rendered capture that a test may change."""

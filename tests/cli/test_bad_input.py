@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.conftest import SMALL, Command, deliverables, run_json
+from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
 from tests.io.images.pictures import app1, full_sphere, xmp
 from tests.permissions import permissions_hold
 from tests.stored import read_picture
@@ -131,7 +131,7 @@ def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: 
     rng = np.random.default_rng(1)
     for name in ("002.png", "003.png"):
         noise = rng.integers(0, 255, (20, 40, 3), dtype=np.uint8)
-        cv2.imwrite(str(capture / "images" / name), cv2.resize(noise, (320, 160), interpolation=cv2.INTER_CUBIC))
+        cv2.imwrite(str(capture / "images" / name), cv2.resize(noise, SIZE_HW[::-1], interpolation=cv2.INTER_CUBIC))
     result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *TO_POSES)
     assert result.code == 3, result.text
     summary = run_json(Path("out"))
@@ -245,9 +245,10 @@ def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(
 @pytest.mark.slow
 def test_a_picture_that_never_registers_keeps_no_files_of_renamed_pictures(pano_mvs: Command, capture: Path) -> None:
     """A capture with such a picture ends with exit code 3 each time, and kept files of renamed pictures."""
-    noise = np.random.default_rng(0).integers(0, 256, (160, 320, 3)).astype(np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (*SIZE_HW, 3)).astype(np.uint8)
     cv2.imwrite(str(capture / "images" / "999.png"), cv2.GaussianBlur(noise, (0, 0), 20))
-    command = ("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    by_sift = ("--set", "weak.learned=never")  # the networks take long to find nothing
+    command = ("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL, *by_sift)
     assert pano_mvs(*command).code == 3
     before = deliverables(Path("out"))
     assert [name for name in before if "003" in name]

@@ -10,9 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.testing.room import capture_poses, default_room
+from tests.cli.conftest import SIZE_HW
 from tests.docs.test_examples import ROOT, SCRIPTS, commands
-from tests.synthetic.capture_files import write_capture
 
 VERBS = ("view", "share", "inspect", "report", "evaluate")
 SUBJECTS = ("run", "poses", "depth", "cloud")
@@ -23,7 +22,6 @@ EXPECTED = {
     "docs/viewer.md": {"out/quickstart"},
     "docs/tutorials/sweep.md": {"quickstart"},
 }
-SIZE_HW = (160, 320)
 
 
 def reads_results(arguments: list[str]) -> bool:
@@ -54,20 +52,7 @@ def test_results_are_made_before_they_are_read(page: Path) -> None:
                 assert any(read == one or read.startswith(f"{one}/") for one in known), shlex.join(arguments)
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small capture, its truth, and the output and the cache of a run."""
-    folder = tmp_path_factory.mktemp("finished")
-    write_capture(folder / "capture", default_room(), capture_poses(4, spread=0.4), size_hw=SIZE_HW)
-    settings = ("depth.planes=32", "features.max_keypoints=1500", f"scores.truth={folder / 'capture' / 'truth'}")
-    changes = [word for setting in settings for word in ("--set", setting)]
-    paths = ["--images", folder / "capture" / "images", "--out", folder / "out", "--cache", folder / "cache"]
-    result = CliRunner().invoke(app, ["run", "quickstart", *map(str, paths), *changes])
-    assert result.exit_code == 0, result.output
-    return folder
-
-
-def adapted(arguments: list[str], finished: Path) -> list[str]:
+def adapted(arguments: list[str], finished: Path, truth: Path) -> list[str]:
     """Return a command for the finished run: its folders, its images and pixels in them, and no window."""
     words = list(arguments)
     place = subject_place(words)
@@ -75,7 +60,7 @@ def adapted(arguments: list[str], finished: Path) -> list[str]:
     words[place] = str(finished / "out")
     if words[0] == "evaluate" and words[1:2] == ["poses"]:
         words[place] += "/colmap/sparse/0"
-    values = {"--truth": finished / "capture" / "truth", "--cache": finished / "cache"}
+    values = {"--truth": truth, "--cache": finished / "cache"}
     for option, value in values.items():
         if option in words:
             words[words.index(option) + 1] = str(value)
@@ -94,10 +79,11 @@ def adapted(arguments: list[str], finished: Path) -> list[str]:
     sorted({shlex.join(each) for _, script in SCRIPTS for each in commands(script) if reads_results(each)}),
 )
 def test_commands_that_read_results_work(
-    line: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    line: str, quickstart: tuple[Path, str], rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arguments = adapted(shlex.split(line), finished)
+    finished = quickstart[0].parent
+    arguments = adapted(shlex.split(line), finished, rendered / "truth")
     if arguments[0] == "report":  # it writes into the output folder
         shutil.copytree(finished / "out", tmp_path / "out")
         arguments[1] = str(tmp_path / "out")

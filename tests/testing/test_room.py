@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, roll_panorama, rotation_from_rotvec, sample_panorama
+from pano_mvs.geometry import (
+    Rigid3,
+    pixel_from_ray,
+    ray_grid,
+    roll_panorama,
+    rotation_from_rotvec,
+    sample_panorama,
+    spiral_rays,
+)
 from pano_mvs.testing.room import Room, capture_poses, default_room, noise, range_along, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
 from tests.synthetic.capture_files import write_capture
@@ -67,6 +75,16 @@ def test_normals_point_towards_the_camera() -> None:
         assert met.any()
         assert np.all(np.sum(normal[met] * rays[met], axis=1) < 0)
         assert np.linalg.norm(normal[met], axis=1) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("surface", default_room().surfaces[1:])
+def test_rays_that_do_not_come_near_a_surface_do_not_meet_it(surface: Cuboid | Quad | Ball) -> None:
+    rays, bounded = spiral_rays(3000), 0
+    for origin in np.random.default_rng(0).uniform(-2.5, 2.5, (20, 3)):
+        met, near = np.flatnonzero(np.isfinite(surface.hit(origin, rays)[0])), surface.towards(origin, rays)
+        assert near is None or np.isin(met, near).all()
+        bounded += near is not None and len(near) < 1000
+    assert bounded > 5
 
 
 def test_range_is_taken_at_the_exact_pixel_centre() -> None:

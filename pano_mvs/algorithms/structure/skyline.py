@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.structure.kernels_creases import edge_clarities
 from pano_mvs.algorithms.structure.view import (
     AZIMUTHS,
     HALF_DIFFERENCE,
@@ -69,16 +68,52 @@ class Skyline:
 
     def crease_clarity(self, distance: FloatArray, height: float) -> FloatArray:
         """Return how clear one crease of walls is, at a height above the camera that is negative for the floor."""
-        beside = [height * (1 + share) for share in (*_SKIRTINGS, *(-share for share in _SKIRTINGS)) if height < 0]
-        edges = np.empty((1 + len(beside), *distance.shape), np.float32)
-        edge_clarities(
-            self.differences, distance, np.array([height, *beside]), _APART_RAD, self.half_window, CLEAR_LEVELS, edges
-        )
-        clear = edges[0]
+        columns = _arcs(np.isfinite(distance), self.half_window)
+        rows = np.arange(len(distance))[:, None]
+        result = np.full(distance.shape, -np.inf, np.float32)
+        distance = distance[rows, columns]
+        seen = np.isfinite(distance)
+        distance = np.where(seen, distance, 1.0)
+        elevation, other = np.arctan2(height, distance), []
+        clear = self._edge_clarity(elevation, seen, columns)
         if height < 0:
-            below, above = edges[1 : 1 + len(_SKIRTINGS)].max(axis=0), edges[1 + len(_SKIRTINGS) :].max(axis=0)
-            clear = clear * (1 + above - below)
-        return np.where(np.isfinite(distance), clear, -np.inf)
+            for sign in (1, -1):
+                clearest = np.zeros(clear.shape)
+                for part in _SKIRTINGS:
+                    beside = np.arctan2(height * (1 - sign * part), distance)
+                    counted = seen & (np.abs(beside - elevation) > _APART_RAD)
+                    clearest = np.maximum(clearest, self._edge_clarity(beside, counted, columns))
+                other.append(clearest)
+            clear *= (1 + other[0] - other[1]).astype(np.float32)
+        result[rows, columns] = np.where(seen, clear, -np.inf)
+        return np.asarray(result)
+
+    def _edge_clarity(
+        self, elevation: FloatArray, counted: NDArray[np.bool_], columns: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Return how clear the edges of walls at elevations (L, N) are, from 0 to 1; 0 where they do not count."""
+        common = mean_along(self._at(elevation, columns) * counted[..., None], self.half_window)
+        red, green, blue = np.moveaxis(common, -1, 0)  # nine times as fast as `np.linalg.norm`
+        return np.asarray(np.sqrt(np.minimum(np.sqrt(red * red + green * green + blue * blue) / CLEAR_LEVELS, 1.0)))
+
+    def _at(self, elevation: FloatArray, columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        place = (elevation + np.pi / 2) / STEP_RAD
+        first = np.clip(place.astype(np.int64), 0, len(self.differences) - 2)
+        part = (place - first)[..., None].astype(np.float32)
+        width = self.differences.shape[1]
+        flat, index = self.differences.reshape(-1, 3), first * width + columns
+        return np.asarray(flat.take(index, axis=0) * (1 - part) + flat.take(index + width, axis=0) * part)
+
+
+def _arcs(seen: NDArray[np.bool_], half_window: int) -> NDArray[np.int64]:
+    """Return azimuths (L, N) with all that are seen (L, A), and half a window of others from the last to the first.
+
+    All azimuths if what is seen is not one arc in each row.
+    """
+    starts, count = seen & ~np.roll(seen, 1, axis=1), int(seen.sum(axis=1).max(initial=0)) + half_window
+    if count >= seen.shape[1] or (starts.sum(axis=1) > 1).any():
+        return np.broadcast_to(np.arange(seen.shape[1]), seen.shape)
+    return np.asarray((starts.argmax(axis=1)[:, None] + np.arange(count)) % seen.shape[1])
 
 
 def skyline(picture: NDArray[np.float32], cam_from_world: Rigid3, step: int = 1) -> Skyline:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 import pytest
@@ -53,6 +54,12 @@ def blobs(
 @pytest.fixture(scope="module")
 def room_image() -> NDArray[np.uint8]:
     return render(default_room(), Rigid3.identity(), SIZE, supersample=1)[0]
+
+
+@pytest.fixture(scope="module")
+def of_room(room_image: NDArray[np.uint8]) -> Callable[..., Features]:
+    """What a method finds in the room, by its name and settings; each is computed once."""
+    return cache(lambda name, **settings: EXTRACTORS[name](room_image, everywhere(room_image), **settings))
 
 
 def everywhere(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -129,8 +136,10 @@ def test_poles_and_seam_are_places_like_any_other(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_record_is_sound_sorted_and_the_same_again(name: str, room_image: NDArray[np.uint8]) -> None:
-    first = EXTRACTORS[name](room_image, everywhere(room_image))
+def test_record_is_sound_sorted_and_the_same_again(
+    name: str, room_image: NDArray[np.uint8], of_room: Callable[..., Features]
+) -> None:
+    first = of_room(name)
     again = EXTRACTORS[name](room_image, everywhere(room_image))
     first.check()
     assert len(first) > 500
@@ -143,16 +152,15 @@ def test_record_is_sound_sorted_and_the_same_again(name: str, room_image: NDArra
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_no_two_key_points_at_one_place(name: str, room_image: NDArray[np.uint8]) -> None:
-    found = EXTRACTORS[name](room_image, everywhere(room_image))
-    assert not cKDTree(found.bearings).query_pairs(0.49 * PIXEL)
+def test_no_two_key_points_at_one_place(name: str, of_room: Callable[..., Features]) -> None:
+    assert not cKDTree(of_room(name).bearings).query_pairs(0.49 * PIXEL)
 
 
-def test_sift_descriptors_are_whole_numbers_of_one_length(room_image: NDArray[np.uint8]) -> None:
-    found = extract_sift(room_image, everywhere(room_image))
+def test_sift_descriptors_are_whole_numbers_of_one_length(of_room: Callable[..., Features]) -> None:
+    found = of_room("sift")
     np.testing.assert_array_equal(found.descriptors, np.rint(found.descriptors))
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 512, rtol=0.01)
-    plain = extract_sift(room_image, everywhere(room_image), root=False)
+    plain = of_room("sift", root=False)
     np.testing.assert_array_equal(found.bearings, plain.bearings)
     assert not np.array_equal(found.descriptors, plain.descriptors)
 
@@ -163,17 +171,21 @@ def repeated_share(found: Features, other: Features, new_from_old: NDArray[np.fl
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_rolling_the_picture_rolls_the_key_points(name: str, room_image: NDArray[np.uint8]) -> None:
+def test_rolling_the_picture_rolls_the_key_points(
+    name: str, room_image: NDArray[np.uint8], of_room: Callable[..., Features]
+) -> None:
     rolled, new_from_old = roll_panorama(room_image, 201)
-    found, other = (EXTRACTORS[name](i, everywhere(i), max_keypoints=20_000) for i in (room_image, rolled))
-    assert repeated_share(found, other, new_from_old) > 0.7
+    other = EXTRACTORS[name](rolled, everywhere(rolled), max_keypoints=20_000)
+    assert repeated_share(of_room(name, max_keypoints=20_000), other, new_from_old) > 0.7
 
 
-def test_turning_the_camera_turns_the_key_points(room_image: NDArray[np.uint8]) -> None:
+def test_turning_the_camera_turns_the_key_points(
+    room_image: NDArray[np.uint8], of_room: Callable[..., Features]
+) -> None:
     new_from_old = rotation_from_rotvec([1.2, 0.3, -0.8])
     turned = rotate_panorama(room_image, new_from_old)
-    found, other = (extract_sift(i, everywhere(i), max_keypoints=20_000) for i in (room_image, turned))
-    assert repeated_share(found, other, new_from_old) > 0.7
+    other = extract_sift(turned, everywhere(turned), max_keypoints=20_000)
+    assert repeated_share(of_room("sift", max_keypoints=20_000), other, new_from_old) > 0.7
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
@@ -208,11 +220,11 @@ def test_a_plain_picture_has_none() -> None:
         assert len(found) == 0
 
 
-def test_few_key_points_are_spread_evenly(room_image: NDArray[np.uint8]) -> None:
-    found = extract_sift(room_image, everywhere(room_image), max_keypoints=300)
+def test_few_key_points_are_spread_evenly(of_room: Callable[..., Features]) -> None:
+    found = of_room("sift", max_keypoints=300)
     assert len(found) == 300
     counts = np.bincount(np.argmax(found.bearings @ face_centers().T, axis=1), minlength=20)
-    everything = extract_sift(room_image, everywhere(room_image), max_keypoints=20_000)
+    everything = of_room("sift", max_keypoints=20_000)
     available = np.bincount(np.argmax(everything.bearings @ face_centers().T, axis=1), minlength=20)
     assert np.all(counts >= np.minimum(available, 5))
     assert np.all(np.diff(found.scores) <= 0)

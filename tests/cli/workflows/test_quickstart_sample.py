@@ -14,19 +14,19 @@ from tests.cli.conftest import deliverables, run_json
 pytestmark = pytest.mark.slow
 
 
-def command(folder: Path, *settings: str) -> list[str]:
+def command(folder: Path, *options: str) -> list[str]:
     return [
         sys.executable,
         *f"-m pano_mvs run quickstart --out {folder / 'out'} --cache {folder / 'cache'}".split(),
-        *settings,
+        *options,
     ]
 
 
 SMALL = ("--set", "images.max_width=512", "--set", "depth.planes=48")
 
 
-def test_poses_and_ranges_are_as_good_as_promised(tmp_path: Path) -> None:
-    subprocess.run(command(tmp_path), check=True)
+def test_poses_and_ranges_are_as_good_as_promised(tmp_path: Path, sample_cache: Path) -> None:
+    subprocess.run(command(tmp_path, "--cache", str(sample_cache)), check=True)
     scores = run_json(tmp_path / "out")["scores"]
     assert scores["poses"]["registered"] == 4
     assert scores["poses"]["median_pair_error_deg"] <= 0.15

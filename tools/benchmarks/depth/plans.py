@@ -71,12 +71,11 @@ class Samples:
         found = np.full(len(self.xy), np.inf)
         if not len(others.xy):
             return found
-        tree = cKDTree(others.xy)
-        for number, xy in enumerate(self.xy):
-            near = tree.query_ball_point(xy, within)
+        for number, indices in enumerate(cKDTree(others.xy).query_ball_point(self.xy, within)):
+            near = np.array(indices, np.intp)
             if parallel:
-                near = [idx for idx in near if abs(others.along[idx] @ self.along[number]) > _FALSE]
-            if near:
+                near = near[np.abs(others.along[near] @ self.along[number]) > _FALSE]
+            if len(near):
                 offset = others.xy[near] - self.xy[number]
                 if parallel:  # across; along it is the distance of the samples
                     offset = offset - (offset * others.along[near]).sum(axis=1, keepdims=True) * others.along[near]
