@@ -324,16 +324,25 @@ def test_what_is_not_confirmed_before_the_floor_stays_if_other_views_show_anothe
     assert np.mean(np.abs(laid / expected - 1) < 0.01) > 0.9
 
 
-def test_a_plane_is_not_laid_where_another_view_sees_through_it(box: Box, planes: Structure) -> None:
-    """The others see 2.5 times as far through the wall ahead, as through a door."""
-    ahead = ray_grid(SIZE)[..., 2] > 0.5
-    others = [
-        replace(box.maps[name], range=np.where(ahead, 2.5 * box.truth[name], box.maps[name].range).astype(np.float32))
-        for name in ("1.png", "2.png")
-    ]
-    middle = ray_grid(SIZE)[..., 2] > 0.98
-    result = box.laid(planes, sources=others)
-    np.testing.assert_array_equal(result.range[middle], box.maps["0.png"].range[middle])
+@pytest.mark.parametrize("red", [True, False])
+def test_a_plane_is_not_laid_where_the_others_see_something_else_behind_it(
+    box: Box, planes: Structure, *, red: bool
+) -> None:
+    """The others see 2.5 times as far through the wall ahead, as through a door, or are wrong about a plain wall."""
+    ahead, middle = ray_grid(SIZE)[..., 2] > 0.5, ray_grid(SIZE)[..., 2] > 0.98
+    for picture in box.pictures.values():
+        picture[ahead] = 120
+    own = box.maps["0.png"]
+    far = np.where(ahead, 2.4 * own.range, own.range).astype(np.float32)
+    unsure = replace(own, range=far, confidence=np.where(ahead, SEEN, own.confidence).astype(np.uint8))
+    others = []
+    for name in ("1.png", "2.png"):
+        behind = np.where(ahead, 2.5 * box.truth[name], box.maps[name].range).astype(np.float32)
+        others.append(replace(box.maps[name], range=behind))
+        box.pictures[name][ahead] = (160, 60, 40) if red else 120
+    laid = box.laid(planes, range_map=unsure, sources=others).range[middle]
+    expected = far[middle] if red else box.truth["0.png"][middle]
+    assert np.mean(np.abs(laid / expected - 1) < 0.01) > 0.9
 
 
 @pytest.mark.parametrize("deep", [1.4, np.nan])

@@ -38,11 +38,13 @@ class Seen:
     """What another view shows at places, (h, w) each.
 
     `ratio`: its range there relative to the distance of the place; NaN where either is unknown. `confirmed`: whether
-    that range is confirmed. `colors`: (h, w, 3), its colours, NaN where it is masked.
+    that range is confirmed. `uncertainty`: relative standard deviation of that range; NaN where unknown. `colors`:
+    (h, w, 3), its colours, NaN where it is masked.
     """
 
     ratio: FloatArray
     confirmed: Mask
+    uncertainty: FloatArray
     colors: FloatArray
 
 
@@ -58,12 +60,14 @@ def seen_by(view: OtherView, places: FloatArray) -> Seen:
     if view.valid is not None:
         shown = cv2.resize(view.valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         small[shown < _SHOWN] = np.nan
-    ratio, confirmed = np.full(known.shape, np.nan), np.zeros(known.shape, np.bool_)
+    ratio, uncertainty, confirmed = *np.full((2, *known.shape), np.nan), np.zeros(known.shape, np.bool_)
     colors = np.full(places.shape, np.nan)
     ratio[known] = view.range_map.range[row, column] / distance
     confirmed[known] = view.range_map.confidence[row, column] >= CONSISTENT_CONFIDENCE[0]
+    if view.range_map.uncertainty is not None:
+        uncertainty[known] = view.range_map.uncertainty[row, column]
     colors[known] = small[pixels_containing(rays, (height, width))]
-    return Seen(ratio, confirmed, colors)
+    return Seen(ratio, confirmed, uncertainty, colors)
 
 
 def laid_evidence(
@@ -80,8 +84,9 @@ def laid_evidence(
 
     Returns:
         `nearer` (logarithm of the range on the plane relative to its own, which may be that of something before the
-        plane), and `unlike` (median difference of its colour, in grey levels, to the views whose own ranges are not
-        nearer than the place).
+        plane), `unlike` (median difference of its colour, in grey levels, to the views whose own ranges are not nearer
+        than the place), and `through` (sum over the views whose confirmed ranges lie behind the place, of the logarithm
+        of 1 + how many standard deviations).
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         nearer = np.log(laid / own)
@@ -94,7 +99,16 @@ def laid_evidence(
     return {
         "nearer": np.maximum(nearer, 0.0),
         "unlike": _median(unlike, own.shape),
+        "through": np.sum([np.zeros(own.shape), *(_through(seen, error) for seen in views)], axis=0),
     }
+
+
+def _through(seen: Seen, error: float) -> FloatArray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        behind = seen.confirmed & (seen.ratio > 1 + error)
+        # The least standard deviation of ranges is about a thousandth.
+        deviations = np.log(seen.ratio) / np.maximum(np.where(np.isnan(seen.uncertainty), error, seen.uncertainty), 1e-3)
+        return np.where(behind, np.log1p(deviations), 0.0)
 
 
 def _gain(picture: Picture, seen: Seen, *, near: Mask, error: float) -> FloatArray:

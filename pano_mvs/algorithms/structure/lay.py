@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.guided import GuidedFilter
 from pano_mvs.algorithms.filters.supported import has_texture
 from pano_mvs.algorithms.filters.uncertainty import with_ranges
-from pano_mvs.algorithms.structure.laid import OtherView, Seen, laid_evidence, seen_by
+from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.laid_coefficients import FITTED
 from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
@@ -71,8 +71,8 @@ def lay_structure(
         guide: (H, W, 3) RGB panorama.
         structure: planes in the world.
         cam_from_world: pose of the view.
-        sources: other views; a pixel is not moved to where one of them sees through the plane, nor where its own range
-            is off the plane and the fitted model (`laid_evidence`) holds that it shows something else.
+        sources: other views; a pixel whose own range is off the plane is not moved where the fitted model
+            (`laid_evidence`) holds that it shows something else.
         group: of the poses of the view.
         valid: (H, W) pixels that may have a range; None: all.
 
@@ -93,7 +93,7 @@ def lay_structure(
     other = found.off.copy()
     evidence = {name: values[found.off] for name, values in found.evidence.items()}
     other[found.off] = FITTED.probabilities(evidence) < MIN_PROBABILITY
-    label = _enlarged(np.where(found.seen_through | other, -1, found.label), size)
+    label = _enlarged(np.where(other, -1, found.label), size)
     agree = _enlarged(found.agree, size) > 0
     laid = _chosen(found.ranges_on, label)
     with np.errstate(invalid="ignore"):
@@ -136,7 +136,6 @@ class Proposal:
         label: (h, w) position in `planes`; −1 for none.
         laid: (h, w) range on that plane; NaN without one.
         agree: (h, w) whether another view confirms a range on it.
-        seen_through: (h, w) whether other views see through it.
         off: (h, w) whether the own range is not on the plane, or unknown.
         evidence: what was measured of each pixel (`laid_evidence`), (h, w) each.
     """
@@ -150,7 +149,6 @@ class Proposal:
     label: NDArray[np.int16]
     laid: FloatArray
     agree: Mask
-    seen_through: Mask
     off: Mask
     evidence: dict[str, FloatArray]
 
@@ -210,15 +208,16 @@ def proposed_planes(
     laid = _chosen(coarse_planes.__getitem__, label)
     places = cam_from_world.center + coarse_rays * laid[..., None]
     views = [seen_by(view, places) for view in sources[:MAX_LAID_SOURCES]]
-    agree, seen_through = _seen_by_others(views, laid.shape, error=plain_error)
+    agree = np.zeros(laid.shape, np.bool_)
+    for seen in views:
+        with np.errstate(invalid="ignore"):
+            agree |= seen.confirmed & (np.abs(seen.ratio - 1) < plain_error)
     own = on_grid(range_map.range, rows).astype(np.float64)
     colors = cv2.resize(guide, laid.shape[::-1], interpolation=cv2.INTER_AREA)
     with np.errstate(invalid="ignore"):
         off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, rows)) & ~on_grid(sunk, rows)
     evidence = laid_evidence(own, laid, picture=colors, views=views, error=plain_error)
-    return Proposal(
-        planes, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, seen_through, off, evidence
-    )
+    return Proposal(planes, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, off, evidence)
 
 
 def _floor(structure: Structure, planes: NDArray[np.intp]) -> int | None:
@@ -287,16 +286,6 @@ def _chosen(ranges_on: Callable[[int], FloatArray], label: NDArray[np.int16]) ->
         here = label == number
         chosen[here] = ranges_on(number)[here]
     return chosen
-
-
-def _seen_by_others(views: Sequence[Seen], shape: tuple[int, ...], *, error: float) -> tuple[Mask, Mask]:
-    """Return where a confirmed range of another view agrees with places (h, w), and where one is clearly behind."""
-    agree, through = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    for seen in views:
-        with np.errstate(invalid="ignore"):
-            agree += seen.confirmed & (np.abs(seen.ratio - 1) < error)
-            through += seen.confirmed & (seen.ratio > 1 + error)
-    return np.asarray(agree > 0), np.asarray(through > agree)
 
 
 def _described(

@@ -37,7 +37,7 @@ from tools.benchmarks.depth.houses import read_house
 from tools.benchmarks.table import print_table
 
 TABLE = Path(__file__).with_name("laid.csv")
-SIGNS = {"nearer": -1, "unlike": -1}
+SIGNS = {"nearer": -1, "unlike": -1, "through": -1}
 PER_PLACE = 300
 PENALTY = 1.0
 
