@@ -106,9 +106,9 @@ def laid_evidence(
 def _through(seen: Seen, error: float) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         behind = seen.confirmed & (seen.ratio > 1 + error)
-        # The least standard deviation of ranges is about a thousandth.
-        deviations = np.log(seen.ratio) / np.maximum(np.where(np.isnan(seen.uncertainty), error, seen.uncertainty), 1e-3)
-        return np.where(behind, np.log1p(deviations), 0.0)
+        # Ranges without a standard deviation agree within the error. The least one is about a thousandth.
+        std = np.fmax(np.where(np.isnan(seen.uncertainty), error, seen.uncertainty), 1e-3)
+        return np.where(behind, np.log1p(np.log(seen.ratio) / std), 0.0)
 
 
 def _gain(picture: Picture, seen: Seen, *, near: Mask, error: float) -> FloatArray:
