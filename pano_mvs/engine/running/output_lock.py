@@ -37,7 +37,7 @@ def output_lock(out: Path) -> Iterator[None]:
     owner = {"host": socket.gethostname(), "process": os.getpid(), "since": since}
     try:
         handle = _acquired(path)
-        os.truncate(handle, 0)
+        os.ftruncate(handle, 0)
         os.write(handle, json.dumps(owner, indent=1).encode() + b"\n")
     except StoreError:
         raise
@@ -49,9 +49,12 @@ def output_lock(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        if os.name != "posix":
+            os.close(handle)  # there, an open file cannot be removed
         with suppress(OSError):
             path.unlink()
-        os.close(handle)
+        if os.name == "posix":
+            os.close(handle)
 
 
 def is_run_gone(out: Path) -> bool:

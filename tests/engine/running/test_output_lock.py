@@ -69,6 +69,31 @@ def test_a_file_that_its_owner_has_just_removed_is_not_the_lock(
     assert len(calls) == 2
 
 
+@ON_POSIX
+def test_where_open_files_cannot_be_removed_the_file_is_closed_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = os.close
+    held: list[bool] = []
+
+    def unlink(_: Path) -> None:
+        if held:
+            raise PermissionError("it is open")
+        os.unlink(tmp_path / LOCK_NAME)  # noqa: PTH108  # as the method does
+
+    def closed(handle: int) -> None:
+        close(handle)
+        held.clear()
+
+    with output_lock(tmp_path):
+        held.append(True)
+        monkeypatch.setattr(os, "close", closed)
+        monkeypatch.setattr(Path, "unlink", unlink)
+        monkeypatch.setattr(os, "name", "nt")
+    monkeypatch.undo()
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_system_without_locks_stops_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_lock", lambda _handle: None)
     with output_lock(tmp_path):
