@@ -59,8 +59,9 @@ def output_lock(out: Path) -> Iterator[None]:
 
 def is_run_gone(out: Path) -> bool:
     """Return whether a run in an output folder was killed: it left its file, and nobody holds the lock."""
+    path = out / LOCK_NAME
     try:
-        handle = os.open(out / LOCK_NAME, os.O_RDWR)
+        handle = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)  # it may be another user's
     except OSError:
         return False
     try:

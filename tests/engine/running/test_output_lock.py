@@ -45,6 +45,21 @@ with output_lock(Path({str(tmp_path)!r})): os._exit(9)"""
     assert not list(tmp_path.iterdir())
 
 
+@ON_POSIX
+def test_a_killed_run_of_another_user_is_gone_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = os.open
+
+    def as_other(path: Path, flags: int) -> int:
+        if flags & os.O_RDWR:
+            raise PermissionError
+        return opened(path, flags)
+
+    (tmp_path / LOCK_NAME).touch()
+    monkeypatch.setattr(os, "access", lambda _path, mode: not mode & os.W_OK)
+    monkeypatch.setattr(os, "open", as_other)
+    assert is_run_gone(tmp_path)
+
+
 @pytest.mark.parametrize("text", [b"", b"{", b"[]"])
 def test_a_file_that_names_nobody_is_no_obstacle(tmp_path: Path, text: bytes) -> None:
     (tmp_path / LOCK_NAME).write_bytes(text)
