@@ -98,7 +98,7 @@ def code_texts(path: Path) -> tuple[str, dict[str, str]]:
         SyntaxError: if one is not Python.
     """
     roots = _Roots.of(path.resolve())
-    texts = {name: (roots.base / name).read_text(encoding="utf-8") for name in _local_code(path).files}
+    texts = {name: (roots.base / name).read_text(encoding="utf-8-sig") for name in _local_code(path).files}
     return roots.name_of(path.resolve()), texts
 
 
@@ -215,7 +215,7 @@ class _Code:
 def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
     """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
-        digest, imports = _parsed(path.read_text(encoding="utf-8"))
+        digest, imports = _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
     except SyntaxError as error:
         error.filename = str(path)
         raise
