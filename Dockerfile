@@ -3,7 +3,7 @@
 #   docker run --rm --user "$(id -u):$(id -g)" --volume "$PWD:/work" --volume pano_mvs:/cache pano_mvs run quickstart
 FROM python:3.12-slim
 
-# EGL and Mesa draw the images of the report and of `view --screenshot` without a display.
+# EGL and Mesa draw `view --screenshot` without a display.
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends libegl1 libgl1-mesa-dri libgomp1 \
     && rm -rf /var/lib/apt/lists/*

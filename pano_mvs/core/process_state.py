@@ -91,7 +91,7 @@ def _set_warnings(filters: list[Any]) -> None:
 
 @cache
 def _mathematics() -> ctypes.CDLL:
-    return ctypes.CDLL(None)
+    return ctypes.CDLL("ucrtbase" if os.name == "nt" else None)
 
 
 @dataclass(frozen=True)

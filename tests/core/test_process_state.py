@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pano_mvs.core import process_state
 from pano_mvs.core.process_state import restored_state
 
 _UPWARD = 0x800  # FE_UPWARD of x86
@@ -45,3 +46,18 @@ def test_changes_are_named_and_undone(what: str, monkeypatch: pytest.MonkeyPatch
     with restored_state() as found:
         pass
     assert found == []
+
+
+def test_windows_has_its_floating_point_modes_in_a_library_of_that_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    names: list[str | None] = []
+
+    def library(name: str | None) -> object:
+        names.append(name)
+        raise OSError("not found")
+
+    monkeypatch.setattr(process_state, "_mathematics", process_state._mathematics.__wrapped__)
+    monkeypatch.setattr(ctypes, "CDLL", library)
+    monkeypatch.setattr(os, "name", "nt")
+    process_state.ProcessState.now().restore()
+    monkeypatch.undo()
+    assert set(names) == {"ucrtbase"}  # there, None is a TypeError

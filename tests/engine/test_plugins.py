@@ -83,6 +83,7 @@ def test_a_broken_plugin_is_told_when_a_name_is_missing(mine: Path, broken: str)
     assert f"{mine / 'bad.py'} failed to load:" in told
     assert any(word in told for word in ("Traceback", "SyntaxError", "SystemExit", "BaseException"))
     assert "registry.py" not in told
+    assert "stage_code.py" not in told
 
 
 def test_the_traceback_of_a_broken_plugin_is_the_original_one(mine: Path) -> None:

@@ -157,12 +157,12 @@ class Library(NamedTuple):
 
 
 _OPENGL = "install the system's OpenGL libraries (Debian, Ubuntu: apt install libgl1 libegl1), or pip install -U vtk"
-_NO_PICTURES = ": there are no pictures of clouds; all else works"
+_NO_VIEWER = ": `pano-mvs view` cannot draw; all else works"
 _LIBRARIES = (
     Library("numba", _NUMBA, "compiles", "failed", f"{_REINSTALL} numba llvmlite"),
     Library("pycolmap", _PYCOLMAP, "has EQUIRECTANGULAR cameras", "failed", f"{_REINSTALL} pycolmap"),
     Library("OpenCV", _OPENCV, "reads images", "failed", f"{_REINSTALL} opencv-python-headless"),
     Library("ONNX Runtime", _ONNX_RUNTIME, "runs networks", "failed", f"{_REINSTALL} onnxruntime"),
-    Library("PyVista", _PYVISTA, "renders without a screen", "warning", _OPENGL, _NO_PICTURES),
+    Library("PyVista", _PYVISTA, "renders without a screen", "warning", _OPENGL, _NO_VIEWER),
     Library("torch", _TORCH, "", "warning", "reinstall torch, or sweep with `backend: numba`"),
 )

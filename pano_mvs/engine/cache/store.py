@@ -68,7 +68,7 @@ class DiskGuard:
 
     @contextmanager
     def scratch(self, parent: Path) -> Iterator[Path]:
-        """Yield an empty folder, removed afterwards.
+        """Yield the absolute path of an empty folder, removed afterwards.
 
         Raises:
             StoreError: if the disk is too full to start, or becomes full inside the context.
@@ -76,7 +76,7 @@ class DiskGuard:
         self.require()
         try:
             make_folder(parent)
-            folder = Path(tempfile.mkdtemp(dir=parent, prefix=temporary_prefix()))
+            folder = Path(tempfile.mkdtemp(dir=parent.absolute(), prefix=temporary_prefix()))
         except OSError as error:
             raise self.cannot_write(error) from error
         try:

@@ -39,7 +39,7 @@ from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.params import key_fields, registered_files
 from pano_mvs.engine.stages.stage import Cardinality, Names, Port
 from pano_mvs.scene import Axis
 from pano_mvs.scene.record import changed_text, vanished_text
@@ -91,10 +91,11 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 
 
 def _called(unit: Unit, arguments: dict[str, Any], context: Context) -> Any:
-    """Return what the stage returns, with the state of the process as before if it is a plugin's."""
+    """Return what the stage returns, with the state of the process as before if it, or a part of it, is a plugin's."""
     process, spec = os.getpid(), unit.entry.spec
     offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
-    with nullcontext() if spec.is_built_in else restored_state() as changes:
+    is_ours = spec.is_built_in and not registered_files(unit.entry.params)
+    with nullcontext() if is_ours else restored_state() as changes:
         try:
             value = spec.function(**arguments, **{name: offered[role] for name, role in spec.extras.items()})
         finally:

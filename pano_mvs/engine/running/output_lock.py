@@ -37,7 +37,7 @@ def output_lock(out: Path) -> Iterator[None]:
     owner = {"host": socket.gethostname(), "process": os.getpid(), "since": since}
     try:
         handle = _acquired(path)
-        os.truncate(handle, 0)
+        os.ftruncate(handle, 0)
         os.write(handle, json.dumps(owner, indent=1).encode() + b"\n")
     except StoreError:
         raise
@@ -49,15 +49,19 @@ def output_lock(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        if os.name != "posix":
+            os.close(handle)  # there, an open file cannot be removed
         with suppress(OSError):
             path.unlink()
-        os.close(handle)
+        if os.name == "posix":
+            os.close(handle)
 
 
 def is_run_gone(out: Path) -> bool:
     """Return whether a run in an output folder was killed: it left its file, and nobody holds the lock."""
+    path = out / LOCK_NAME
     try:
-        handle = os.open(out / LOCK_NAME, os.O_RDWR)
+        handle = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)  # it may be another user's
     except OSError:
         return False
     try:

@@ -205,8 +205,8 @@ def _broken(origin: str, error: BaseException) -> Plugin:
 
 
 def _trace(error: BaseException) -> str:
-    """Return the traceback, beginning at the plugin's own code."""
-    step = error.__traceback__
+    """Return the traceback, beginning at the plugin's own code; only the place if that is not Python."""
+    step = None if isinstance(error, SyntaxError) else error.__traceback__
     while step is not None and (
         step.tb_frame.f_code.co_filename == __file__ or "importlib" in step.tb_frame.f_code.co_filename
     ):

@@ -21,7 +21,7 @@ from typing import TypeAlias
 import pano_mvs
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import StoreError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import checked_body, write_checked
 from pano_mvs.core.kernel_cache import user_cache_folder
 from pano_mvs.engine.stages.params import Params, registered_files
 from pano_mvs.engine.stages.stage import StageSpec
@@ -98,7 +98,7 @@ def code_texts(path: Path) -> tuple[str, dict[str, str]]:
         SyntaxError: if one is not Python.
     """
     roots = _Roots.of(path.resolve())
-    texts = {name: (roots.base / name).read_text(encoding="utf-8") for name in _local_code(path).files}
+    texts = {name: (roots.base / name).read_text(encoding="utf-8-sig") for name in _local_code(path).files}
     return roots.name_of(path.resolve()), texts
 
 
@@ -182,8 +182,10 @@ class _Roots:
         return path.relative_to(self.base).as_posix() if path.is_relative_to(self.base) else str(path)
 
     def files(self, dotted: str) -> list[Path]:
-        found = [] if self.folder is None else _module_files(self.folder, dotted)
-        if self.package is not None and dotted.partition(".")[0] == self.package.name:
+        top = dotted.partition(".")[0]
+        # pano_mvs is loaded before any plugin, so a checkout of it beside a plugin is not what the plugin gets.
+        found = [] if self.folder is None or top == _OURS.name else _module_files(self.folder, dotted)
+        if self.package is not None and top == self.package.name:
             found += (_our_files if self.package == _OURS else _module_files)(self.package.parent, dotted)
         return found
 
@@ -213,7 +215,7 @@ class _Code:
 def _module(path: Path, roots: _Roots) -> tuple[str, set[Path], set[str]]:
     """Return the digest of a module, the files that it imports from the roots, and the names that it imports beside."""
     try:
-        digest, imports = _parsed(path.read_text(encoding="utf-8"))
+        digest, imports = _parsed(path.read_text(encoding="utf-8-sig"))  # editors on Windows write a mark
     except SyntaxError as error:
         error.filename = str(path)
         raise
@@ -292,16 +294,25 @@ def _imports_in(tree: ast.AST) -> Iterator[_Import]:
                 yield from _imports_in(node)
 
 
-_FILE = f"{sys.version_info.major}.{sys.version_info.minor}.json"
+def _kept_place() -> Path:
+    return user_cache_folder() / "pano-mvs" / "code" / f"{sys.version_info.major}.{sys.version_info.minor}.json"
+
+
+@cache
+def _parser() -> str:
+    """Return a digest of what decides how a module is parsed: results of another version are not read."""
+    return digest_from_value([sys.version, Path(__file__).read_bytes()])
 
 
 @cache
 def _known_parsed() -> dict[str, _Parsed]:
-    """Return what earlier processes have parsed; nothing if the file is missing or damaged."""
-    try:
-        return dict(json.loads((user_cache_folder() / "pano-mvs" / "code" / _FILE).read_bytes()))
-    except (OSError, ValueError, TypeError, RuntimeError):
-        return {}
+    """Return what earlier processes have parsed; nothing if the file is missing, damaged or of another version."""
+    known: dict[str, _Parsed] = {}
+    with suppress(OSError, ValueError, RuntimeError):
+        parser, kept = json.loads(checked_body(_kept_place().read_bytes()))
+        known = dict(kept) if parser == _parser() else {}
+    _kept_counts.append(len(known))
+    return known
 
 
 def _keep_parsed() -> None:
@@ -310,8 +321,8 @@ def _keep_parsed() -> None:
     if len(known) > _kept_counts[-1]:
         _kept_counts.append(len(known))
         with suppress(StoreError, OSError, RuntimeError):  # a user without a home
-            place = user_cache_folder() / "pano-mvs" / "code" / _FILE
-            write_text(place, json.dumps(dict(list(known.items())[-4000:])))
+            place, body = _kept_place(), json.dumps([_parser(), dict(list(known.items())[-4000:])])
+            write_checked(place, body.encode(), temporary_in=place.parent)
 
 
-_kept_counts = [0]
+_kept_counts: list[int] = []

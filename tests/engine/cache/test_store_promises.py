@@ -457,6 +457,17 @@ def test_an_array_of_a_shape_that_there_cannot_be_is_damage(tmp_path: Path, shap
         blobs.get(ref)
 
 
+def test_a_stage_that_changes_the_folder_still_finds_its_scratch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Store(Path("cache")).scratch() as scratch:
+        monkeypatch.chdir("/")
+        (scratch / "a.txt").touch()
+        monkeypatch.chdir(tmp_path)
+    assert not scratch.exists()
+
+
 @pytest.mark.parametrize(("days", "goes"), [(6.9, False), (7.1, True)])
 def test_what_has_another_name_goes_from_the_scratch_folder_after_seven_days(
     tmp_path: Path, days: float, goes: bool

@@ -10,15 +10,23 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any
 
+import numpy as np
 import pytest
+from pydantic import create_model
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.choose import SerialExecutor
+from pano_mvs.engine.executors.execute import _called
 from pano_mvs.engine.executors.processes import WorkerProcess
 from pano_mvs.engine.planning.plan import RunOptions
 from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import Params, RegisteredIn
 from tests.engine.conftest import Toy, ran, start
 from tests.engine.running.test_executors import Make, files_below, one_process, run_with, told, two_processes
 from tests.engine.running.test_run import ALL_UNITS
@@ -67,6 +75,32 @@ np.seterr(over="raise")""",
     notes = {note for stage in result.stages for note in stage.notes}
     change = "OpenCV's optimisation, numpy's handling of errors"
     assert any(f"it changed {change} in its process; this was undone" in note for note in notes)
+
+
+@pytest.mark.parametrize(("part", "left"), [("ours", "1"), ("theirs", "")])
+def test_changes_by_a_plugins_part_of_a_built_in_stage_are_undone(
+    part: str, left: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts: NamedRegistry[int] = NamedRegistry("toy part", {"ours": 1})
+    parts.register("theirs", 2, lambda: None)
+    monkeypatch.setenv("TOY_PART", "")
+
+    chosen = create_model(
+        "Chosen", __doc__="Settings.", __base__=Params, part=(Annotated[str, RegisteredIn(parts)], "ours")
+    )
+
+    def built_in() -> str:
+        os.environ["TOY_PART"] = "1"
+        return "value"
+
+    spec = SimpleNamespace(function=built_in, extras={}, is_built_in=True)
+    unit: Any = SimpleNamespace(
+        entry=SimpleNamespace(spec=spec, params=chosen.model_validate({"part": part})), source=None
+    )
+    context = Context(np.random.default_rng(0), tmp_path)
+    assert _called(unit, {}, context) == "value"
+    assert os.environ["TOY_PART"] == left
+    assert bool(context.notes) == (not left)
 
 
 def test_a_forked_child_neither_stores_nor_answers(toy: Toy) -> None:

@@ -45,6 +45,21 @@ with output_lock(Path({str(tmp_path)!r})): os._exit(9)"""
     assert not list(tmp_path.iterdir())
 
 
+@ON_POSIX
+def test_a_killed_run_of_another_user_is_gone_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = os.open
+
+    def as_other(path: Path, flags: int) -> int:
+        if flags & os.O_RDWR:
+            raise PermissionError
+        return opened(path, flags)
+
+    (tmp_path / LOCK_NAME).touch()
+    monkeypatch.setattr(os, "access", lambda _path, mode: not mode & os.W_OK)
+    monkeypatch.setattr(os, "open", as_other)
+    assert is_run_gone(tmp_path)
+
+
 @pytest.mark.parametrize("text", [b"", b"{", b"[]"])
 def test_a_file_that_names_nobody_is_no_obstacle(tmp_path: Path, text: bytes) -> None:
     (tmp_path / LOCK_NAME).write_bytes(text)
@@ -67,6 +82,31 @@ def test_a_file_that_its_owner_has_just_removed_is_not_the_lock(
     with output_lock(tmp_path):
         assert (tmp_path / LOCK_NAME).is_file()
     assert len(calls) == 2
+
+
+@ON_POSIX
+def test_where_open_files_cannot_be_removed_the_file_is_closed_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = os.close
+    held: list[bool] = []
+
+    def unlink(_: Path) -> None:
+        if held:
+            raise PermissionError("it is open")
+        os.unlink(tmp_path / LOCK_NAME)  # noqa: PTH108  # as the method does
+
+    def closed(handle: int) -> None:
+        close(handle)
+        held.clear()
+
+    with output_lock(tmp_path):
+        held.append(True)
+        monkeypatch.setattr(os, "close", closed)
+        monkeypatch.setattr(Path, "unlink", unlink)
+        monkeypatch.setattr(os, "name", "nt")
+    monkeypatch.undo()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_system_without_locks_stops_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

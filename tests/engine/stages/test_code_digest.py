@@ -157,3 +157,10 @@ def test_a_name_that_a_package_itself_defines_counts(tmp_path: Path, spelling: s
     before = code_digest(module)
     place.write_text("limit = 2")
     assert code_digest(module) != before
+
+
+def test_a_byte_order_mark_does_not_count(tmp_path: Path) -> None:
+    plugin = written(tmp_path, {"plug.py": "x = 1\n"})
+    found = code_digest(plugin), code_texts(plugin)
+    plugin.write_text("x = 1\n", encoding="utf-8-sig")
+    assert (code_digest(plugin), code_texts(plugin)) == found

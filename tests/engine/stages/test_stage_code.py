@@ -171,7 +171,7 @@ def test_what_was_parsed_is_kept_for_later_processes(tmp_path: Path, monkeypatch
     def later_process() -> None:
         stage_code_module._known_parsed.cache_clear()
         stage_code_module._parsed.cache_clear()
-        monkeypatch.setattr(stage_code_module, "_kept_counts", [0])
+        monkeypatch.setattr(stage_code_module, "_kept_counts", [])
 
     later_process()
     plugin = tmp_path / "plug.py"
@@ -179,10 +179,39 @@ def test_what_was_parsed_is_kept_for_later_processes(tmp_path: Path, monkeypatch
     before = code_digest(plugin)
     stage_code_module._keep_parsed()
     place = next((tmp_path / "kept").rglob("*.json"))
-    for damage in ("", "{", "[]", "1"):
-        if damage:
-            place.write_text(damage)
+    whole = place.read_text()
+    for text in (whole, "{", "[]", "1", whole.replace('[[0, "json", []]]', "7")):
+        place.write_text(text)
         later_process()
-        assert len(stage_code_module._known_parsed()) == (0 if damage else 1)
+        assert len(stage_code_module._known_parsed()) == (1 if text == whole else 0)
         assert code_digest(plugin) == before
     later_process()
+
+
+def test_what_another_version_parsed_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_code_module, "user_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(stage_code_module, "_kept_counts", [])
+    known = stage_code_module._known_parsed
+    known.cache_clear()
+    known()["text"] = "digest", ()
+    stage_code_module._keep_parsed()
+    place, written = stage_code_module._kept_place(), stage_code_module._kept_place().stat().st_mtime_ns
+    known.cache_clear()
+    assert list(known()) == ["text"]
+    stage_code_module._keep_parsed()
+    assert place.stat().st_mtime_ns == written  # nothing is new
+    monkeypatch.setattr(stage_code_module, "_parser", lambda: "later")
+    known.cache_clear()
+    assert known() == {}
+    known.cache_clear()
+
+
+def test_a_checkout_beside_a_plugin_is_not_what_the_plugin_imports(tmp_path: Path) -> None:
+    plugin = tmp_path / "plug.py"
+    plugin.write_text("from pano_mvs.scene import poses\n")
+    before = stage_code_module._code_of.__wrapped__(plugin, "")
+    (tmp_path / "pano_mvs" / "scene").mkdir(parents=True)
+    for file in ("__init__.py", "scene/__init__.py", "scene/poses.py"):
+        (tmp_path / "pano_mvs" / file).write_text("later = 1\n")
+    assert list(code_texts(plugin)[1]) == ["plug.py"]
+    assert stage_code_module._code_of.__wrapped__(plugin, "") == before
