@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pano_mvs.algorithms.filters.supported import has_texture
+from pano_mvs.algorithms.structure import planes as planes_module
 from pano_mvs.algorithms.structure import skyline
 from pano_mvs.algorithms.structure.ceilings import moved_ceilings, supposed_ceiling
 from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
@@ -370,6 +371,20 @@ def test_without_gravity_there_are_no_planes(box: Box) -> None:
     structure = box.structure(frame="the first registered camera")
     assert len(structure) == 0
     np.testing.assert_array_equal(box.laid(structure).range, box.maps["0.png"].range)
+
+
+def test_no_more_than_four_views_are_in_memory_at_a_time(box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[int] = []
+
+    def recorded(*_: object, threads: int, **_named: object) -> list[object]:
+        used.append(threads)
+        return []
+
+    monkeypatch.setattr(planes_module, "find_planes", recorded)
+    monkeypatch.setattr(planes_module, "find_mirrors", recorded)
+    poses = Poses.without_points(box.cams, frame="y down", scale="", metric=True)
+    find_structure(poses, box.maps, box.pictures.__getitem__, rng=np.random.default_rng(0), threads=64)
+    assert used == [4, 4]
 
 
 def test_a_structure_is_checked() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.growth import extend, why_nothing
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
-from pano_mvs.algorithms.poses.placement.resection import refine_resection, why_no_pair
+from pano_mvs.algorithms.poses.placement.resection import MAX_ERROR_RAD, MIN_POINTS, refine_resection, why_no_pair
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 
@@ -45,7 +45,7 @@ def extend_poses(
     fixed = {*model.cameras}
     model.verify_again()
     left = {*range(len(names))} - fixed
-    reasons = extend(model, left, adjust=False, confirmation=None)
+    reasons = extend(model, left, adjust=False, confirmation=None) if fixed else {}
     poses = Poses.without_points(
         {names[idx]: model.cameras[idx] for idx in sorted(model.cameras)},
         rejected={
@@ -58,11 +58,12 @@ def extend_poses(
     )
     tracks, members = model.tracks()
     for _ in range(3):
-        poses = poses_with_points(poses, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
+        # Points by the limits of placement, whatever is kept of them in the end.
+        seen = poses_with_points(poses, tracks, max_error_deg=float(np.rad2deg(MAX_ERROR_RAD)), min_angle_deg=1.0)
         for position, image in enumerate(members):
-            own = poses.track_image_idx == position
-            if image not in fixed and own.any():
-                points, bearings = poses.points_in_world[poses.track_point_idx[own]], poses.track_bearings[own]
+            own = seen.track_image_idx == position
+            if image not in fixed and own.sum() >= MIN_POINTS:
+                points, bearings = seen.points_in_world[seen.track_point_idx[own]], seen.track_bearings[own]
                 pose = refine_resection(
                     poses.cam_from_world(position), points, bearings, scale_rad=float(np.deg2rad(0.1))
                 )

@@ -281,8 +281,9 @@ def find_structure(
         range_maps: by name, those of all views that have one.
         load: returns the panorama of a view, (H, W, 3) RGB.
         rng: draws points and planes.
-        threads: number of threads.
+        threads: number of threads, of which four are used: each holds a picture, 250 MB at 4096 columns.
     """
+    threads = min(threads, 4)
     planes, groups, mirrors, mirror_groups = [], [], [], []
     for number, group in enumerate(split_groups(poses)):
         named = [(idx, name) for idx, name in enumerate(group.names) if name in range_maps]

@@ -67,6 +67,12 @@ def test_a_true_model_in_which_nothing_repeats_has_no_other_arrangement() -> Non
     assert other_arrangement(model_of(aliased_capture("no alias", false={}, views=COUNT))) == ""
 
 
+def test_a_place_does_not_repeat_because_a_camera_is_wrong() -> None:
+    capture = aliased_capture("a wrong camera", false={}, views=COUNT)
+    said = other_arrangement(model_of(capture, {3: shifted_pose(capture.poses[capture.names[3]], 1)}))
+    assert said.startswith(f"{COUNT - 1} pairs would agree if some of the images were ")
+
+
 def test_two_pairs_do_not_make_a_block() -> None:
     """Errors of single pairs are no block."""
     capture = aliased_capture("two pairs", false={(0, 3): 1, (2, 5): 1}, views=COUNT)

@@ -88,6 +88,21 @@ def test_one_known_camera_gives_no_points_to_see(capture: Capture) -> None:
     assert all("shares enough points with a third image" in reason for reason in poses.rejected.values())
 
 
+def test_without_known_cameras_nothing_is_found(capture: Capture) -> None:
+    truth, features, two_views = capture
+    poses = extend_poses(known_of(truth, []), features, two_views)
+    assert poses.names == ()
+    assert list(poses.rejected) == list(features)
+
+
+def test_the_points_that_are_kept_do_not_move_the_new_one(capture: Capture) -> None:
+    truth, features, two_views = capture
+    known = known_of(truth, [name for name in truth if name != "5.jpg"])
+    many, few = (extend_poses(known, features, two_views, min_angle_deg=angle) for angle in (1.0, 60.0))
+    assert len(few.points_in_world) < 20 < len(many.points_in_world)
+    np.testing.assert_array_equal(few.translations, many.translations)
+
+
 def test_wrong_known_poses_reject_the_new_one(capture: Capture) -> None:
     """Cameras that do not fit the pictures give no points that a new picture could trust."""
     truth, features, two_views = capture

@@ -50,7 +50,9 @@ def other_arrangement(model: PlacedModel) -> str:
         how = f"{one.length:.2g} units away from where they are, relative to the others"
     else:
         how = f"rotated by {np.rad2deg(one.turn_rad):.0f}° and placed elsewhere, as in a second, similar room"
-    return f"the place repeats: {len(edges)} pairs would agree as well if some of the images were {how}"
+    if 2 * len(edges & model.chosen.keys()) > len(edges):
+        return f"the place repeats: {len(edges)} pairs would agree as well if some of the images were {how}"
+    return f"{len(edges)} pairs would agree if some of the images were {how}"
 
 
 def most_suggested(suggestions: list[Suggestion]) -> tuple[set[Edge], Suggestion | None]:

@@ -100,7 +100,7 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
     Args:
         model: the fitted model.
         row: the evidence for the camera.
-        ambiguity: description of another arrangement that the images would confirm about as much; "" if none is known.
+        ambiguity: description of another arrangement that many pairs would agree with; "" if none is known.
     """
     lost = {
         name: value
@@ -113,13 +113,8 @@ def reason(model: Model, row: Mapping[str, float], *, ambiguity: str = "") -> st
     said = [_SAID[name][0](row) if np.isfinite(row.get(name, np.nan)) else _SAID[name][1] for name in worst]
     advice = ", or ".join(dict.fromkeys(_SAID[name][2] for name in worst))
     why = ", and ".join(dict.fromkeys(filter(None, said))) or "nothing speaks against it, but miss_cost demands more"
-    undecided = f"; it cannot be decided from these images: {ambiguity}" if ambiguity else ""
-    return "; ".join(
-        filter(
-            None,
-            (f"its pose is right with a probability of {_percent(model.probability(row))}: {why}{undecided}", advice),
-        )
-    )
+    stated = f"its pose is right with a probability of {_percent(model.probability(row))}: {why}"
+    return "; ".join(filter(None, (stated, ambiguity, advice)))
 
 
 def _percent(share: float, digits: int = 0) -> str:
