@@ -94,6 +94,7 @@ class WorkflowReader:
         self.presets = presets
         self.problems = Problems()
         self.plugins: dict[Path, str] = {}
+        self._lacks_plugins = False
         self.folders: dict[str, Path] = {}
 
     def read(
@@ -159,6 +160,7 @@ class WorkflowReader:
             self.plugins[path] = code_digest(path)
         except PluginError as error:
             self.problems.add(item.place, str(error))
+            self._lacks_plugins = True
 
     def _folder(self, item: Located) -> Path:
         """Return the folder that a relative path starts from: that of its file, or the current one for overrides."""
@@ -167,6 +169,8 @@ class WorkflowReader:
     def _stage(self, name: str, node: Located) -> StageEntry | None:
         use = node.value["use"]
         spec = self.registry.stages.get(use.value) if isinstance(use.value, str) else None
+        if spec is None and self._lacks_plugins:
+            return None  # it may be one of theirs
         if spec is None:
             shown = repr(use.plain())[:80]
             hint = self.registry.suggest(str(use.value)[:80])
