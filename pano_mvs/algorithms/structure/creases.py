@@ -64,6 +64,7 @@ def placed_by_creases(
 
     Planes without support that show no clear ones are left out. `views`: of one group, in whose world y points down
     along gravity. `planes`: found in ranges and outlines. `max_relative_error`: of ranges on a plane.
+    `threads`: number of threads.
     """
     creases = _creases(views, planes, max_relative_error, threads=threads)
     level_distances = [_level_distance(plane, views) if plane.is_level else 0.0 for plane in planes]
