@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pano_mvs.testing.paint import Colors, Texture
+from pano_mvs.testing.room import Colors, Texture
 from pano_mvs.testing.room import Room, default_room
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Vector
 from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
