@@ -37,32 +37,27 @@ def write_colmap_model(
     Args:
         poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each image by name.
-        photographs: ordinary photographs, in the same world; see `_add_photographs`.
+        photographs: ordinary photographs, in the same world; see `_RigModel.add_photographs`.
         form: "bin" (COLMAP's default), "txt", or "both", of which COLMAP reads the binary files.
 
     Raises:
         UsageError: if the size of an image is missing.
     """
-    import pycolmap
-
     missing = [name for name in poses.names if name not in sizes_hw]
     if missing:
         raise UsageError(f"the size of {missing[0]} is not given (nor of {len(missing) - 1} more)")
-    model = pycolmap.Reconstruction()
-    camera_ids = _add_cameras(model, [sizes_hw[name] for name in poses.names])
-    points = _ModelPoints(poses)
+    model = _RigModel(poses)
+    for name in poses.names:
+        height, width = sizes_hw[name]
+        # An EQUIRECTANGULAR camera without params aborts the process when it is used.
+        model.add_rig((height, width), [_Camera("EQUIRECTANGULAR", (height, width), [width, height])])
     for idx, name in enumerate(poses.names):
-        observed = points.observations(idx)
-        pixels = pixel_from_ray(poses.track_bearings[observed], sizes_hw[name])
-        image = pycolmap.Image(
-            name=name, keypoints=pixels.reshape(-1, 2), camera_id=camera_ids[sizes_hw[name]], image_id=idx + 1
-        )
-        model.add_image_with_trivial_frame(image, _rigid(poses.rotations[idx], poses.translations[idx]))
-        points.observe(idx + 1, observed, pixels_per_rad=sizes_hw[name][1] / (2 * np.pi))
-    if photographs is not None:
-        _add_photographs(model, photographs, first_camera=len(camera_ids) + 1, first_image=len(poses.names) + 1)
-    points.add_to(model)
-    _write_model(model, folder, form)
+        observed = model.points.observations(idx)
+        pixels = pixel_from_ray(poses.track_bearings[observed], sizes_hw[name]).reshape(-1, 2)
+        picture = _Picture(name, observed, pixels, sizes_hw[name][1] / (2 * np.pi))
+        model.add_frame(sizes_hw[name], poses.cam_from_world(idx), [picture])
+    model.add_photographs(photographs)
+    model.write(folder, form, only_seen=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,11 +93,11 @@ def write_rig_model(
     Args:
         poses: poses of the panoramas with points and tracks. Errors become pixels at a face's centre (f per radian).
         cuts: panorama name to its faces; panoramas without an entry are omitted.
-        photographs: ordinary photographs, in the same world; see `_add_photographs`.
+        photographs: ordinary photographs, in the same world; see `_RigModel.add_photographs`.
         form: "bin", "txt" or "both". COLMAP prefers binary files; some versions of OpenMVS read only text.
 
     Returns:
-        Name of each face's image to the number of points that it observes. COLMAP does not fuse images without points.
+        Name of each image to the number of points that it observes. COLMAP does not fuse images without points.
     """
     model = _RigModel(poses)
     for name in poses.names:
@@ -121,9 +116,7 @@ def write_rig_model(
             ]
             first_from_world = Rigid3(views[0].view_from_cam, np.zeros(3)) @ poses.cam_from_world(idx)
             model.add_frame(id(views), first_from_world, pictures)
-    if photographs is not None:
-        first_camera, first_image = len(model.model.cameras) + 1, len(model.seen) + 1
-        _add_photographs(model.model, photographs, first_camera=first_camera, first_image=first_image)
+    model.add_photographs(photographs)
     return model.write(folder, form)
 
 
@@ -206,24 +199,27 @@ class _Picture(NamedTuple):
 
 
 class _RigModel:
-    """A pycolmap model of rigs, whose cameras, images and frames have ids in the order in which they are added."""
+    """A pycolmap model of rigs, whose cameras and images have ids in the order in which they are added."""
 
     def __init__(self, poses: Poses) -> None:
         import pycolmap
 
-        self.model = pycolmap.Reconstruction()  # the pycolmap.Reconstruction
+        self.model = pycolmap.Reconstruction()
         self.points = _ModelPoints(poses)  # the points of the poses
         self.seen: dict[str, int] = {}  # image name to the number of points that it observes
         self._rigs: dict[Hashable, tuple[int, list[int]]] = {}
 
-    def add_rig(self, key: Hashable, cameras: Sequence[_Camera], from_first: Sequence[Rigid3]) -> None:
+    def add_rig(
+        self, key: Hashable, cameras: Sequence[_Camera], from_first: Sequence[Rigid3] = (Rigid3.identity(),)
+    ) -> None:
         """Add a rig with its cameras, unless it is known; `from_first` are the poses of the cameras in the first."""
         import pycolmap
 
         if key in self._rigs:
             return
-        rig = pycolmap.Rig(rig_id=len(self._rigs) + 1)
         first_id = len(self.model.cameras) + 1
+        # COLMAP's own rigs of one camera have the camera's id, and their frames the image's.
+        rig = pycolmap.Rig(rig_id=first_id if len(cameras) == 1 else len(self._rigs) + 1)
         camera_ids = list(range(first_id, first_id + len(cameras)))
         for camera_id, (kind, (height, width), params), pose in zip(camera_ids, cameras, from_first, strict=True):
             self.model.add_camera(
@@ -232,7 +228,7 @@ class _RigModel:
             if camera_id == first_id:
                 rig.add_ref_sensor(_sensor(camera_id))
             else:
-                rig.add_sensor(_sensor(camera_id), _rigid(pose.rotation, pose.translation))
+                rig.add_sensor(_sensor(camera_id), _rigid(pose))
         self.model.add_rig(rig)
         self._rigs[key] = rig.rig_id, camera_ids
 
@@ -241,7 +237,7 @@ class _RigModel:
         import pycolmap
 
         rig_id, camera_ids = self._rigs[key]
-        frame_id = self.model.num_frames() + 1
+        frame_id = (len(self.seen) if len(camera_ids) == 1 else self.model.num_frames()) + 1
         frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_id)
         taken = [
             (len(self.seen) + number, *each)
@@ -249,7 +245,7 @@ class _RigModel:
         ]
         for image_id, camera_id, _ in taken:
             frame.add_data_id(pycolmap.data_t(_sensor(camera_id), image_id))
-        frame.rig_from_world = _rigid(rig_from_world.rotation, rig_from_world.translation)
+        frame.rig_from_world = _rigid(rig_from_world)
         self.model.add_frame(frame)
         for image_id, camera_id, picture in taken:
             image = pycolmap.Image(name=picture.name, keypoints=picture.pixels, camera_id=camera_id, image_id=image_id)
@@ -259,10 +255,28 @@ class _RigModel:
             self.seen[picture.name] = len(picture.pixels)
         self.model.register_frame(frame_id)
 
-    def write(self, folder: Path, form: ModelForm) -> Mapping[str, int]:
-        """Write the model with the points that an image observes, and return `seen`."""
-        self.points.add_to(self.model, only_seen=True)
-        _write_model(self.model, folder, form)
+    def add_photographs(self, photographs: Photographs | None) -> None:
+        """Add photographs without key points, each with a camera of its own.
+
+        A photograph with distortion has a SIMPLE_RADIAL camera, one without a PINHOLE camera.
+        """
+        for idx, name in enumerate(photographs.names if photographs is not None else ()):
+            assert photographs is not None
+            height, width = photographs.sizes_hw[idx].tolist()
+            focal, radial = photographs.focals_px[idx], photographs.radials[idx]
+            params = [focal, width / 2, height / 2, radial] if radial else [focal, focal, width / 2, height / 2]
+            self.add_rig(name, [_Camera("SIMPLE_RADIAL" if radial else "PINHOLE", (height, width), params)])
+            nothing = _Picture(name, np.zeros(0, np.intp), np.zeros((0, 2)), 0.0)
+            self.add_frame(name, photographs.cam_from_world(idx), [nothing])
+
+    def write(self, folder: Path, form: ModelForm, *, only_seen: bool = True) -> Mapping[str, int]:
+        """Write the model with the points, or those that an image observes; the folder is made. Return `seen`."""
+        self.points.add_to(self.model, only_seen=only_seen)
+        folder.mkdir(parents=True, exist_ok=True)
+        if form in ("bin", "both"):
+            self.model.write_binary(str(folder))
+        if form in ("txt", "both"):
+            self.model.write_text(str(folder))
         return self.seen
 
 
@@ -306,21 +320,6 @@ def _pixels(
     return kept, lens.pixel_from_ray(rays[kept]).reshape(-1, 2)
 
 
-def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int, int], int]:
-    """Add one camera for each distinct size, and return their ids."""
-    import pycolmap
-
-    ids: dict[tuple[int, int], int] = {}
-    for height, width in sizes_hw:
-        if (height, width) not in ids:
-            ids[height, width] = len(ids) + 1
-            # An EQUIRECTANGULAR camera without params aborts the process when it is used.
-            camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
-            camera.camera_id = ids[height, width]
-            model.add_camera_with_trivial_rig(camera)
-    return ids
-
-
 class _ModelPoints:
     """Collect the observations of images in tracks, and add the points to a pycolmap model."""
 
@@ -344,53 +343,21 @@ class _ModelPoints:
             self._tracks[point_idx].add_element(image_id, point2d_idx)
             self._pixels_per_rad[point_idx] += pixels_per_rad
 
-    def add_to(self, model: Any, *, only_seen: bool = False) -> int:
-        """Add the points and return their number; with `only_seen`, only those that an image observes.
+    def add_to(self, model: Any, *, only_seen: bool) -> None:
+        """Add the points; with `only_seen`, only those that an image observes.
 
         The error of a point is its angle in pixels, averaged over the images that observe it.
         """
-        poses, added = self._poses, 0
+        poses = self._poses
         for idx, track in enumerate(self._tracks):
             if only_seen and not track.length():
                 continue
             point_id = model.add_point3D(poses.points_in_world[idx], track, poses.point_colors_rgb[idx])
             per_rad = self._pixels_per_rad[idx] / max(track.length(), 1)
             model.points3D[point_id].error = float(poses.point_errors_rad[idx] * per_rad)
-            added += 1
-        return added
 
 
-def _add_photographs(model: Any, photographs: Photographs, *, first_camera: int, first_image: int) -> None:
-    """Add photographs without key points to a pycolmap.Reconstruction, each with a camera of its own.
-
-    A photograph with distortion has a SIMPLE_RADIAL camera, one without a PINHOLE camera.
-    """
+def _rigid(pose: Rigid3) -> Any:
     import pycolmap
 
-    for idx, name in enumerate(photographs.names):
-        height, width = photographs.sizes_hw[idx].tolist()
-        focal, radial = photographs.focals_px[idx], photographs.radials[idx]
-        params = [focal, width / 2, height / 2, radial] if radial else [focal, focal, width / 2, height / 2]
-        kind = "SIMPLE_RADIAL" if radial else "PINHOLE"
-        camera = pycolmap.Camera(model=kind, width=width, height=height, params=params)
-        camera.camera_id = first_camera + idx
-        model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(
-            name=name, keypoints=np.zeros((0, 2)), camera_id=camera.camera_id, image_id=first_image + idx
-        )
-        model.add_image_with_trivial_frame(image, _rigid(photographs.rotations[idx], photographs.translations[idx]))
-
-
-def _rigid(rotation: FloatArray, translation: FloatArray) -> Any:
-    import pycolmap
-
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(rotation)), np.asarray(translation))
-
-
-def _write_model(model: Any, folder: Path, form: ModelForm) -> None:
-    """Write a pycolmap model as "bin", "txt" or "both"; the folder is created if necessary."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if form in ("bin", "both"):
-        model.write_binary(str(folder))
-    if form in ("txt", "both"):
-        model.write_text(str(folder))
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(pose.rotation)), np.asarray(pose.translation))

@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pano_mvs.testing.room import Colors, Texture
-from pano_mvs.testing.room import Room, default_room
+from pano_mvs.testing.room import Colors, Room, Texture, default_room
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Vector
 from tests.synthetic.paints import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE
 from tests.synthetic.places import large_plain_room, window_room, yard
