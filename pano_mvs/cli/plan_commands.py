@@ -18,6 +18,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import write_given
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import duration_text, plural, shortened_list, without_controls
+from pano_mvs.core.yaml_text import Located
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.queues import read_queue
 from pano_mvs.engine.planning.forecast import StageForecast
@@ -28,7 +29,6 @@ from pano_mvs.engine.workflows.extends import read_text
 from pano_mvs.engine.workflows.resolved import resolved_yaml
 from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
-from pano_mvs.engine.workflows.yaml_text import Located
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 from pano_mvs.session.commands import reopen, run_command
 from pano_mvs.session.planning import RunPlan, plan_session

@@ -17,7 +17,7 @@ from scipy.spatial.distance import squareform
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.core.paths import resolved
-from pano_mvs.engine.workflows.yaml_text import parse_yaml
+from pano_mvs.core.yaml_text import parse_yaml
 from pano_mvs.geometry import Rigid3, pixel_from_ray, pixel_solid_angle, ray_grid
 from pano_mvs.results.figures import share as share_text
 from pano_mvs.results.pictures import probability_color

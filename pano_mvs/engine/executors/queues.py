@@ -24,13 +24,12 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.extras import import_extra
 from pano_mvs.core.files import remove_whole, temporary_prefix
 from pano_mvs.core.memory import bytes_from_size
+from pano_mvs.core.yaml_text import Problems, parse_yaml, report_invalid
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor, with_waiting
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.executors.threads import WORKER_BYTES, share_cores
 from pano_mvs.engine.workflows.extends import read_text
-from pano_mvs.engine.workflows.workflow import report_invalid
-from pano_mvs.engine.workflows.yaml_text import Problems, parse_yaml
 
 SYSTEMS = {"slurm": "sbatch", "pbs": "qsub", "lsf": "bsub", "sge": "qsub"}
 """Queueing system to its command that submits a job."""

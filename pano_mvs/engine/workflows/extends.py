@@ -5,13 +5,12 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_file, resolved
-from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
+from pano_mvs.core.yaml_text import Located, Problems, did_you_mean, parse_yaml
 
 FORMAT_VERSION = 1
 MAX_BYTES = 100_000
@@ -227,12 +226,3 @@ def merged_entry(below: Located | None, above: Located) -> Located:
         return above
     value = {**below.value, **above.value}
     return Located(value, above.line, above.column, above.key_line, above.key_column, above.origin, above.file)
-
-
-def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:
-    """Return a hint for an unknown word: similar options, or else all of them."""
-    close = get_close_matches(word[:80], list(options), n=2, cutoff=0.6)
-    if close:
-        return f" Did you mean {' or '.join(map(repr, close))}?"
-    shown = list(options)[:40]
-    return f" Known: {', '.join(shown)}{', …' if len(options) > len(shown) else ''}" if shown else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +13,13 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
+from pano_mvs.core.yaml_text import Located, Problems, did_you_mean, parse_yaml, report_invalid
 from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.stages.stage_code import code_digest
-from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, did_you_mean, merge_stages, read_text
+from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, merge_stages, read_text
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
-from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,30 +227,6 @@ class WorkflowReader:
 
 def _keys(model: type[BaseModel]) -> list[str]:
     return [info.alias or name for name, info in model.model_fields.items()]
-
-
-def report_invalid(
-    error: ValidationError, node: Located, problems: Problems, *, known: Sequence[str], subject: str = ""
-) -> None:
-    """Add a line for each setting that does not fit a model.
-
-    Args:
-        subject: what the settings belong to, at the beginning of each line.
-    """
-    for problem in error.errors(include_url=False):
-        path = tuple(problem["loc"])
-        found = node.at(path)
-        key = ".".join(map(str, path))
-        if problem["type"] == "extra_forbidden":
-            hint = did_you_mean(key, list(dict.fromkeys(known)) if len(path) == 1 else [])
-            problems.add(found.key_place, f"{subject}unknown setting {key[:80]!r}.{hint}")
-        elif problem["type"] == "missing":
-            problems.add(found.key_place, f"{subject}setting {key!r} is missing")
-        else:
-            message = problem["msg"].removeprefix("Value error, ")
-            shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
-            setting = f"{key}: " if key else ""
-            problems.add(found.place, f"{subject}{setting}{message} (got {shown})")
 
 
 def _name_of(shown_as: str) -> str:

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import InputError, PluginError, UsageError, WorkflowError
+from pano_mvs.core.yaml_text import parse_yaml
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import wire
 from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
-from pano_mvs.engine.workflows.yaml_text import parse_yaml
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.session import presets_folder
 from tests.engine.conftest import Toy

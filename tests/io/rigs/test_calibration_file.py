@@ -5,6 +5,7 @@ The pictures of both lenses are found side by side, in two folders, or by the en
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,7 +69,7 @@ def test_an_assumed_distance_stays_one(tmp_path: Path) -> None:
     assert not LensRig.from_values(again.to_values()).metric
     assert (tmp_path / "rig.yaml").read_text(encoding="utf-8").startswith("# from 8 captures\n")
     assert read_rig(file_of(tmp_path, TEXT)).metric
-    with pytest.raises(InputError, match=r"rig\.yaml:1:1: metric: must be true, or false"):
+    with pytest.raises(InputError, match=r"rig\.yaml:1:9: metric: Input should be a valid boolean"):
         read_rig(file_of(tmp_path, f"metric: 1\n{TEXT}"))
 
 
@@ -85,35 +86,33 @@ def test_opencv_counts_pixels_from_the_centre_of_the_first(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("opencv_fisheye", "pinhole", r"rig\.yaml:1:1: model: unknown model 'pinhole'.*kannala_brandt"),
-        ("first_pixel_px: 0", "first_pixel_px: 1", r"rig\.yaml:2:1: first_pixel_px: must be 0\.5 \(COLMAP\) or 0"),
-        ("first_pixel_px: 0\n", "", r"rig\.yaml:1:1: first_pixel_px is missing, and cannot be guessed"),
-        ("[640, 480]", "[640]", r"rig\.yaml:5:5: image_size_px: must be a list of 2 numbers: width and height"),
-        ("[640, 480]", "[640, 4.5]", r"rig\.yaml:5:5: image_size_px: must be two whole numbers"),
-        ("[150.0, 151.0]", "[150.0, -1]", r"rig\.yaml:6:5: focal_px: must be positive"),
-        ("[319.5, 239.5]", "[319.5, 500]", r"rig\.yaml:7:5: principal_point_px: is outside of the picture of 640×480"),
-        ("[0.01, 0, 0, 0]", "[-0.2, 0, 0, 0]", r"rig\.yaml:8:5: distortion: .* stops growing 74\.0°.*smaller field_of"),
+        ("opencv_fisheye", "pinhole", "1:8: model: Input should be 'kannala_brandt' or"),
+        ("first_pixel_px: 0", "first_pixel_px: 1", "2:17: first_pixel_px: must be 0.5 (COLMAP) or 0"),
+        ("first_pixel_px: 0\n", "", "1:1: setting 'first_pixel_px' is missing"),
+        ("[640, 480]", "[640]", "5:5: setting 'lenses.front.image_size_px.1' is missing"),
+        ("[640, 480]", "[640, 4.5]", "5:26: lenses.front.image_size_px.1: Input should be a valid integer"),
+        ("[150.0, 151.0]", "[150.0, -1]", "6:23: lenses.front.focal_px.1: Input should be greater than 0"),
         (
-            "[0.01, 0, 0, 0]",
-            "[a, 0, 0, 0]",
-            r"rig\.yaml:8:5: distortion: must be a list of 4 numbers: k1, k2, k3 and k4",
+            "[319.5, 239.5]",
+            "[319.5, 500]",
+            "7:25: lenses.front.principal_point_px: is outside of the picture of 640×480",
         ),
-        ("field_of_view_deg: 190", "field_of_view_deg: 0", r"rig\.yaml:9:5: field_of_view_deg: must be the full angle"),
-        ("    field_of_view_deg: 190\n", "", r"rig\.yaml:5:5: field_of_view_deg is missing"),
-        ("field_of_view_deg", "fov", r"rig\.yaml:9:5: fov: unknown key; the keys here are image_size_px"),
-        ("[1, 0, 0, 0]", "[1, 1, 0, 0]", r"rig\.yaml:10:21: rotation_wxyz: the length of the quaternion is not 1"),
-        ("[0, 0, 0]}", "[0, 0, 30]}", r"rig\.yaml:10:50: translation_m: is more than 10 metres"),
-        ("[[-1, 0, 0]", "[[1, 0, 0]", r"rig\.yaml:18:7: rotation: is not a rotation matrix"),
-        (", [0, 0, -1]]", "]", r"rig\.yaml:18:7: rotation: must be three rows of three numbers"),
-        ("lens_from_rig: {", "lens_from_rig: 3 #", r"rig\.yaml:10:5: lens_from_rig: must have the keys"),
-        ("  back:", "  front:", r"rig\.yaml:\d+:\d+: not valid YAML: found duplicate key"),
-        ("  back:", "  ba ck:", r"rig\.yaml:11:3: ba ck: the name 'ba ck' of a lens must consist of"),
-        ("[640, 480]", "[640, 480", r"rig\.yaml:\d+:\d+: not valid YAML"),
+        ("[0.01, 0, 0, 0]", "[-0.2, 0, 0, 0]", "5:5: lenses.front: distortion: the distortion is not invertible"),
+        ("[0.01, 0, 0, 0]", "['1', 0, 0, 0]", "8:18: lenses.front.distortion.0: Input should be a valid number"),
+        ("field_of_view_deg: 190", "field_of_view_deg: 0", "9:24: lenses.front.field_of_view_deg: Input should be"),
+        ("field_of_view_deg", "fov", "9:5: unknown setting 'lenses.front.fov'"),
+        ("[1, 0, 0, 0]", "[1, 1, 0, 0]", "10:20: lenses.front.lens_from_rig: the length of the quaternion is not 1"),
+        ("[0, 0, 0]}", "[0, 0, 30]}", "10:20: lenses.front.lens_from_rig: translation_m is more than 10 metres"),
+        ("[[-1, 0, 0]", "[[1, 0, 0]", "18:7: lenses.back.lens_from_rig: rotation is not a rotation matrix"),
+        ("rotation_wxyz: [1, 0, 0, 0], ", "", "10:20: lenses.front.lens_from_rig: must have the keys rotation_wxyz"),
+        ("  back:", "  front:", "11:3: key 'front' occurs twice"),
+        ("  back:", "  ba ck:", "12:5: lenses.ba ck.[key]: String should match"),
+        ("[640, 480]", "[640, 480", "6:"),
     ],
 )
 def test_errors_state_file_line_key_and_remedy(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in TEXT
-    with pytest.raises(InputError, match=message) as error:
+    with pytest.raises(InputError, match=rf"rig\.yaml:{re.escape(message)}") as error:
         read_rig(file_of(tmp_path, TEXT.replace(old, new, 1)))
     assert "docs/rigs.md" in str(error.value)
 
@@ -122,7 +121,7 @@ def test_errors_state_file_line_key_and_remedy(tmp_path: Path, old: str, new: st
     "text", ["", "- 1\n", "3\n", "\x00", "model: kannala_brandt\nfirst_pixel_px: 0\nlenses: {a: 1}\n"]
 )
 def test_files_that_are_no_calibration_are_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"rig\.yaml.*docs/rigs\.md"):
+    with pytest.raises(InputError, match=r"(?s)rig\.yaml.*docs/rigs\.md"):
         read_rig(file_of(tmp_path, text))
 
 

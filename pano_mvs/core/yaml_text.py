@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import lru_cache
 from typing import Any
 
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -115,6 +119,39 @@ def parse_yaml(text: str, name: str, problems: Problems | None = None) -> Locate
     if problems is None:
         builder.problems.raise_if_any()
     return located
+
+
+def report_invalid(
+    error: ValidationError, node: Located, problems: Problems, *, known: Sequence[str], subject: str = ""
+) -> None:
+    """Add a line for each setting that does not fit a model.
+
+    Args:
+        subject: what the settings belong to, at the beginning of each line.
+    """
+    for problem in error.errors(include_url=False):
+        path = tuple(problem["loc"])
+        found = node.at(path)
+        key = ".".join(map(str, path))
+        if problem["type"] == "extra_forbidden":
+            hint = did_you_mean(key, list(dict.fromkeys(known)) if len(path) == 1 else [])
+            problems.add(found.key_place, f"{subject}unknown setting {key[:80]!r}.{hint}")
+        elif problem["type"] == "missing":
+            problems.add(found.key_place, f"{subject}setting {key!r} is missing")
+        else:
+            message = problem["msg"].removeprefix("Value error, ")
+            shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
+            setting = f"{key}: " if key else ""
+            problems.add(found.place, f"{subject}{setting}{message} (got {shown})")
+
+
+def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:
+    """Return a hint for an unknown word: similar options, or else all of them."""
+    close = get_close_matches(word[:80], list(options), n=2, cutoff=0.6)
+    if close:
+        return f" Did you mean {' or '.join(map(repr, close))}?"
+    shown = list(options)[:40]
+    return f" Known: {', '.join(shown)}{', …' if len(options) > len(shown) else ''}" if shown else ""
 
 
 @lru_cache(maxsize=64)  # a command reads the same workflow more than once, and many of them extend the same one
