@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import accumulate
 from typing import ClassVar
 
@@ -64,17 +64,13 @@ class PointCloud(Record):
         """Return the cloud of each group, the largest group of cameras first; arrays are views of this cloud's."""
         if not self.group_sizes:
             return [self]
-        return [
-            PointCloud(
-                self.points_in_world[end - size : end],
-                self.normals_in_world[end - size : end],
-                self.colors_rgb[end - size : end],
-                self.view_counts[end - size : end],
-                None if self.confidence is None else self.confidence[end - size : end],
-                uncertainty=None if self.uncertainty is None else self.uncertainty[end - size : end],
-            )
-            for size, end in zip(self.group_sizes, accumulate(self.group_sizes), strict=True)
-        ]
+        ends = zip(self.group_sizes, accumulate(self.group_sizes), strict=True)
+        return [self.some(slice(end - size, end)) for size, end in ends]
+
+    def some(self, chosen: slice | NDArray[np.bool_] | NDArray[np.integer]) -> PointCloud:
+        """Return the points at a slice, a mask or positions, as one group."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "group_sizes"}
+        return PointCloud(**{name: None if array is None else array[chosen] for name, array in arrays.items()})
 
     @staticmethod
     def of_groups(clouds: Sequence[PointCloud]) -> PointCloud:

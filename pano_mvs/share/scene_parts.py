@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,13 +86,13 @@ def shown_cloud(cloud: PointCloud | None, frame: Rigid3, *, max_points: int) -> 
     chosen = np.arange(len(cloud))
     if max_points < len(cloud):
         chosen = np.sort(np.random.default_rng(0).choice(len(cloud), max_points, replace=False))
-    turned = PointCloud(
-        frame.apply(cloud.points_in_world[chosen]).astype(np.float32),
-        (cloud.normals_in_world[chosen] @ frame.rotation.T).astype(np.float32),
-        cloud.colors_rgb[chosen],
-        cloud.view_counts[chosen],
+    kept = cloud.some(chosen)
+    turned = replace(
+        kept,
+        points_in_world=frame.apply(kept.points_in_world).astype(np.float32),
+        normals_in_world=(kept.normals_in_world @ frame.rotation.T).astype(np.float32),
     )
-    sigmas = cloud.uncertainty[chosen] if cloud.uncertainty is not None else np.zeros(len(chosen))
+    sigmas = kept.uncertainty if kept.uncertainty is not None else np.zeros(len(kept))
     return ShownCloud(turned, log_steps(sigmas, np.uint8))
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.blocks import MergedBlocks, nearest_cameras
 from pano_mvs.core.digest import digest_from_file
@@ -80,7 +79,7 @@ class Block:
         elif self.run.values.cloud is not None:
             cloud = self.run.values.cloud.groups()[0]
             for part in chunks(len(cloud)):
-                yield _selected(cloud, part)
+                yield cloud.some(part)
 
     def _model_sizes(self) -> dict[str, tuple[int, int]]:
         files = model_files(self.run.out / "colmap" / "sparse" / "0")
@@ -255,7 +254,7 @@ class MergeFiles:
                 )
                 camera_idx = nearest_cameras(moved.points_in_world, centers)
                 own = merged.owner[camera_idx] == number
-                moved, camera_idx = _selected(moved, own), camera_idx[own]
+                moved, camera_idx = moved.some(own), camera_idx[own]
                 if merged.before is not None:
                     points, normals = merged.move(moved.points_in_world, moved.normals_in_world, camera_idx)
                     moved = replace(
@@ -281,14 +280,3 @@ def _frame(path: str, size_hw: tuple[int, int]) -> NerfstudioFrame:
     height, width = size_hw
     rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return NerfstudioFrame("equirectangular", path, "", "", (width, height), (width / 2, float(height)), rows)
-
-
-def _selected(cloud: PointCloud, kept: NDArray[np.bool_] | slice) -> PointCloud:
-    return PointCloud(
-        cloud.points_in_world[kept],
-        cloud.normals_in_world[kept],
-        cloud.colors_rgb[kept],
-        cloud.view_counts[kept],
-        None if cloud.confidence is None else cloud.confidence[kept],
-        uncertainty=None if cloud.uncertainty is None else cloud.uncertainty[kept],
-    )
