@@ -23,11 +23,11 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.reader import is_colmap_model
 from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.scene import Scores
+from pano_mvs.scene.masking import Scalar
 from pano_mvs.scene.scores import NO_TRUTH
 
 KEPT = "psnr_db", "w_mae", "w_delta_105", "bad_5", "completeness", "median_relative_error"
 KEPT_OF_CONFIDENCE = "sparsification_area", "sparsification_oracle_area", "ause"
-Scalar = TypeVar("Scalar", bound=np.generic)
 RangeReader = Callable[[], "NDArray[np.float32] | None"]
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})

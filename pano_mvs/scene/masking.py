@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.image_file import decode_picture
 from pano_mvs.scene.record import FilePart
 
+Scalar = TypeVar("Scalar", bound=np.generic)
 # (left, top, width, height) in pixels of the whole sphere.
 Crop = tuple[int, int, int, int]
 
@@ -137,6 +139,14 @@ def placed_mask(mask: Mask, size_hw: tuple[int, int], *, of: Crop, whole_hw: tup
     before = cv2.integral((~mask).astype(np.uint8), sdepth=cv2.CV_32S)
     masked = before[lower] - before[upper]
     return np.asarray(masked[:, last] == masked[:, first])
+
+
+def nearest_pixels(pixels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray[Scalar]:
+    """Return a map (H, W) at another size: at each new pixel's centre, the value of the pixel that contains it."""
+    rows, columns = (
+        (2 * np.arange(new) + 1) * old // (2 * new) for new, old in zip(size_hw, pixels.shape, strict=True)
+    )
+    return pixels[rows[:, None], columns]
 
 
 def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:

@@ -28,6 +28,7 @@ from pano_mvs.api import (
     params_from,
     stage,
 )
+from pano_mvs.scene.masking import nearest_pixels
 from pano_mvs.scene.panorama import Camera, StaticMasks, camera_of
 
 
@@ -172,11 +173,7 @@ def _other_view(image: Panorama, range_map: RangeMap, pose: Pose, *, of: Pose) -
 
 def _sampled(range_map: RangeMap, size_hw: tuple[int, int]) -> RangeMap:
     """Return some pixels of a range map, (h, w)."""
-    rows, columns = (
-        (2 * np.arange(size) + 1) * of // (2 * size) for size, of in zip(size_hw, range_map.range.shape, strict=True)
-    )
-    at = (rows[:, None], columns)
-    return RangeMap(range_map.range[at], range_map.confidence[at])
+    return RangeMap(nearest_pixels(range_map.range, size_hw), nearest_pixels(range_map.confidence, size_hw))
 
 
 def _resized(pixels: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.bool_]:

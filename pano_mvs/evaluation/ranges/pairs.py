@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import shortened_list
 from pano_mvs.evaluation.inputs import RangeMaps, StoredRange, find_ranges, find_true_ranges, source_name
 from pano_mvs.geometry import pad_panorama
-from pano_mvs.io.images.names import find_mask, pair_image_names, without_extension
-from pano_mvs.scene.masking import decode_mask, placed_mask
+from pano_mvs.io.images.names import find_mask, pair_image_names, require_masks
+from pano_mvs.scene.masking import Scalar, decode_mask, nearest_pixels, placed_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,18 +35,6 @@ class ViewMasks:
     # a folder with a mask per image, `<image name>.png` or `<name without extension>.png`, or None
     folder: Path | None = None
     common: Path | None = None  # one mask for all images, or None
-
-    def require_some(self, names: Sequence[str]) -> None:
-        """Raise InputError unless the folder holds a mask of one of the views."""
-        if self.folder is None:
-            return
-        if not is_folder(self.folder):
-            raise InputError(f"{self.folder}: masks must be a folder. Give one mask for all images as `mask`")
-        if len(self.missing(names)) == len(names):
-            raise InputError(
-                f"{self.folder}: no mask in it belongs to a view. The mask of {names[0]} must be named like the image "
-                f"with .png appended, or {without_extension(names[0])}.png"
-            )
 
     def missing(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the views without a mask in the folder; none without a folder."""
@@ -111,7 +97,8 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
             "without extension"
         )
     names = {name: matched[name] for name in estimates if name in matched}
-    masks.require_some(list(names))
+    if masks.folder is not None:
+        require_masks(masks.folder, list(names))
     return RangePairs(
         {name: estimates[name] for name in names},
         {name: truths[other] for name, other in names.items()},
@@ -122,8 +109,6 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
         tuple(name for name in truths if name not in set(names.values())),
     )
 
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Largest relative difference of four neighbouring ranges on one surface.
 _ONE_SURFACE = 0.1
@@ -166,7 +151,4 @@ def resized_labels(labels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray
             f"a map of {width}×{height} px cannot be compared with one of {size_hw[1]}×{size_hw[0]}: "
             "both must be full panoramas, twice as wide as high"
         )
-    rows, columns = (
-        ((np.arange(new) + 0.5) * old / new).astype(np.intp) for new, old in zip(size_hw, labels.shape, strict=True)
-    )
-    return labels[np.ix_(rows, columns)]
+    return nearest_pixels(labels, size_hw)

@@ -144,12 +144,3 @@ def write_picture(path: Path, picture: NDArray[np.uint8], size_hw: tuple[int, in
         return
     kind, options = (suffix, []) if suffix in _WRITABLE else (".jpg", _JPEG)
     path.write_bytes(cv2.imencode(kind, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)[1].tobytes())
-
-
-def resized_mask(mask: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return a mask (H, W) resized with nearest-neighbour sampling at the centres of the new pixels."""
-    rows, columns = (
-        np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.intp), old - 1)
-        for new, old in zip(size_hw, mask.shape, strict=True)
-    )
-    return np.asarray(mask[rows[:, None], columns])

@@ -33,7 +33,6 @@ from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap.workspace import (
     WORKSPACE,
     face_image_name,
-    resized_mask,
     sparse_targets,
     write_face,
     write_picture,
@@ -42,6 +41,7 @@ from pano_mvs.io.colmap.workspace import (
 from pano_mvs.io.colmap.writer import CutPanorama, ModelForm, write_colmap_model, write_rig_model
 from pano_mvs.scene.files import FaceFiles, item_stems
 from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.masking import nearest_pixels
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surfaces import TrackedPoints
@@ -89,7 +89,7 @@ def colmap_masks(image: Each[Panorama], params: MasksParams, ctx: Context) -> Fi
     """
     mask = image.load_mask()
     files = {"colmap/masks/{name}.png": ctx.scratch / "mask.png"}
-    write_png(files["colmap/masks/{name}.png"], resized_mask(mask, image.source_size_hw).astype(np.uint8) * 255)
+    write_png(files["colmap/masks/{name}.png"], nearest_pixels(mask, image.source_size_hw).astype(np.uint8) * 255)
     if params.pictures:
         files["colmap/images/{name}"] = ctx.scratch / f"picture{image.image.path.suffix.lower()}"
         write_picture(files["colmap/images/{name}"], image.load(), image.source_size_hw)

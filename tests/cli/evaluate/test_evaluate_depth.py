@@ -220,7 +220,7 @@ def test_masks_and_confidence_leave_out_what_they_say(
         (("--unit", "0"), "unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
-        (("--masks", "."), "no mask in it belongs to a view"),
+        (("--masks", "."), "no mask in it belongs to an image"),
         (("--poses", "none.json"), "none.json: no such file"),
         (("--images", "none"), None),
     ],
