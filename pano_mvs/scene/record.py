@@ -58,6 +58,17 @@ class FilePart:
             raise ChangedFileError(changed_text(self.path), self.path)
         return data
 
+    def read_text(self) -> str:
+        """Return the file's text, in UTF-8 with or without a mark in front; raises as `read_bytes` does.
+
+        Raises:
+            InputError: if it is not such a text.
+        """
+        try:
+            return self.read_bytes().decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self.path}: not a text file in UTF-8") from error
+
     def sha256(self) -> str:
         """Return the SHA-256 of the file's bytes in hex, as other programs state it; raises as `read_bytes` does."""
         return hashlib.sha256(self.read_bytes()).hexdigest()

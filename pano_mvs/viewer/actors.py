@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.panoramas import narrowed
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_from_pixel
-from pano_mvs.io.images.captures import describe_picture
+from pano_mvs.io.images.captures import panorama_in
 from pano_mvs.io.images.preview import MARKS, color_mapped, mark_unconfirmed, range_limits, unconfirmed_classes
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff
 from pano_mvs.scene.image_file import decode_image
@@ -257,7 +256,11 @@ def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
         if path is None:
             continue
         try:
-            picture = _panorama_in(path, preview=path == camera.preview)
+            if path == camera.preview:
+                shown = decode_image(path)
+                picture = shown[: shown.shape[1] // 2]
+            else:
+                picture = panorama_in(path).load_unmasked()
         except InputError:
             continue
         if picture.shape[1] <= width:
@@ -267,16 +270,3 @@ def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
     # Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
     rows = np.linspace((150, 160, 175), (90, 95, 105), 64)[:, None]
     return np.ascontiguousarray(np.broadcast_to(rows, (64, 128, 3)).astype(np.uint8))
-
-
-def _panorama_in(path: Path, *, preview: bool) -> NDArray[np.uint8]:
-    picture = decode_image(path)
-    if preview:
-        return picture[: picture.shape[1] // 2]
-    info = describe_picture(path)
-    if info.crop_ltwh is None:
-        return picture
-    left, top, width, height = info.crop_ltwh
-    sphere = np.zeros((*info.size_hw, 3), np.uint8)
-    sphere[top : top + height, left : left + width] = picture
-    return sphere

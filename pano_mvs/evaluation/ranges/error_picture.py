@@ -16,10 +16,9 @@ from pano_mvs.core.file_names import file_inside, path_inside
 from pano_mvs.evaluation.drawing import WIDTH, drawn_figure
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
 from pano_mvs.evaluation.ranges.pairs import RangePairs
-from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
+from pano_mvs.io.images.captures import PICTURE_SUFFIXES, list_pictures, panorama_in
 from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
-from pano_mvs.scene import FilePart, Panorama
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +39,7 @@ def write_depth_pictures(
     panoramas = _panoramas(images, evaluation.pairs)
     for name in evaluation.views:
         maps = evaluation.read_maps(name)
-        image = _load(panoramas[name]) if name in panoramas else None
+        image = panorama_in(panoramas[name]).load() if name in panoramas else None
         path = path_inside(folder, f"{name}.jpg")
         write_error_picture(path, maps.estimated, maps.truth, image=image, counted=maps.counted, limit=limit)
 
@@ -144,8 +143,3 @@ def _panoramas(images: Path | None, pairs: RangePairs) -> Mapping[str, Path]:
     }
     found = {name: next(filter(None, paths), None) for name, paths in places.items()}
     return {name: path for name, path in found.items() if path and path.suffix.lower() in PICTURE_SUFFIXES}
-
-
-def _load(path: Path) -> Picture:
-    info = describe_picture(path)
-    return Panorama(FilePart(path, external=True), info.size_hw, info.size_hw, crop_ltwh=info.crop_ltwh).load()

@@ -14,7 +14,7 @@ from pano_mvs.core.files import CACHE_MARK, OUTPUT_MARK
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.core.text import shortened_list
 from pano_mvs.io.images.metadata import GPano, find_gpano, orientation_from_exif, position_from_exif, read_container
-from pano_mvs.scene import FilePart
+from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.image_file import MAX_PIXELS, check_stated_size, decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".insp"})
@@ -136,6 +136,12 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     if gpano is None:
         traits = (*traits, "no GPano metadata; taken as full spheres, since the width is twice the height")
     return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
+
+
+def panorama_in(path: Path) -> Panorama:
+    """Return the panorama in an image file at the full size of its sphere; raises as `describe_picture` does."""
+    info = describe_picture(path)
+    return Panorama(FilePart(path, external=True), info.size_hw, info.size_hw, crop_ltwh=info.crop_ltwh)
 
 
 def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:

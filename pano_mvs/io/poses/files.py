@@ -29,7 +29,7 @@ from pano_mvs.io.poses.other_json import (
     openmvg_poses,
     opensfm_poses,
 )
-from pano_mvs.scene import Poses
+from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
@@ -128,12 +128,7 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
     Raises:
         InputError: if the file is invalid; it names the line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8") from error
+    lines = FilePart(path).read_text().splitlines()
     numbered = [(idx, line) for idx, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     try:
         rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, nearest_rotation
+from pano_mvs.scene import FilePart
 
 
 @dataclass(frozen=True)
@@ -36,13 +37,11 @@ def read_json_value(path: Path) -> Any:
         InputError: if the file cannot be read or is not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+        return json.loads(FilePart(path).read_text())
+    except InputError:
+        raise
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON ({error.msg})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8") from error
     except (RecursionError, ValueError) as error:
         raise InputError(f"{path}: nested too deeply, or a number with too many digits") from error
 

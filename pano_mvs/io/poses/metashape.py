@@ -17,9 +17,8 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import xml_root
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
-from pano_mvs.scene.poses import Poses
+from pano_mvs.scene import FilePart, Poses
 
-_MAX_BYTES = 1 << 30
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 
 
@@ -57,14 +56,9 @@ def read_metashape(path: Path) -> dict[str, Rigid3]:
 
 def _parsed(path: Path) -> ElementTree.Element:
     try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= _MAX_BYTES else b""
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    if not data:
-        raise InputError(f"{path}: is empty, or larger than {_MAX_BYTES >> 20} MiB")
-    try:
-        return xml_root(data)
+        return xml_root(FilePart(path).read_bytes())
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{path}: {error}. Export the cameras of Metashape as XML") from error
 
