@@ -13,27 +13,26 @@ from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.reader import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
+    posed_views,
     read_json_value,
-    read_posed_views,
-    read_transforms,
     require_distinct,
     require_object,
     rigid_from_arrays,
+    transforms_poses,
 )
 from pano_mvs.io.poses.metashape import read_metashape
-from pano_mvs.io.poses.other_json import (
-    alicevision_poses,
-    is_alicevision,
-    is_openmvg,
-    is_opensfm,
-    openmvg_poses,
-    opensfm_poses,
-)
+from pano_mvs.io.poses.other_json import alicevision_poses, openmvg_poses, opensfm_poses
 from pano_mvs.scene import FilePart, Poses
 from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
 _JSON = (".json", ".sfm")
+# The keys by which the JSON object of another program is known.
+_BY_KEYS = (
+    ({"views", "intrinsics", "extrinsics"}, openmvg_poses),
+    ({"version", "views", "intrinsics"}, alicevision_poses),
+    ({"frames"}, transforms_poses),
+)
 _IN_A_FOLDER = (
     "transforms.json",
     "poses.json",
@@ -77,18 +76,15 @@ def read_poses(path: Path) -> Poses:
             f"{path}: poses are read from a COLMAP model (its folder), .json, .sfm, .xml and .csv, not {suffix!r}"
         )
     value = read_json_value(path)
-    if is_opensfm(value):
+    if isinstance(value, list) and value and all(isinstance(item, dict) and "shots" in item for item in value):
         poses, metric = opensfm_poses(value, path)
         return _from_file(poses, path, metric=metric)
     data = require_object(value, path)
-    if is_openmvg(data):
-        return _from_file(openmvg_poses(data, path), path, metric=False)
-    if is_alicevision(data):
-        return _from_file(alicevision_poses(data, path), path, metric=False)
-    if "frames" in data:
-        return _from_file(read_transforms(path), path, metric=False)
+    for keys, read in _BY_KEYS:
+        if keys <= data.keys():
+            return _from_file(read(data, path), path, metric=False)
     if "views" in data:
-        views, metric = read_posed_views(path)
+        views, metric = posed_views(data, path)
         return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
     raise InputError(
         f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
@@ -117,9 +113,9 @@ def recorded_pictures(path: Path) -> dict[str, str]:
     """Return the SHA-256 of the images of poses by name, if the file states them (poses.json)."""
     path = _file_or_model(path)
     value = read_json_value(path) if path.suffix.lower() in _JSON else None
-    if not isinstance(value, dict) or "views" not in value or is_openmvg(value) or is_alicevision(value):
+    if not isinstance(value, dict) or "views" not in value or any(keys <= value.keys() for keys, _ in _BY_KEYS):
         return {}
-    return {view.name: view.sha256 for view in read_posed_views(path)[0] if view.sha256 is not None}
+    return {view.name: view.sha256 for view in posed_views(value, path)[0] if view.sha256 is not None}
 
 
 def read_csv(path: Path) -> dict[str, Rigid3]:

@@ -25,11 +25,6 @@ class PosedView:
     sha256: str | None
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file."""
-    return require_object(read_json_value(path), path)
-
-
 def read_json_value(path: Path) -> Any:
     """Return the value in a JSON file, of any type.
 
@@ -63,7 +58,11 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
     Raises:
         InputError: if a key is missing or malformed; it names the file and the key.
     """
-    data = read_json(path)
+    return posed_views(require_object(read_json_value(path), path), path)
+
+
+def posed_views(data: dict[str, Any], path: Path) -> tuple[list[PosedView], bool]:
+    """Return what `read_posed_views` does, of the object in the file."""
     entries = data.get("views")
     if not isinstance(entries, list):
         raise InputError(f"{path}: key 'views' must be a list of views, got {type(entries).__name__}")
@@ -75,8 +74,8 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
     return views, metric
 
 
-def read_transforms(path: Path) -> dict[str, Rigid3]:
-    """Return the poses of a nerfstudio transforms.json by image name (`panorama`, which we write, or `file_path`).
+def transforms_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
+    """Return the poses in nerfstudio's transforms.json by image name (`panorama`, which we write, or `file_path`).
 
     `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's, or
     that of our run if the file states the rotation `file_from_world` (3 × 3) with which our export turned it.
@@ -84,7 +83,6 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
     Raises:
         InputError: if a key is missing or malformed, or a camera is not EQUIRECTANGULAR; it names the file and the key.
     """
-    data = read_json(path)
     frames = data.get("frames")
     if not isinstance(frames, list):
         raise InputError(f"{path}: key 'frames' must be a list of frames, got {type(frames).__name__}")
@@ -93,16 +91,10 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
     file_from_world = rigid_from_arrays(turn, np.zeros(3), f"{path}: file_from_world")
     for idx, frame in enumerate(frames):
         where = f"{path}: frames[{idx}]"
-        name = _name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
-        model = frame.get("camera_model", data.get("camera_model"))
-        if model != "EQUIRECTANGULAR":
-            raise InputError(
-                f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas can be used"
-            )
+        name = image_name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
+        require_panorama(frame.get("camera_model", data.get("camera_model")), "EQUIRECTANGULAR", f"{where} ({name})")
         matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
-        if not np.isfinite(matrix).all():
-            raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
-        if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        if np.isfinite(matrix).all() and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
         # OpenGL's camera frame is x right, y up, z backwards.
         rotation = matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0])
@@ -142,7 +134,7 @@ def require_distinct(names: list[str], path: Path) -> None:
 
 
 def _posed_view(entry: Any, where: str) -> PosedView:
-    name = _name(entry, "image", where)
+    name = image_name(entry, "image", where)
     pose = rigid_from_arrays(
         number_array(entry, "R", (3, 3), where=where), number_array(entry, "t", (3,), where=where), f"{where} ({name})"
     )
@@ -150,11 +142,22 @@ def _posed_view(entry: Any, where: str) -> PosedView:
     return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
 
 
-def _name(entry: Any, key: str, where: str) -> str:
+def require_panorama(kind: object, expected: str, where: str) -> None:
+    """Raise InputError, beginning with `where`, unless a camera is of the expected kind."""
+    if kind != expected:
+        raise InputError(f"{where}: its camera is {kind}, expected {expected}. Only panoramas can be used")
+
+
+def image_name(entry: Any, key: str, where: str) -> str:
+    """Return the name of an image under a key of a JSON object, with forward slashes.
+
+    Raises:
+        InputError: beginning with `where`, if there is none.
+    """
     if not isinstance(entry, dict):
         raise InputError(f"{where}: expected an object, got {type(entry).__name__}")
     name = entry.get(key)
-    if not isinstance(name, str) or not name:
+    if not isinstance(name, str) or not name.strip("/"):
         raise InputError(f"{where}: key {key!r} must be the name of the image, got {name!r}")
     return name.replace("\\", "/").removeprefix("./")
 

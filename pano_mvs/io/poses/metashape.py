@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import xml_root
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.poses.json_files import require_distinct, rigid_from_arrays
+from pano_mvs.io.poses.json_files import require_distinct, require_panorama, rigid_from_arrays
 from pano_mvs.scene import FilePart, Poses
 
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -42,8 +42,7 @@ def read_metashape(path: Path) -> dict[str, Rigid3]:
         if transform is None or camera.get("enabled", "true") in ("false", "0"):
             continue
         where = f"{path}: camera {label!r}"
-        if (kind := sensors.get(camera.get("sensor_id"))) != "spherical":
-            raise InputError(f"{where}: its sensor is {kind}, expected spherical. Only panoramas can be used")
+        require_panorama(sensors.get(camera.get("sensor_id")), "spherical", where)
         matrix = _numbers(transform.text, (4, 4), where)
         chunk_from_cam = rigid_from_arrays(matrix[:3, :3], matrix[:3, 3], where)
         component = camera.get("component_id")

@@ -1,4 +1,4 @@
-"""Poses in openMVG's sfm_data.json.
+"""Poses in the JSON files of openMVG, AliceVision and OpenSfM.
 
 openMVG's spherical camera maps a bearing (cos lat sin lon, −sin lat, cos lat cos lon) to u = lon / 2π, v = −lat / 2π
 about the image centre in image widths, so that its camera frame is x right, y down, z forward, as ours. A pose holds
@@ -17,16 +17,17 @@ import numpy as np
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, pixel_from_ray, rotation_from_rotvec
-from pano_mvs.io.poses.json_files import number_array, require_distinct, rigid_from_arrays
+from pano_mvs.io.poses.json_files import (
+    image_name,
+    number_array,
+    require_distinct,
+    require_panorama,
+    rigid_from_arrays,
+)
 from pano_mvs.scene.poses import Poses
 
 _SPHERICAL = "spherical"
 _NEW, _PLAIN = 1 << 31, 1 << 30  # of cereal: the first mention of a pointer or class; an object of the base class
-
-
-def is_openmvg(data: Any) -> bool:
-    """Return whether a JSON value looks like openMVG's description of a scene."""
-    return isinstance(data, dict) and {"views", "intrinsics", "extrinsics"} <= data.keys()
 
 
 def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
@@ -49,14 +50,11 @@ def openmvg_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
         pose = extrinsics.get(about.get("id_pose"))
         if pose is None:
             continue
-        name = about.get("filename")
-        if not isinstance(name, str) or not name:
-            raise InputError(f"{where}: key 'filename' must be the name of the image, got {name!r}")
+        name = image_name(about, "filename", where)
         camera = cameras.get(about.get("id_intrinsic"), {})
         number = camera.get("polymorphic_id")
         kind = camera.get("polymorphic_name", kinds.get(number | _NEW if isinstance(number, int) else -1))
-        if kind != _SPHERICAL:
-            raise InputError(f"{where} ({name}): its camera is {kind}, expected spherical. Only panoramas can be used")
+        require_panorama(kind, _SPHERICAL, f"{where} ({name})")
         folder = str(about.get("local_path") or "").replace("\\", "/").strip("/")
         names.append(f"{folder}/{name}" if folder else name)
         poses[names[-1]] = _pose(pose, f"{path}: pose {about['id_pose']} ({name})")
@@ -86,12 +84,9 @@ def _inner(view: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _pose(value: dict[str, Any], where: str) -> Rigid3:
-    rotation, center = (
-        number_array(value, "rotation", (3, 3), where=where),
-        number_array(value, "center", (3,), where=where),
-    )
-    checked = rigid_from_arrays(rotation, center, where)
-    return Rigid3.from_center(checked.rotation, center)
+    rotation = number_array(value, "rotation", (3, 3), where=where)
+    center = number_array(value, "center", (3,), where=where)
+    return Rigid3.from_center(rigid_from_arrays(rotation, center, where).rotation, center)
 
 
 def write_openmvg(path: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
@@ -151,14 +146,6 @@ def _pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
     return {"ptr_wrapper": {"id": _NEW | (number + 1), "data": data}}
 
 
-_EQUIRECTANGULAR = "equirectangular"
-
-
-def is_alicevision(data: Any) -> bool:
-    """Return whether a JSON value looks like AliceVision's description of a scene."""
-    return isinstance(data, dict) and {"version", "views", "intrinsics"} <= data.keys()
-
-
 def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     """Return the poses of all views that have one, by image path below the folder that all images share.
 
@@ -171,26 +158,19 @@ def alicevision_poses(data: dict[str, Any], path: Path) -> dict[str, Rigid3]:
     for view in _entries(data, "views", path):
         if (pose := placed.get(view.get("poseId"))) is None:
             continue
-        file = view.get("path")
         where = f"{path}: view {view.get('viewId')}"
-        if not isinstance(file, str) or not PurePosixPath(file.replace("\\", "/")).name:
-            raise InputError(f"{where}: key 'path' must be the path of the image, got {file!r}")
-        kind = cameras.get(view.get("intrinsicId"), {}).get("type")
+        file = image_name(view, "path", where)
         in_rig = str(view.get("rigId", "-1")) not in {"-1", str((1 << 32) - 1)}  # in newer and older files
-        if kind != _EQUIRECTANGULAR or in_rig:
-            camera = "part of a rig" if in_rig else kind
-            raise InputError(f"{where} ({file}): its camera is {camera}, expected one equirectangular camera")
-        found.append((file.replace("\\", "/"), _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
+        kind = "part of a rig" if in_rig else cameras.get(view.get("intrinsicId"), {}).get("type")
+        require_panorama(kind, "equirectangular", f"{where} ({file})")
+        found.append((file, _alicevision_pose(pose, f"{path}: pose {view['poseId']} ({file})")))
     require_distinct([name for name, _ in found], path)
-    shared = _shared_folder([PurePosixPath(name) for name, _ in found])
+    files = [PurePosixPath(name) for name, _ in found]
+    mixed = len({file.is_absolute() for file in files}) > 1
+    shared = PurePosixPath("" if mixed else commonpath([str(file.parent) for file in files]))
     # Of a share on a network, the shared folder has one slash in front instead of two, and as many parts.
-    return {str(PurePosixPath(*PurePosixPath(name).parts[len(shared.parts) :])): pose for name, pose in found}
-
-
-def _shared_folder(files: list[PurePosixPath]) -> PurePosixPath:
-    if len({file.is_absolute() for file in files}) > 1:
-        return PurePosixPath()
-    return PurePosixPath(commonpath([str(file.parent) for file in files]))
+    below = (str(PurePosixPath(*file.parts[len(shared.parts) :])) for file in files)
+    return {name: pose for name, (_, pose) in zip(below, found, strict=True)}
 
 
 def _entries(data: dict[str, Any], section: str, path: Path) -> list[dict[str, Any]]:
@@ -207,14 +187,6 @@ def _alicevision_pose(value: Any, where: str) -> Rigid3:
     by_columns = number_array(transform, "rotation", (9,), where=where).reshape(3, 3)
     center = number_array(transform, "center", (3,), where=where)
     return Rigid3.from_center(rigid_from_arrays(by_columns.T, center, where).rotation, center)
-
-
-_OPENSFM_SPHERICAL = ("spherical", "equirectangular")
-
-
-def is_opensfm(data: Any) -> bool:
-    """Return whether a JSON value looks like the list of reconstructions that OpenSfM writes."""
-    return isinstance(data, list) and bool(data) and all(isinstance(item, dict) and "shots" in item for item in data)
 
 
 def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rigid3], bool]:
@@ -243,10 +215,7 @@ def _opensfm_pose(shot: Any, cameras: dict[str, Any], where: str) -> Rigid3:
         raise InputError(f"{where}: expected an object, got {type(shot).__name__}")
     camera = cameras.get(str(shot.get("camera", "")))
     projection = camera.get("projection_type") if isinstance(camera, dict) else None
-    if projection not in _OPENSFM_SPHERICAL:
-        raise InputError(
-            f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas can be used"
-        )
+    require_panorama("spherical" if projection == "equirectangular" else projection, "spherical", where)
     rotvec, translation = (number_array(shot, key, (3,), where=where) for key in ("rotation", "translation"))
     if not np.isfinite(rotvec).all():
         raise InputError(f"{where}: key 'rotation' holds NaN or infinite numbers")

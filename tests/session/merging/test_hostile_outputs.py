@@ -124,7 +124,7 @@ SECRET = b"what nobody may read"
 FORMATS: dict[str, Callable[[Path, Poses], None]] = {
     "io.colmap.reader.read_colmap_model": _colmap,
     "io.colmap.reader.read_colmap_model (text)": _colmap_text,
-    "io.poses.json_files.read_transforms": _transforms,
+    "io.poses.json_files.transforms_poses": _transforms,
     "io.poses.json_files.read_posed_views": _poses_json,
     "io.poses.files.read_csv": _csv,
     "io.poses.other_json.opensfm_poses": _opensfm,
@@ -152,8 +152,7 @@ _NO_NAMES = {
     *(f"io.ranges.read_{name}" for name in ("range_tiff", "range_png", "normals", "confidence_png", "npy", "exr")),
     *("io.ranges.read_npz", "io.colmap.workspace.read_colmap_map", "io.images.video.read_times"),
     *("io.images.metadata.read_container", "io.splats.open_mask", "io.meshes.read_glb"),
-    *(f"io.poses.json_files.{name}" for name in ("read_json", "read_json_value")),
-    *("session.merging.block_runs.open_blocks", "session.session.open_session"),
+    *("io.poses.json_files.read_json_value", "session.merging.block_runs.open_blocks", "session.session.open_session"),
 }
 
 
