@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import struct
 import subprocess
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import Tiles3dParams, tiles_3d
 from tests.foreign import npm_packages
 from tests.share.chromium import chromium
+from tests.share.server import served
 
 COUNT, TILE_POINTS, SMALL_TILE = 20_000, 1000, 500
 
@@ -225,21 +223,15 @@ def test_a_viewer_loads_the_tiles_that_it_needs(tmp_path: Path) -> None:
     npm_packages(tmp_path, "3d-tiles-renderer@0.5.3", "three@0.187.0")
     for name, target in (("all", "0.01"), ("far", "100000")):
         (tmp_path / f"{name}.html").write_text(VIEWER.replace("ERROR_TARGET", target))
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{server.server_port}"
-    with chromium(width=400, height=300) as browser:
-        browser.open(f"{address}/far.html")
+    with served(tmp_path) as server, chromium(width=400, height=300) as browser:
+        browser.open(f"{server.address}far.html")
         browser.wait("window.points && points().length")
         assert len(browser.evaluate("points()")) < 0.3 * COUNT
-        browser.open(f"{address}/all.html")
+        browser.open(f"{server.address}all.html")
         browser.wait(f"window.points && points().length == {COUNT}")
         found = np.array(browser.evaluate("points()"), np.float32)
         shown = browser.screenshot().astype(int)
         assert browser.evaluate("failures") == []
-    server.shutdown()
-    server.server_close()
     x, y, z = cloud.points_in_world.T
     np.testing.assert_allclose(rows(found), rows(np.stack([x, z, -y], axis=-1)), atol=1e-5)
     lit = shown[shown.max(axis=2) > 150]

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import re
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +19,7 @@ from pano_mvs.stages.exports.tour import PanoramasParams, TourExportParams, pano
 from tests.foreign import npm_packages
 from tests.share.browser import Browser
 from tests.share.chromium import chromium
+from tests.share.server import served
 
 pytestmark = pytest.mark.browser
 
@@ -84,21 +82,17 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         made[name] = panoramas(images[name], Pose(camera), poses, None, params, ctx)
     players = TourExportParams(players=("pannellum", "marzipano"))
     files = tour_of_panoramas(made, poses, images, players, Context(np.random.default_rng(0), folder)).files
-    served = folder / "served"
-    served.mkdir()
+    site = folder / "site"
+    site.mkdir()
     for target, path in files.items():
         text = path.read_text().replace('pannellum.viewer("', 'window.viewer = pannellum.viewer("')
         local = re.sub(r"https://cdn\.jsdelivr\.net/npm/(\w+)@[\d.]+/", r"node_modules/\1/", text)
-        (served / Path(target).name).write_text(local)
+        (site / Path(target).name).write_text(local)
     for name, picture in made.items():
-        picture.files["panoramas/{item}.png"].rename(served / name)
-    npm_packages(served, f"pannellum@{PANNELLUM}", f"marzipano@{MARZIPANO}")
-    handler = functools.partial(SimpleHTTPRequestHandler, directory=str(served))
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    server.server_close()
+        picture.files["panoramas/{item}.png"].rename(site / name)
+    npm_packages(site, f"pannellum@{PANNELLUM}", f"marzipano@{MARZIPANO}")
+    with served(site) as server:
+        yield server.address
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +105,7 @@ def window() -> Iterator[Browser]:
 def player(request: pytest.FixtureRequest, window: Browser, address: str) -> str:
     """Open the tour in a player, without anything that covers a mark."""
     name = str(request.param)
-    window.open(f"{address}/{name}.html" if name == "marzipano" else f"{address}/tour.html")
+    window.open(f"{address}{'tour' if name == 'pannellum' else name}.html")
     window.wait(f"(() => {{ try {{ return {PAGES[name]['ready']}; }} catch {{ return false; }} }})()")
     window.evaluate("document.head.insertAdjacentHTML('beforeend', '<style>.pnlm-ui, button {opacity: 0 !important}')")
     return name

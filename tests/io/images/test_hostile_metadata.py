@@ -21,47 +21,23 @@ from hypothesis import strategies as st
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.captures import describe_picture
-from pano_mvs.io.images.metadata import focal_from_exif, orientation_from_exif, position_from_exif, read_container
+from pano_mvs.io.images.metadata import (
+    camera_from_exif,
+    focal_from_exif,
+    orientation_from_exif,
+    position_from_exif,
+    read_container,
+)
 from pano_mvs.io.images.video import _movie_header, describe_video, frames_between
 from pano_mvs.scene.image_file import MAX_PIXELS
 from tests.io.images.pictures import app1, exif, full_sphere, picture, png_chunk, xmp
 
 NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 0x7F, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1]) | st.integers(0, 2**32 - 1)
 TAGS = st.sampled_from([0x0112, 0x8769, 0x8825, 0xA405, 700, 256, 257, *range(7)]) | st.integers(0, 0xFFFF)
-TEXTS = st.sampled_from(
-    [
-        *(
-            "",
-            " ",
-            "nan",
-            "-inf",
-            "1e308",
-            "-1e308",
-            "1e-320",
-            "2e9",
-            "-1",
-            "0",
-            "0.5",
-            "64",
-            "128",
-            "4096",
-            "8192",
-            "1e9",
-        ),
-        *(
-            "9" * 400,
-            "9" * 5000,
-            "0x40",
-            "١٢٨",
-            "1_000",
-            "true",
-            "128 px",
-            "\U0001f600",
-            "equirectangular",
-            "cylindrical",
-        ),
-    ]
-) | st.text(st.characters(codec="utf-8", exclude_characters="<&>\"'\0", exclude_categories=["Cc", "Cs"]), max_size=8)
+PLAIN = "nan -inf 1e308 -1e308 1e-320 2e9 -1 0 0.5 64 128 4096 8192 1e9 0x40 ١٢٨ 1_000 true equirectangular cylindrical"
+TEXTS = st.sampled_from(["", " ", "128 px", "\U0001f600", "9" * 400, "9" * 5000, *PLAIN.split()]) | st.text(
+    st.characters(codec="utf-8", exclude_characters="<&>\"'\0", exclude_categories=["Cc", "Cs"]), max_size=8
+)
 FIELDS = [*full_sphere(1, 2), "PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees"]
 
 
@@ -93,6 +69,7 @@ def test_any_exif_is_read(data: bytes) -> None:
     assert 1 <= orientation_from_exif(data) <= 8
     focal = focal_from_exif(data, (64, 128))
     assert focal is None or focal > 0
+    assert isinstance(camera_from_exif(data), str)
     read_container(data)
 
 
