@@ -30,6 +30,7 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.text import plural
+from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.workspace import write_picture
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.ranges import write_confidence_png, write_normals_png, write_range_png
@@ -44,7 +45,9 @@ from pano_mvs.io.splats import (
 from pano_mvs.io.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.photographs import Photographs
+from pano_mvs.scene.pose_groups import split_groups
 
+PosedFrame = tuple[str, Rigid3, NerfstudioFrame]
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -197,11 +200,30 @@ def frames_with_poses(poses: Poses, frames: Mapping[str, PanoramaFrames], ctx: C
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedGroup:
-    """One group of poses with the frames of its panoramas."""
+    """One group of poses with the frames of its panoramas, its cloud, and photographs in its world."""
 
     number: int
     poses: Poses
     frames: Mapping[str, PanoramaFrames]
+    cloud: PointCloud | None = None
+    photographs: Photographs | None = None
+
+    @staticmethod
+    def all_of(
+        poses: Poses, frames: Mapping[str, PanoramaFrames], cloud: PointCloud | None, photographs: Photographs | None
+    ) -> list[PosedGroup]:
+        """Return all groups of the poses; photographs are in the world of the first."""
+        clouds = [] if cloud is None else cloud.groups()
+        return [
+            PosedGroup(
+                number,
+                group,
+                {name: frames[name] for name in group.names if name in frames},
+                clouds[number] if number < len(clouds) else None,
+                None if number else photographs,
+            )
+            for number, group in enumerate(split_groups(poses))
+        ]
 
     @property
     def depth_unit(self) -> float:
@@ -220,105 +242,75 @@ class PosedGroup:
 def write_transforms(
     root: str,
     group: PosedGroup,
-    cloud: PointCloud | None,
-    *,
     params: SeedParams,
+    *,
     ctx: Context,
     file_from_world: NDArray[np.float64] | None = None,
 ) -> dict[str, Path]:
     """Write transforms.json of each variant and the initial points of a group; return the targets of the files.
 
+    Photographs are listed after the faces, in a file of their own: they have no depths, and a list has depths of all
+    frames or of none.
+
     Args:
         root: folder of the variants in the output folder.
-        cloud: of the group; None: the sparse points of its poses.
         file_from_world: rotation (3, 3) of cameras and points; None: they stay in the world of the poses.
     """
     files: dict[str, Path] = {}
     scratch = ctx.scratch / str(group.number)
     scratch.mkdir()
     poses = group.poses
-    seed = _write_seed(group, cloud, params, ctx=ctx, file_from_world=file_from_world)
+    seed = _write_seed(group, params, ctx=ctx, file_from_world=file_from_world)
     seed_name = "" if seed is None else group_file("seed.ply", group.number)
-    about = {"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame}
     cameras = poses.cameras
-    for variant, listed in group.listed().items():
+
+    def write(name: str, variant: Variant, frames: list[PosedFrame], about: Mapping[str, Any]) -> None:
         document = transforms_document(
             variant,
-            [(name, cameras[name], frame) for name, frame in listed],
+            frames,
             depth_unit=group.depth_unit,
-            about=about,
+            about={**about, "world_frame": poses.frame},
             file_from_world=file_from_world,
             seed=seed_name,
         )
-        folder = f"{root}/{variant}"
-        path = files[f"{folder}/{group_file('transforms.json', group.number)}"] = scratch / f"{variant}.json"
+        path = files[f"{root}/{variant}/{name}"] = scratch / f"{variant}_{name}"
         path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        files.update(_open_masks([frame for *_, frame in frames], f"{root}/{variant}", scratch))
+
+    for variant, listed in group.listed().items():
+        frames = [(name, cameras[name], frame) for name, frame in listed]
+        unit = "metre" if poses.metric else poses.scale
+        write(group_file("transforms.json", group.number), variant, frames, {"scene_unit": unit})
         if seed is not None:
-            files[f"{folder}/{seed_name}"] = seed
-        files |= _open_masks([frame for _, frame in listed], folder, scratch)
+            files[f"{root}/{variant}/{seed_name}"] = seed
         ctx.metric(variant, ctx.metrics.get(variant, 0) + len(listed))
+        if variant == "faces" and group.photographs is not None and len(group.photographs):
+            shown = _listed_photographs(group.photographs)
+            files |= {
+                f"{root}/faces/{frame.image}": picture.path
+                for (*_, frame), picture in zip(shown, group.photographs.pictures, strict=True)
+            }
+            write("transforms_photographs.json", "faces", frames + shown, {})
     return files
 
 
-def write_photographs(
-    root: str,
-    group: PosedGroup,
-    photographs: Photographs,
-    *,
-    seed: bool,
-    ctx: Context,
-    file_from_world: NDArray[np.float64] | None = None,
-) -> dict[str, Path]:
-    """Write transforms_photographs.json, which lists photographs after the faces, and the photographs themselves.
-
-    Photographs have no depths, so the list has none: a list has depths of all frames or of none.
-
-    Args:
-        root: folder of the variants in the output folder.
-        group: poses and frames of the panoramas in whose world the photographs are.
-        seed: whether there are initial points.
-        file_from_world: as in `write_transforms`.
-    """
-    faces = group.listed().get("faces", [])
-    if not faces or not len(photographs):
-        return {}
-    frames = [(name, group.poses.cameras[name], frame) for name, frame in faces]
-    folder = f"{root}/faces"
-    files: dict[str, Path] = {}
+def _listed_photographs(photographs: Photographs) -> list[PosedFrame]:
+    found = []
     for idx, name in enumerate(photographs.names):
         height, width = photographs.sizes_hw[idx].tolist()
-        focal = float(photographs.focals_px[idx])
-        radial = float(photographs.radials[idx])
+        focal, radial = float(photographs.focals_px[idx]), float(photographs.radials[idx])
         frame = NerfstudioFrame(
             "faces", f"images/{name}", "", "", (width, height), (focal, focal), _NO_TURN, radial=radial
         )
-        frames.append((name, photographs.cam_from_world(idx), frame))
-        files[f"{folder}/images/{name}"] = photographs.pictures[idx].path
-    document = transforms_document(
-        "faces",
-        frames,
-        depth_unit=group.depth_unit,
-        about={"world_frame": group.poses.frame},
-        file_from_world=file_from_world,
-        seed="seed.ply" if seed else "",
-    )
-    scratch = ctx.scratch / "photographs"
-    scratch.mkdir()
-    files[f"{folder}/transforms_photographs.json"] = scratch / "transforms.json"
-    (scratch / "transforms.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
-    return files | _open_masks([frame for _, _, frame in frames], folder, scratch)
+        found.append((name, photographs.cam_from_world(idx), frame))
+    return found
 
 
 def _write_seed(
-    group: PosedGroup,
-    cloud: PointCloud | None,
-    params: SeedParams,
-    *,
-    ctx: Context,
-    file_from_world: NDArray[np.float64] | None,
+    group: PosedGroup, params: SeedParams, *, ctx: Context, file_from_world: NDArray[np.float64] | None
 ) -> Path | None:
     """Write the initial points; return None if there are none."""
-    poses, scratch = group.poses, ctx.scratch / str(group.number)
+    poses, cloud, scratch = group.poses, group.cloud, ctx.scratch / str(group.number)
     if cloud is None or not len(cloud):
         count = len(poses.points_in_world)
         cloud = PointCloud(

@@ -12,7 +12,6 @@ from pano_mvs.algorithms.faces.layout import panorama_faces
 from pano_mvs.api import All, Context, Each, Files, One, Panorama, PointCloud, Poses, RangeMap, arguments_from, stage
 from pano_mvs.io.splats import NerfstudioFrames
 from pano_mvs.scene.photographs import Photographs
-from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.stages.exports.files import FrameParams, files_from_world
 from pano_mvs.stages.exports.frame_files import (
     FrameFiles,
@@ -21,7 +20,6 @@ from pano_mvs.stages.exports.frame_files import (
     PosedGroup,
     SeedParams,
     frames_with_poses,
-    write_photographs,
     write_transforms,
 )
 
@@ -80,18 +78,11 @@ def nerfstudio(
     """
     loaded = frames_with_poses(poses, frames, ctx)
     files: dict[str, Path] = {}
-    groups = split_groups(poses)
-    clouds = [] if cloud is None else cloud.groups()
-    for number, group in enumerate(groups):
-        own = {name: loaded[name] for name in group.names if name in loaded}
-        if own:
-            given = clouds[number] if number < len(clouds) else None
-            (turn,) = files_from_world(params, group, groups=1)
-            posed = PosedGroup(number, group, own)
-            files |= write_transforms(_ROOT, posed, given, params=params, ctx=ctx, file_from_world=turn)
-            if photographs is not None and number == 0:
-                seed = f"{_ROOT}/faces/seed.ply" in files
-                files |= write_photographs(_ROOT, posed, photographs, seed=seed, ctx=ctx, file_from_world=turn)
+    groups = PosedGroup.all_of(poses, loaded, cloud, photographs)
+    for group in groups:
+        if group.frames:
+            (turn,) = files_from_world(params, group.poses, groups=1)
+            files |= write_transforms(_ROOT, group, params, ctx=ctx, file_from_world=turn)
     if len(groups) > 1:
         ctx.note(
             f"the poses are in {len(groups)} groups, each in its own frame: transforms.json lists the largest group, "

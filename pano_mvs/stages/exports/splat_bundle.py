@@ -45,7 +45,6 @@ from pano_mvs.stages.exports.frame_files import (
     PosedGroup,
     SeedParams,
     frames_with_poses,
-    write_photographs,
     write_transforms,
 )
 
@@ -147,29 +146,21 @@ def splat_bundle(
     """
     loaded = frames_with_poses(poses, frames, ctx)
     joined = poses if points is None else points.joined_to(poses, keep_points=True)
-    clouds = [] if cloud is None else cloud.groups()
     files: dict[str, Path] = {}
-    groups: list[dict[str, Any]] = []
+    about: list[dict[str, Any]] = []
     views: list[BundleView] = []
     shown = photographs if params.photographs else None
     taken = None if shown is None else _taken(shown, loaded, ctx)
-    for number, (group, with_points) in enumerate(zip(split_groups(poses), split_groups(joined), strict=True)):
-        own = {name: loaded[name] for name in group.names if name in loaded}
+    groups = PosedGroup.all_of(poses, loaded, cloud, taken)
+    for group, with_points in zip(groups, split_groups(joined), strict=True):
         written: dict[str, Path] = {}
-        if own:
-            posed = PosedGroup(number, group, own)
-            given = clouds[number] if number < len(clouds) else None
-            written = write_transforms(ROOT, posed, given, params=params, ctx=ctx)
-            placed = taken if number == 0 else None
-            written |= _write_models(posed, with_points, placed, ctx=ctx)
-            if placed is not None:
-                seed = f"{ROOT}/faces/seed.ply" in written
-                written |= write_photographs(ROOT, posed, placed, seed=seed, ctx=ctx)
-            views += _views(posed)
-        groups.append(_about(number, group, written))
+        if group.frames:
+            written = write_transforms(ROOT, group, params, ctx=ctx) | _write_models(group, with_points, ctx=ctx)
+            views += _views(group)
+        about.append(_about(group.number, group.poses, written))
         files |= written
     unit = next(iter(loaded.values())).depth_unit
-    document = manifest_document(views, groups, depth_unit=unit, photographs=taken)
+    document = manifest_document(views, about, depth_unit=unit, photographs=taken)
     files[f"{ROOT}/manifest.json"] = ctx.scratch / "manifest.json"
     files[f"{ROOT}/manifest.json"].write_text(json.dumps(document, indent=1), encoding="utf-8")
     ctx.metric("views", len(views))
@@ -215,13 +206,13 @@ def _about(number: int, poses: Poses, written: Mapping[str, Path]) -> dict[str, 
     }
 
 
-def _write_models(group: PosedGroup, poses: Poses, photographs: Photographs | None, *, ctx: Context) -> dict[str, Path]:
+def _write_models(group: PosedGroup, poses: Poses, *, ctx: Context) -> dict[str, Path]:
     """Write a COLMAP model of each variant, whose image names are relative to the folder images/ of the variant."""
     files: dict[str, Path] = {}
     for variant, listed in group.listed().items():
         folder = ctx.scratch / f"{variant}_{group.number}"
         if variant == "faces":
-            write_rig_model(folder, poses, _cuts(listed), photographs=photographs, form="bin")
+            write_rig_model(folder, poses, _cuts(listed), photographs=group.photographs, form="bin")
         else:
             frames = dict(listed)
             kept = with_cameras(poses, np.array([name in frames for name in poses.names]))
