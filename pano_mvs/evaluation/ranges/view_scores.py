@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,34 +196,25 @@ def weighted_quantile(values: NDArray[np.floating], weight: FloatArray, share: f
     return float(values[order[np.searchsorted(reached, reached[-1] * share)]])
 
 
-@dataclass(frozen=True, eq=False)
-class Sparsification:
-    """Mean error of the most confident pixels against the share of pixels that is kept.
+class Sparsification(NamedTuple):
+    """Areas under the mean error of the most confident pixels against the share of pixels that is kept.
 
     Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
     order. Errors are |error| / truth, at most 1.
     """
 
-    kept: NDArray[np.float64]  # (N,) share of the pixels with truth and estimate that is kept, growing to 1
-    error: NDArray[np.float64]  # (N,) mean relative error of those
-    # (N,) mean relative error if the pixels were ordered by their true errors
-    oracle_error: NDArray[np.float64]
-    area: float  # under the curve, the mean over all shares
-    oracle_area: float  # under the oracle's
+    area: float
+    oracle_area: float  # if the pixels were ordered by their true errors
+    unranked_area: float  # if all pixels had the same confidence: the mean error
 
     @property
     def ause(self) -> float:
         """Area between the two curves: 0 if confidence orders the pixels like their errors; less is better."""
         return self.area - self.oracle_area
 
-    @property
-    def unranked_area(self) -> float:
-        """The area if all pixels had the same confidence: the mean error."""
-        return float(self.error[-1]) if len(self.error) else float("nan")
-
 
 def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsification:
-    """Return the sparsification curve of a range map; an empty curve with NaN areas if no pixel has an estimate.
+    """Return the sparsification of a range map; NaN if no pixel has an estimate.
 
     E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018, section 5.1.
     """
@@ -232,19 +223,17 @@ def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsifica
         raise UsageError("sparsification needs the confidence of the pixels")
     weight = both.weight if by_solid_angle else np.ones_like(both.weight)
     if len(weight) == 0:
-        nothing = np.zeros(0)
-        return Sparsification(nothing, nothing, nothing, float("nan"), float("nan"))
+        return Sparsification(float("nan"), float("nan"), float("nan"))
     # Larger relative errors count as this one; otherwise a few far pixels would decide the area.
     error = np.minimum(np.abs(both.found - both.true) / both.true, 1.0)
-    kept, mean, area = _curve(both.confidence.astype(np.float64), error, weight)
-    oracle_kept, oracle_mean, oracle_area = _curve(-error, error, weight)
-    return Sparsification(kept, mean, np.interp(kept, oracle_kept, oracle_mean), area, oracle_area)
+    area, unranked_area = _areas(both.confidence.astype(np.float64), error, weight)
+    return Sparsification(area, _areas(-error, error, weight)[0], unranked_area)
 
 
-def _curve(
+def _areas(
     sureness: NDArray[np.float64], error: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the shares kept, their mean errors, and the area under the curve."""
+) -> tuple[float, float]:
+    """Return the area under the curve of an order, and the mean error."""
     levels, level = np.unique(-sureness, return_inverse=True)
     added = np.bincount(level, weight, len(levels)) / weight.sum()
     lost = np.bincount(level, weight * error, len(levels)) / weight.sum()
@@ -255,7 +244,7 @@ def _curve(
     mean = lost / added
     growth = np.log1p(np.divide(added, before, out=np.zeros_like(added), where=before > 0))
     area = float(np.sum(mean * added + (total_before - mean * before) * growth))
-    return kept, total / kept, area
+    return area, float(total[-1] / kept[-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
