@@ -1,9 +1,7 @@
-"""Range maps, confidences, clouds and previews come back as they were written."""
+"""Range maps and confidences come back as they were written, and previews show them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,7 @@ from pano_mvs.io.images.preview import (
     unconfirmed_classes,
     write_preview,
 )
-from pano_mvs.io.ply import read_ply, write_ply
 from pano_mvs.io.ranges import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
-from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
 from tests.stored import read_picture
 
@@ -43,15 +39,6 @@ def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path: Path) -> None:
     assert (tmp_path / "a.tiff").read_bytes() == (tmp_path / "b.tiff").read_bytes()
 
 
-def test_a_confidence_map_comes_back(tmp_path: Path) -> None:
-    confidence = np.random.default_rng(1).integers(0, 256, (6, 12), dtype=np.uint8)
-    write_confidence_png(tmp_path / "a.png", confidence)
-    np.testing.assert_array_equal(read_confidence_png(tmp_path / "a.png"), confidence)
-    cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(InputError, match=r"colour\.png: a confidence map is an 8-bit grey PNG"):
-        read_confidence_png(tmp_path / "colour.png")
-
-
 def test_another_file_is_no_range_map(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.tiff: cannot be read"):
         read_range_tiff(tmp_path / "gone.tiff")
@@ -66,54 +53,13 @@ def test_another_file_is_no_range_map(tmp_path: Path) -> None:
 def test_a_confidence_map_is_an_8_bit_png(tmp_path: Path) -> None:
     confidence = np.arange(256, dtype=np.uint8).reshape(8, 32)
     write_confidence_png(tmp_path / "a.png", confidence)
+    np.testing.assert_array_equal(read_confidence_png(tmp_path / "a.png"), confidence)
     np.testing.assert_array_equal(read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), confidence)
     with pytest.raises(UsageError, match=r"a confidence map is \(H, W\) uint8"):
         write_confidence_png(tmp_path / "a.png", confidence.astype(float))
-
-
-def cloud(count: int) -> PointCloud:
-    rng = np.random.default_rng(count)
-    normals = rng.normal(size=(count, 3)).astype(np.float32)
-    return PointCloud(
-        rng.normal(size=(count, 3)).astype(np.float32),
-        normals,
-        rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        np.zeros(count, np.uint8),
-    )
-
-
-def test_the_ply_header_is_what_other_programs_expect(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", cloud(3))
-    lines = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
-    names = [
-        "float x",
-        "float y",
-        "float z",
-        "float nx",
-        "float ny",
-        "float nz",
-        "uchar red",
-        "uchar green",
-        "uchar blue",
-    ]
-    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 3"]
-    assert lines[3:] == [f"property {name}" for name in names]
-    assert (tmp_path / "a.ply").stat().st_size == len("\n".join([*lines, "end_header", ""])) + 3 * 27
-
-
-@pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        (lambda data: data[:-1], "states 3 points, but it contains fewer"),
-        (lambda data: data.replace(b"vertex 3", b"vertex three"), "vertex"),
-        (lambda data: b"", "not a PLY file"),
-    ],
-)
-def test_another_ply_is_refused(tmp_path: Path, change: Callable[..., Any], what: str) -> None:
-    write_ply(tmp_path / "a.ply", cloud(3))
-    (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
-    with pytest.raises(InputError, match=rf"a\.ply: .*{what}"):
-        read_ply(tmp_path / "a.ply")
+    cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match=r"colour\.png: a confidence map is an 8-bit grey PNG"):
+        read_confidence_png(tmp_path / "colour.png")
 
 
 def test_a_preview_shows_the_panorama_above_its_range(tmp_path: Path) -> None:
@@ -159,15 +105,6 @@ def test_a_preview_explains_its_marks(tmp_path: Path) -> None:
     sure, weak = read_picture(tmp_path / "sure.jpg"), read_picture(tmp_path / "weak.jpg")
     assert weak.shape[0] > sure.shape[0]
     assert weak[650:840].mean() > sure[650:840].mean() + 40
-
-
-@pytest.mark.parametrize(("quality", "uncertainty"), [(False, True), (True, True)])
-def test_the_uncertainty_of_points_survives(tmp_path: Path, quality: bool, uncertainty: bool) -> None:
-    known = replace(cloud(3), uncertainty=np.array([0.01, 0.02, 0.5], np.float32))
-    write_ply(tmp_path / "a.ply", known, quality=quality, uncertainty=uncertainty)
-    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").uncertainty, known.uncertainty)
-    write_ply(tmp_path / "b.ply", cloud(3), quality=quality, uncertainty=uncertainty)
-    assert read_ply(tmp_path / "b.ply").uncertainty is None
 
 
 def test_near_is_red_far_is_blue_and_nothing_is_grey() -> None:

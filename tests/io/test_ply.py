@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import trimesh
 from pano_mvs.api import Context, InputError, PointCloud, Poses
 from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.io.ply import open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
+from pano_mvs.io.ply import RGB, open_ply_points, read_ply, read_ply_mesh, read_ply_points, write_ply, write_ply_mesh
 from pano_mvs.scene.upright import z_up_from_world
 from pano_mvs.stages.exports.files import PlyParams, ply
 from pano_mvs.viewer.cloud_colors import drawn_cloud
@@ -48,18 +49,28 @@ def test_text_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quality", [False, True])
-def test_our_own_files(tmp_path: Path, quality: bool) -> None:
-    one = np.ones((2, 3), np.float32)
-    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8))
-    write_ply(tmp_path / "a.ply", cloud, quality=quality)
-    np.testing.assert_array_equal(read_ply_points(tmp_path / "a.ply"), POINTS)
-    back = read_ply(tmp_path / "a.ply")
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_our_own_files_hold_what_is_asked_for(tmp_path: Path, quality: bool, uncertainty: bool) -> None:
+    ones, sigmas = np.ones((2, 3), np.float32), np.array([0.01, 0.5], np.float32)
+    counts, confidence = np.array([2, 9], np.uint8), np.array([130, 255], np.uint8)
+    cloud = PointCloud(POINTS, ones, ones.astype(np.uint8), counts, confidence, uncertainty=sigmas)
+    params = PlyParams(quality=quality, uncertainty=uncertainty)
+    path = ply(cloud, None, params, Context(np.random.default_rng(0), tmp_path)).files["cloud.ply"]
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    names = [*(f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")), *(f"uchar {name}" for name in RGB)]
+    names += ["uchar views", "uchar confidence"] * quality + ["float uncertainty"] * uncertainty
+    lines = [line for line in head.decode().splitlines() if not line.startswith("comment")]
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    assert lines[3:] == [f"property {name}" for name in names]
+    assert len(body) == 2 * (27 + 2 * quality + 4 * uncertainty)
+    back = read_ply(path)
     back.check()
     np.testing.assert_array_equal(back.points_in_world, POINTS)
-    if quality:
-        np.testing.assert_array_equal([back.view_counts, back.confidence], [[2, 9], [130, 255]])
-    else:
-        assert back.confidence is None
+    np.testing.assert_array_equal(back.view_counts, counts if quality else 0)
+    np.testing.assert_array_equal(back.confidence, confidence if quality else None)
+    np.testing.assert_array_equal(back.uncertainty, sigmas if uncertainty else None)
+    write_ply(path, replace(cloud, uncertainty=None), quality=quality, uncertainty=uncertainty)
+    assert read_ply(path).uncertainty is None
 
 
 @pytest.mark.parametrize(
@@ -85,17 +96,6 @@ def test_damaged_and_strange_files_are_named(tmp_path: Path, data: bytes, what: 
         read_ply_points(tmp_path / "a.ply")
     with pytest.raises(InputError, match="cannot be read"):
         read_ply_points(tmp_path / "no.ply")
-
-
-def test_the_export_writes_quality_on_demand(tmp_path: Path) -> None:
-    cloud = PointCloud(
-        POINTS, POINTS, POINTS.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8)
-    )
-    context = Context(np.random.default_rng(0), tmp_path)
-    for quality, confidence in ((False, None), (True, [130, 255])):
-        files = ply(cloud, None, PlyParams(quality=quality), context)
-        back = read_ply(files.files["cloud.ply"])
-        assert (None if back.confidence is None else back.confidence.tolist()) == confidence
 
 
 def test_a_file_is_read_in_parts_with_its_normals(tmp_path: Path) -> None:
