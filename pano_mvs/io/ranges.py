@@ -56,12 +56,6 @@ def write_range_png(path: Path, range_map: NDArray[np.float32], *, unit: float) 
     return int(beyond.sum())
 
 
-def read_range_png(path: Path, *, unit: float) -> NDArray[np.float32]:
-    """Return the range map (H, W) float32 in a 16-bit PNG file, NaN where it has 0."""
-    steps = np.asarray(_one_channel(path, np.uint16, "a range map in steps is a 16-bit grey PNG"), np.float64)
-    return np.where(steps > 0, steps * unit, np.nan).astype(np.float32)
-
-
 def write_normals_tiff(path: Path, normals: NDArray[np.float32]) -> None:
     """Write normals (H, W, 3) as a float32 TIFF whose red, green and blue are x, y and z; NaN stays NaN."""
     path.write_bytes(_encoded(".tiff", _checked_normals(normals)[..., ::-1], [cv2.IMWRITE_TIFF_COMPRESSION, _DEFLATE]))

@@ -133,11 +133,6 @@ class TestFaults:
         with pytest.raises(InputError, match="16-bit PNG, and give its unit"):
             find_ranges(tmp_path)["a"].read()
 
-    def test_pickles_are_refused(self, tmp_path: Path) -> None:
-        np.save(tmp_path / "a.npy", np.array([{}], object), allow_pickle=True)
-        with pytest.raises(InputError, match=r"a\.npy"):
-            find_ranges(tmp_path)["a"].read()
-
     def test_several_arrays_of_which_none_is_meant(self, tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", x=RANGES, y=RANGES)
         with pytest.raises(InputError, match="holds 2 arrays"):
