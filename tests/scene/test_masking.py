@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
+from tests.io.images.pictures import png_chunk
 from tests.stored import read_picture
 
 VALID = np.array([[True, True, False, True], [False, True, True, True]])
@@ -26,14 +27,11 @@ def written(path: Path, picture: NDArray[np.generic], *options: int) -> Path:
 
 
 def palette_png(index: NDArray[np.uint8], colors_rgb: bytes) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     height, width = index.shape
     rows = b"".join(b"\0" + row.tobytes() for row in index)
     header = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
     parts = [(b"IHDR", header), (b"PLTE", colors_rgb), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*part) for part in parts)
 
 
 def test_grey_masks_of_any_depth(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups, with_cameras
 from tests.scene.pose_groups import drawn_group
+from tests.scene.test_kinds import assert_same
 
 _LARGE = drawn_group(("b.jpg", "d.jpg", "e.jpg"), seed=1)
 _SMALL = drawn_group(("a.jpg", "c.jpg"), seed=2)
@@ -21,16 +22,6 @@ _ORDER = ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg", "f.jpg")
 
 def _joined() -> Poses:
     return join_groups([_SMALL, _LARGE], order=_ORDER, rejected={"f.jpg": "blurred", "a.jpg": "not any more"})
-
-
-def _assert_same(first: Poses, second: Poses) -> None:
-    for field in fields(Poses):
-        a, b = getattr(first, field.name), getattr(second, field.name)
-        if isinstance(a, np.ndarray):
-            assert a.dtype == b.dtype, field.name
-            np.testing.assert_array_equal(a, b, err_msg=field.name)
-        else:
-            assert a == b, field.name
 
 
 def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is_first() -> None:
@@ -58,17 +49,17 @@ def test_every_observation_still_points_at_its_point() -> None:
 
 def test_split_gives_back_what_was_joined() -> None:
     large, small = split_groups(_joined())
-    _assert_same(large, _LARGE)
-    _assert_same(small, _SMALL)
+    assert_same(large, _LARGE)
+    assert_same(small, _SMALL)
 
 
 def test_groups_survive_the_form_in_which_they_are_stored() -> None:
     joined = _joined()
-    _assert_same(Poses.from_parts(joined.to_parts()), joined)
+    assert_same(Poses.from_parts(joined.to_parts()), joined)
     meta = joined.to_parts()["meta"]
     assert isinstance(meta, dict)
     as_read = meta | {"other_worlds": [list(world) for world in joined.other_worlds]}
-    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": as_read}), joined)
+    assert_same(Poses.from_parts({**joined.to_parts(), "meta": as_read}), joined)
 
 
 def test_what_only_one_group_knows_is_unknown_of_the_other() -> None:
@@ -83,7 +74,7 @@ def test_what_only_one_group_knows_is_unknown_of_the_other() -> None:
 def test_one_group_is_passed_on_as_it_is() -> None:
     assert split_groups(_LARGE) == [_LARGE]
     assert per_group(_LARGE, lambda poses: poses) is _LARGE
-    _assert_same(join_groups([_LARGE]), _LARGE)
+    assert_same(join_groups([_LARGE]), _LARGE)
     assert join_groups([_LARGE], order=_ORDER).track_bearings is _LARGE.track_bearings
     backwards = join_groups([_LARGE], order=tuple(reversed(_ORDER)))
     assert backwards.names == tuple(reversed(_LARGE.names))

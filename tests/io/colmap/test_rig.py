@@ -169,13 +169,6 @@ def test_the_text_model_is_what_openmvs_reads(tmp_path: Path) -> None:
     assert all(len(line.split()) >= 10 and len(line.split()) % 2 == 0 for line in lines["points3D"])
 
 
-def test_the_same_poses_are_the_same_bytes(tmp_path: Path) -> None:
-    for folder in ("a", "b"):
-        write_rig_model(tmp_path / folder, noisy_poses(), cuts())
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
-
-
 def test_configurations_name_every_picture(tmp_path: Path) -> None:
     names = ["front/a b/1.jpg", "up/ä.jpg"]
     files = write_stereo_configs(tmp_path, names)
