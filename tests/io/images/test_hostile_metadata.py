@@ -15,12 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pillow_heif
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pano_mvs.core.errors import InputError
-from pano_mvs.io.images.captures import describe_picture
+from pano_mvs.api import Context, InputError
 from pano_mvs.io.images.metadata import (
     camera_from_exif,
     focal_from_exif,
@@ -30,8 +30,20 @@ from pano_mvs.io.images.metadata import (
 )
 from pano_mvs.io.images.video import _movie_header, describe_video, frames_between
 from pano_mvs.scene.image_file import MAX_PIXELS
-from tests.io.images.pictures import app1, exif, full_sphere, picture, png_chunk, xmp
+from pano_mvs.stages.source import FolderParams, folder, folder_memory_bytes, list_folder
+from tests.io.images.pictures import (
+    app1,
+    by_pillow,
+    exif,
+    full_sphere,
+    picture,
+    png_chunk,
+    sound_files,
+    write_jpeg,
+    xmp,
+)
 
+pillow_heif.register_heif_opener()
 NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 0x7F, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1]) | st.integers(0, 2**32 - 1)
 TAGS = st.sampled_from([0x0112, 0x8769, 0x8825, 0xA405, 700, 256, 257, *range(7)]) | st.integers(0, 0xFFFF)
 PLAIN = "nan -inf 1e308 -1e308 1e-320 2e9 -1 0 0.5 64 128 4096 8192 1e9 0x40 ١٢٨ 1_000 true equirectangular cylindrical"
@@ -108,21 +120,48 @@ KINDS, FORMS = st.sampled_from(["jpg", "png", "webp", "avif"]), st.sampled_from(
 
 
 @given(st.dictionaries(st.sampled_from(FIELDS), TEXTS), KINDS, FORMS)
+@example(full_sphere(10**9, 2 * 10**9), "jpg", "element")
+@example(full_sphere(32, 64, CroppedAreaLeftPixels=10**30), "png", "element")
 @settings(max_examples=100, deadline=None)
-def test_any_gpano_costs_at_most_its_picture(fields: dict[str, str], kind: str, form: str) -> None:
+def test_any_gpano_costs_at_most_its_picture(fields: dict[str, object], kind: str, form: str) -> None:
     """A GPano field of 2·10⁹ columns ended the run of all pictures."""
-    described_or_refused(with_packet(kind, xmp(full_sphere(64, 128) | fields, form=form)))
+    read_with_neighbours(with_packet(kind, xmp(full_sphere(64, 128) | fields, form=form)), kind)
 
 
-def described_or_refused(data: bytes) -> None:
-    path = Path("folder/hostile.img")
-    try:
-        info = describe_picture(path, data)
-    except InputError as error:
-        assert str(path) in str(error)  # noqa: PT017
-        assert len(str(error)) < 3000  # noqa: PT017
-        return
-    assert info.size_hw[0] * info.size_hw[1] <= MAX_PIXELS
+def read_with_neighbours(data: bytes, suffix: str) -> None:
+    """Read a capture with a file between two sound ones; it alone may be refused, and with a reason."""
+    with TemporaryDirectory() as name:
+        capture = Path(name)
+        write_jpeg(capture / "a.jpg", (32, 64))
+        write_jpeg(capture / "c.jpg", (48, 96))
+        (capture / f"b.{suffix}").write_bytes(data)
+        params = FolderParams(path=capture)
+        items = list(list_folder(params))
+        assert [item.name for item in items] == ["a.jpg", f"b.{suffix}", "c.jpg"]
+        for item in items:
+            refused = item.problem
+            assert not refused or item.name.startswith("b.")
+            if not refused:
+                assert 0 <= folder_memory_bytes(params, {"item": item}) < 1 << 30
+                (capture / f".{item.name}").mkdir()
+                try:
+                    made = folder(item, params, Context(np.random.default_rng(0), capture / f".{item.name}"))
+                except InputError as error:
+                    refused = str(error)
+                else:
+                    made.check()
+                    assert made.load().shape == (*made.size_hw, 3)
+            assert not refused or f"b.{suffix}" in refused
+            assert len(refused) < 3000
+
+
+def test_sizes_that_a_file_cannot_hold_plan_no_memory() -> None:
+    tiff = sound_files((32, 64), b"")[2]
+    read_with_neighbours(tiff[:20] + b"\x7f" + tiff[21:], "tif")  # the most significant half of the width
+    heic = by_pillow((32, 64), "HEIF")
+    size, length = heic.index(b"ispe") + 8, heic.index(b"ispe") - 1
+    for at, value in ((size, b" "), (size, struct.pack(">II", 32_000, 16_000)), (length, b"\0")):
+        read_with_neighbours(heic[:at] + value + heic[at + len(value) :], "heic")
 
 
 def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[tuple[bytes, int, int]]:
@@ -154,10 +193,24 @@ CHANGES = st.lists(
 )
 
 
-@given(CHANGES)
+@given(CHANGES, st.sampled_from(["avif", "heic"]))
 @settings(max_examples=60, deadline=None)
-def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]]) -> None:
-    described_or_refused(with_hostile_fields(plain(".avif"), changes))
+def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]], kind: str) -> None:
+    data = plain(".avif") if kind == "avif" else by_pillow((64, 128), "HEIF")
+    read_with_neighbours(with_hostile_fields(data, changes), kind)
+
+
+@pytest.mark.slow
+@given(
+    st.integers(0, 3), st.lists(st.tuples(st.integers(0, 599), st.integers(0, 255)), max_size=6), st.integers(8, 9999)
+)
+@settings(max_examples=60, deadline=None)
+def test_any_bytes_of_a_file_are_read(number: int, places: list[tuple[int, int]], length: int) -> None:
+    """Sizes, types and offsets of RIFF chunks, TIFF entries and JPEG segments."""
+    changed = bytearray(sound_files((32, 64), xmp(full_sphere(32, 64)))[number])
+    for place, value in places:
+        changed[min(place, len(changed) - 1)] = value
+    read_with_neighbours(bytes(changed[:length]), ("jpg", "webp", "tif", "tif")[number])
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=3), hostile_exif())
@@ -165,7 +218,7 @@ def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]
 def test_any_stated_sizes_of_a_picture_are_read(sizes: list[tuple[int, int]], about: bytes) -> None:
     ispe = b"".join(struct.pack(">I4sIII", 20, b"ispe", 0, width, height) for width, height in sizes)
     ftyp = struct.pack(">I4s4sI4s", 20, b"ftyp", b"heic", 0, b"mif1")
-    described_or_refused(ftyp + ispe + struct.pack(">I4s", 8 + len(about), b"mdat") + b"Exif\0\0" + about)
+    read_with_neighbours(ftyp + ispe + struct.pack(">I4s", 8 + len(about), b"mdat") + b"Exif\0\0" + about, "heic")
 
 
 @cache
