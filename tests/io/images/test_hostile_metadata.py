@@ -207,7 +207,7 @@ def test_any_boxes_of_a_picture_are_read(changes: list[tuple[int, int, int, int]
 @settings(max_examples=60, deadline=None)
 def test_any_bytes_of_a_file_are_read(number: int, places: list[tuple[int, int]], length: int) -> None:
     """Sizes, types and offsets of RIFF chunks, TIFF entries and JPEG segments."""
-    changed = bytearray(sound_files((32, 64), xmp(full_sphere(32, 64)))[number])
+    changed = bytearray(sound_files((40, 80), xmp(full_sphere(40, 80)))[number])
     for place, value in places:
         changed[min(place, len(changed) - 1)] = value
     read_with_neighbours(bytes(changed[:length]), ("jpg", "webp", "tif", "tif")[number])
