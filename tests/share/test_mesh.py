@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.meshes import read_glb
+from pano_mvs.io.meshes import TexturedArrays, encoded_texture, read_glb, write_glb
 from pano_mvs.results.run_output import load
 from pano_mvs.share import share_run
 from pano_mvs.share.encoding import PIECE_FACES, VertexFacts, mesh_pieces, z_order
@@ -26,38 +25,14 @@ from tests.viewer.scenes import HALF
 GLB_FROM_WORLD = np.diag([1.0, -1.0, -1.0])
 
 
-def glb_bytes(mesh: SharedMesh, *, png: bool = True) -> bytes:
-    """Return a GLB file as `export.mesh_textured` writes it: y up, the origin of uv in the upper-left corner."""
+def written_glb(path: Path, mesh: SharedMesh) -> Path:
+    """Write a mesh as `export.mesh_textured` does: y up, the origin of uv in the upper-left corner."""
     assert mesh.uv is not None
     assert mesh.texture is not None
-    positions = (mesh.vertices @ GLB_FROM_WORLD.T).astype("<f4")
-    uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=-1).astype("<f4")
-    picture = cv2.imencode(".png" if png else ".jpg", mesh.texture[..., ::-1])[1].tobytes()
-    parts = [positions.tobytes(), uv.tobytes(), mesh.faces.astype("<u4").tobytes(), picture]
-    padded = [part + b"\0" * (-len(part) % 4) for part in parts]
-    starts = np.cumsum([0, *map(len, padded)]).tolist()
-    document = {
-        "asset": {"version": "2.0"},
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        "textures": [{"source": 0}],
-        "images": [{"bufferView": 3, "mimeType": "image/png"}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5126, "count": len(uv), "type": "VEC2"},
-            {"bufferView": 2, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
-        ],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": len(part)}
-            for start, part in zip(starts, parts, strict=False)
-        ],
-        "buffers": [{"byteLength": starts[-1]}],
-    }
-    head = json.dumps(document).encode()
-    head += b" " * (-len(head) % 4)
-    binary = b"".join(padded)
-    chunks = struct.pack("<II", len(head), 0x4E4F534A) + head + struct.pack("<II", len(binary), 0x004E4942) + binary
-    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+    positions = (mesh.vertices @ GLB_FROM_WORLD.T).astype(np.float32)
+    arrays = TexturedArrays(positions, np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=-1), mesh.faces)
+    write_glb(path, arrays, encoded_texture(mesh.texture, "png", quality=90), form="png")
+    return path
 
 
 def textured_box() -> SharedMesh:
@@ -109,7 +84,7 @@ def test_a_textured_mesh_comes_before_a_coloured_one(tmp_path: Path) -> None:
     assert colored is not None
     assert (colored.texture, note) == (None, "")
     expected = textured_box()
-    (run.out / "mesh_textured.glb").write_bytes(glb_bytes(expected))
+    written_glb(run.out / "mesh_textured.glb", expected)
     mesh, note = run_mesh(load(run.out))
     assert mesh is not None
     assert note == ""
@@ -127,7 +102,7 @@ def test_the_frame_of_the_textured_mesh_is_the_one_that_the_run_was_asked_for(
 ) -> None:
     run = box_run(tmp_path, points=500)
     expected = textured_box()
-    (run.out / "mesh_textured.glb").write_bytes(glb_bytes(expected))
+    written_glb(run.out / "mesh_textured.glb", expected)
     summary = json.loads((run.out / "run.json").read_text())
     summary["stages"].append({"name": "textured", "use": "export.mesh_textured", "params": {"frame": frame}})
     (run.out / "run.json").write_text(json.dumps(summary))
@@ -146,8 +121,8 @@ def test_the_frame_of_the_textured_mesh_is_the_one_that_the_run_was_asked_for(
 )
 def test_a_damaged_file_is_named_and_the_coloured_mesh_shown(tmp_path: Path, damage: Any, message: str) -> None:
     run = box_run(tmp_path, points=500, mesh=True)
-    path = run.out / "mesh_textured.glb"
-    path.write_bytes(damage(glb_bytes(textured_box())))
+    path = written_glb(run.out / "mesh_textured.glb", textured_box())
+    path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(InputError, match=message):
         read_glb(path)
     mesh, note = run_mesh(load(run.out))
@@ -245,7 +220,7 @@ def test_a_large_texture_is_reduced(tmp_path: Path) -> None:
     mesh = textured_box()
     assert mesh.texture is not None
     large = SharedMesh(mesh.vertices, mesh.faces, uv=mesh.uv, texture=np.zeros((8, 5000, 3), np.uint8))
-    (run.out / "mesh_textured.glb").write_bytes(glb_bytes(large))
+    written_glb(run.out / "mesh_textured.glb", large)
     share_run(load(run.out), tmp_path / "page")
     data = base64.b64decode(value_of(tmp_path / "page" / "data" / "mesh" / "texture.js"))
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
