@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,15 +22,7 @@ from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.paths import is_folder
 from pano_mvs.core.text import plural
 from pano_mvs.io.images.names import printable_name
-from pano_mvs.io.images.video import (
-    VideoInfo,
-    describe_video,
-    frames_between,
-    keyframe_file,
-    list_videos,
-    read_times,
-    store_times,
-)
+from pano_mvs.io.images.video import KeptFile, VideoInfo, describe_video, frames_between, list_videos, read_times
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.scene.stereo import StereoSetting
@@ -221,10 +214,8 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
         zenith_deg=params.zenith_deg,
     ).load_mask()
     code = digest_from_file(Path(str(keyframes.__file__)))
-    known = keyframe_file(
-        path,
-        [*vars(settings).values(), info.stereo, params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, code],
-    )
+    own = [*vars(settings).values(), info.stereo, params.start_s, params.end_s, usable.tobytes(), _MEASURED_PER_S, code]
+    known = KeptFile.of(path, "keyframes", own, suffix=".json")
     times = read_times(known)
     if times is None:
         frames = frames_between(
@@ -241,7 +232,7 @@ def _keyframes(path: Path, info: VideoInfo, params: VideoParams) -> list[float]:
             for time_s, frame in frames
         )
         times = [frame.time_s for frame in select_keyframes(small, settings, usable)]
-        store_times(known, times)
+        known.write(json.dumps(times).encode())
     if params.max_frames is not None and len(times) > params.max_frames:
         kept = np.linspace(0, len(times) - 1, params.max_frames).round().astype(int)
         times = [times[idx] for idx in kept]

@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import InputError, StoreError
-from pano_mvs.core.files import read_regular, replacing
-from pano_mvs.io.images.video import file_of_state
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.images.video import KeptFile
 from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_file import MAX_PIXELS, decode_picture
 from pano_mvs.scene.image_header import stated_size
@@ -81,19 +80,18 @@ def _magnitudes(path: Path, max_pixels: int, *, read: bool) -> NDArray[np.float3
 
     They are stored among the user's caches for the next command.
     """
-    kept = file_of_state(path, "copies", [*_SIZE_HW, _SAMPLES], suffix=".f2")
-    if kept is not None:
-        with suppress(OSError, ValueError):
-            stored = np.frombuffer(read_regular(kept), "<f2")
-            if stored.shape == (_SAMPLES,) and np.isfinite(stored).all():
-                return stored.astype(np.float32)
+    kept = KeptFile.of(path, "copies", [*_SIZE_HW, _SAMPLES], suffix=".f2")
+    with suppress(ValueError):
+        stored = np.frombuffer(kept.read(), "<f2")
+        if stored.shape == (_SAMPLES,) and np.isfinite(stored).all():
+            return stored.astype(np.float32)
     found = np.zeros(_SAMPLES, np.float32)
     if not read:
         return found
     if (picture := _decoded(path, max_pixels)) is not None:
         sampled = np.abs(_spectrum(picture))[_sampled_places()]
         found = np.asarray(sampled / max(float(np.linalg.norm(sampled)), 1e-12), np.float32)
-        _keep(kept, found.astype("<f2").tobytes())
+        kept.write(found.astype("<f2").tobytes())
     return found
 
 
@@ -119,15 +117,14 @@ def _spectrum(picture: NDArray[np.uint8]) -> NDArray[np.complex64]:
 
 def _reduced(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
     """Return a picture in grey at `_SIZE_HW`, stored among the user's caches for the next command; None if unread."""
-    kept = file_of_state(path, "copies", [*_SIZE_HW], suffix=".png")
-    if kept is not None:
-        with suppress(OSError):
-            picture = cv2.imdecode(np.fromfile(kept, np.uint8), cv2.IMREAD_GRAYSCALE)
-            if picture is not None and picture.shape == _SIZE_HW:
-                return np.asarray(picture, np.uint8)
+    kept = KeptFile.of(path, "copies", [*_SIZE_HW], suffix=".png")
+    if data := kept.read():
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if picture is not None and picture.shape == _SIZE_HW:
+            return np.asarray(picture, np.uint8)
     small = _decoded(path, max_pixels)
     if small is not None:
-        _keep(kept, cv2.imencode(".png", small)[1].tobytes())
+        kept.write(cv2.imencode(".png", small)[1].tobytes())
     return small
 
 
@@ -141,9 +138,3 @@ def _decoded(path: Path, max_pixels: int) -> NDArray[np.uint8] | None:
         if decoded is not None:
             return np.asarray(cv2.resize(decoded, _SIZE_HW[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     return None
-
-
-def _keep(path: Path | None, data: bytes) -> None:
-    if path is not None:
-        with suppress(OSError, StoreError), replacing(path) as temporary:
-            temporary.write_bytes(data)
