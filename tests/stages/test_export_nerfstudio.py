@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,18 +13,17 @@ import PIL.Image
 import pytest
 from scipy.spatial import cKDTree
 
-from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
-from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.api import FilePart, InputError, Panorama, Poses, RangeMap
 from pano_mvs.io import splats
-from pano_mvs.io.ply import open_ply_points, read_ply
+from pano_mvs.io.ply import open_ply_points
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.splats import NerfstudioFrame, NerfstudioFrames
+from pano_mvs.io.splats import NerfstudioFrame
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.stages.exports.nerfstudio import NerfstudioFramesParams, NerfstudioParams, nerfstudio, nerfstudio_frames
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import documented_rays, world_points
+from tests.stages.published_frames import published, scratch_in, true_ranges
 from tests.stored import read_picture
 
 HEIGHT, WIDTH = 192, 384
@@ -37,37 +36,19 @@ def exported(
     folder: Path,
     *,
     images: dict[str, Panorama] | None = None,
-    settings: dict[str, Any] | None = None,
-    cloud: PointCloud | None = None,
-    seed_points: int = 100,
     frame: Literal["upright", "world"] = "upright",
 ) -> Path:
     """Write both variants with true ranges everywhere, as a run would, and return the folder nerfstudio/."""
-    images = images or capture.images
-    store = Store(folder / "cache")
-    publisher = Publisher(folder / "out", store)
-    publisher.name_items(capture.names)
-    frames = {}
-    for idx, name in enumerate(capture.names):
-        scratch = folder / f"scratch_{idx}"
-        scratch.mkdir()
-        everywhere = RangeMap(capture.ranges[idx], np.full(capture.ranges[idx].shape, 200, np.uint8))
-        params = NerfstudioFramesParams.model_validate(settings or {})
-        made = nerfstudio_frames(images[name], everywhere, params, Context(np.random.default_rng(0), scratch))
-        ref = store.put_value(made)
-        publisher.publish("frames", name, ref)
-        read = store.load(ref, NerfstudioFrames)
-        assert isinstance(read, NerfstudioFrames)
-        frames[name] = read
-    scratch = folder / "scratch"
-    scratch.mkdir()
-    poses = capture.whole(Poses)
-    seeds = NerfstudioParams(seed_points=seed_points, frame=frame)
-    files = nerfstudio(
-        frames, poses, cloud, capture.whole(Photographs), seeds, Context(np.random.default_rng(0), scratch)
+    given, ranges = images or capture.images, true_ranges(capture)
+    params, seeds = NerfstudioFramesParams(), NerfstudioParams(seed_points=100, frame=frame)
+    poses, photographs = capture.whole(Poses), capture.whole(Photographs)
+    out = published(
+        folder,
+        capture.names,
+        lambda name, ctx: nerfstudio_frames(given[name], ranges[name], params, ctx),
+        whole=lambda frames, ctx: nerfstudio(frames, poses, None, photographs, seeds, ctx),
     )
-    publisher.publish("nerfstudio", "", store.put_value(files))
-    return folder / "out" / "nerfstudio"
+    return out / "nerfstudio"
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +123,12 @@ def test_cameras_and_points_have_z_up_together(plain: Path) -> None:
         x, y, z = pose.center
         np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], [x, z, -y], atol=1e-12)
     x, y, z = tiny_capture(PLAIN).points_in_world.T
-    seed = open_ply_points(plain / "equirectangular" / document["ply_file_path"])
-    in_file = np.stack([seed.vertices[name] for name in "xyz"], axis=-1)
-    assert np.max(cKDTree(np.stack([x, z, -y], axis=-1)).query(in_file)[0]) < 1e-5
+    for variant in ("equirectangular", "faces"):
+        seed = open_ply_points(plain / variant / document["ply_file_path"])
+        assert 85 <= seed.count <= 100
+        in_file = np.stack([seed.vertices[name] for name in "xyz"], axis=-1)
+        assert np.max(cKDTree(np.stack([x, z, -y], axis=-1)).query(in_file)[0]) < 1e-5
+        assert np.max(cKDTree(np.stack([x, y, z], axis=-1)).query(next(seed.chunks()))[0]) < 1e-5
 
 
 def test_the_world_frame_can_be_kept(tmp_path: Path) -> None:
@@ -188,16 +172,6 @@ def test_the_file_says_what_nerfstudio_looks_for(plain: Path) -> None:
             assert (plain / variant / frame["file_path"]).is_file()
     document = json.loads((plain / "equirectangular" / "transforms.json").read_text())
     assert (document["w"], document["h"], document["fl_x"], document["fl_y"]) == (WIDTH, HEIGHT, WIDTH / 2, HEIGHT)
-
-
-def test_seed_points_are_in_the_world_of_the_cameras(plain: Path) -> None:
-    """Without a cloud the sparse points are taken, which lie on the walls."""
-    for variant in ("equirectangular", "faces"):
-        document = json.loads((plain / variant / "transforms.json").read_text())
-        seed = read_ply(plain / variant / document["ply_file_path"])
-        assert 85 <= len(seed) <= 100
-        sparse = tiny_capture(PLAIN).points_in_world
-        assert np.max(cKDTree(sparse).query(seed.points_in_world)[0]) < 1e-5
 
 
 def test_a_picture_is_delivered_as_it_is_and_not_kept_twice(plain: Path) -> None:
@@ -258,11 +232,9 @@ def test_cropped_and_scaled_panoramas_are_written_whole(tmp_path: Path) -> None:
     capture = tiny_capture(Variant((64, 128), cropped=True))
     images = dict(capture.images)
     images["001.png"] = replace(tiny_capture(PLAIN).images["001.png"], size_hw=(32, 64))
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
     for image, size_hw in ((images["000.png"], (64, 128)), (images["001.png"], (32, 64))):
         params = NerfstudioFramesParams(variants=("equirectangular",), image_format="png")
-        made = nerfstudio_frames(image, None, params, Context(np.random.default_rng(0), scratch))
+        made = nerfstudio_frames(image, None, params, scratch_in(tmp_path))
         assert not made.pictures
         path = made.files["nerfstudio/equirectangular/images/{name}.png"]
         picture = read_picture(path)[..., ::-1]
@@ -291,7 +263,7 @@ def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
     far[:96] = 2
     doubtful = np.full((HEIGHT, WIDTH), 200, np.uint8)
     doubtful[:48] = 40
-    ctx = Context(np.random.default_rng(0), tmp_path)
+    ctx = scratch_in(tmp_path)
     params = NerfstudioFramesParams(variants=("equirectangular",))
     made = nerfstudio_frames(image, RangeMap(far, doubtful), params, ctx)
     steps = read_picture(made.files["nerfstudio/equirectangular/depths/{name}.png"], cv2.IMREAD_UNCHANGED)
@@ -305,10 +277,9 @@ def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
 def test_panoramas_without_frames_are_told_and_none_at_all_is_refused(tmp_path: Path) -> None:
     capture = tiny_capture(PLAIN)
     poses = capture.whole(Poses)
-    (tmp_path / "a").mkdir()
     params = NerfstudioFramesParams.model_validate({"variants": ("faces",), "size_px": 32})
-    made = nerfstudio_frames(capture.images["002.png"], None, params, Context(np.random.default_rng(0), tmp_path / "a"))
-    ctx = Context(np.random.default_rng(0), tmp_path)
+    made = nerfstudio_frames(capture.images["002.png"], None, params, scratch_in(tmp_path / "a"))
+    ctx = scratch_in(tmp_path)
     files = nerfstudio({"002.png": made}, poses, None, None, NerfstudioParams(seed_points=0), ctx).files
     assert set(files) == {"nerfstudio/faces/transforms.json"}
     document = json.loads(files["nerfstudio/faces/transforms.json"].read_text())
@@ -331,11 +302,9 @@ def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:
     PIL.Image.open(image.image.path).convert("CMYK").save(tmp_path / "cmyk.jpg")
     PIL.Image.open(image.image.path).convert("L").save(tmp_path / "grey.jpg")
     for idx, name in enumerate(("deep.png", "grey.png", "cmyk.jpg", "grey.jpg")):
-        scratch = tmp_path / str(idx)
-        scratch.mkdir()
         given = replace(image, image=FilePart(tmp_path / name, external=True))
         params = NerfstudioFramesParams(variants=("equirectangular",))
-        made = nerfstudio_frames(given, None, params, Context(np.random.default_rng(0), scratch))
+        made = nerfstudio_frames(given, None, params, scratch_in(tmp_path / str(idx)))
         assert list(made.files) == ["nerfstudio/equirectangular/images/{name}.jpg"]
 
 

@@ -13,9 +13,7 @@ import pycolmap
 import pytest
 
 from pano_mvs.api import (
-    Context,
     FilePart,
-    InputError,
     Panorama,
     PointCloud,
     Poses,
@@ -25,18 +23,16 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.arrays import FloatArray
-from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.geometry import rotation_from_rotvec
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.ranges import read_confidence_png, read_normals
-from pano_mvs.io.splats import SplatFrames
 from pano_mvs.scene.photographs import Photographs
 from pano_mvs.scene.surfaces import TrackedPoints
 from pano_mvs.stages.exports.splat_bundle import SplatBundleParams, SplatFramesParams, splat_bundle, splat_frames
 from pano_mvs.testing.room import default_room, range_along
-from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.oracles.nerfstudio import world_points
+from tests.stages.published_frames import published, true_ranges
 from tests.stored import read_picture
 from tests.synthetic.photograph import render_photograph
 
@@ -58,32 +54,14 @@ def delivered(
     **settings: Any,
 ) -> Path:
     """Write a bundle as a run does, through the store, and return its folder."""
-    store = Store(folder / "cache")
-    publisher = Publisher(folder / "out", store)
-    publisher.name_items(tuple(images))
-    params = SplatFramesParams.model_validate(settings)
-    frames = {}
-    for number, name in enumerate(ranges):
-        scratch = folder / f"scratch_{number}"
-        scratch.mkdir()
-        made = splat_frames(images[name], ranges[name], params, Context(np.random.default_rng(0), scratch))
-        ref = store.put_value(made)
-        publisher.publish("frames", name, ref)
-        read = store.load(ref, SplatFrames)
-        assert isinstance(read, SplatFrames)
-        frames[name] = read
-    (folder / "scratch").mkdir()
-    ctx = Context(np.random.default_rng(0), folder / "scratch")
-    files = splat_bundle(frames, poses, cloud, points, photographs, SplatBundleParams(photographs=listed), ctx)
-    publisher.publish("bundle", "", store.put_value(files))
-    return folder / "out" / "splat_bundle"
-
-
-def true_ranges(capture: TinyCapture) -> dict[str, RangeMap]:
-    return {
-        name: RangeMap(ranges, np.full(ranges.shape, 200, np.uint8))
-        for name, ranges in zip(capture.names, capture.ranges, strict=True)
-    }
+    params, bundle = SplatFramesParams.model_validate(settings), SplatBundleParams(photographs=listed)
+    out = published(
+        folder,
+        list(ranges),
+        lambda name, ctx: splat_frames(images[name], ranges[name], params, ctx),
+        whole=lambda frames, ctx: splat_bundle(frames, poses, cloud, points, photographs, bundle, ctx),
+    )
+    return out / "splat_bundle"
 
 
 @pytest.fixture(scope="module")
@@ -485,9 +463,3 @@ def test_layers_that_are_not_wanted_are_null(tmp_path: Path) -> None:
         assert view["confidence"] is None
         assert view["depth"]
     assert not (folder / "faces" / "normals").exists()
-
-
-def test_without_frames_there_is_no_bundle(tmp_path: Path) -> None:
-    poses = tiny_capture(Variant((64, 128))).whole(Poses)
-    with pytest.raises(InputError, match="no panorama has both a pose and frames"):
-        splat_bundle({}, poses, None, None, None, SplatBundleParams(), Context(np.random.default_rng(0), tmp_path))
