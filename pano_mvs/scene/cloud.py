@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import ClassVar
 
@@ -70,7 +70,8 @@ class PointCloud(Record):
     def some(self, chosen: slice | NDArray[np.bool_] | NDArray[np.integer]) -> PointCloud:
         """Return the points at a slice, a mask or positions, as one group."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "group_sizes"}
-        return PointCloud(**{name: None if array is None else array[chosen] for name, array in arrays.items()})
+        some = {name: array[chosen] for name, array in arrays.items() if array is not None}
+        return replace(self, group_sizes=(), **some)
 
     @staticmethod
     def of_groups(clouds: Sequence[PointCloud]) -> PointCloud:

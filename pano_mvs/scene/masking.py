@@ -146,7 +146,7 @@ def nearest_pixels(pixels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray
     rows, columns = (
         (2 * np.arange(new) + 1) * old // (2 * new) for new, old in zip(size_hw, pixels.shape, strict=True)
     )
-    return pixels[rows[:, None], columns]
+    return np.asarray(pixels[rows[:, None], columns])
 
 
 def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
