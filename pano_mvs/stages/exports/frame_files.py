@@ -210,7 +210,11 @@ class PosedGroup:
 
     @staticmethod
     def all_of(
-        poses: Poses, frames: Mapping[str, PanoramaFrames], cloud: PointCloud | None, photographs: Photographs | None
+        poses: Poses,
+        frames: Mapping[str, PanoramaFrames],
+        cloud: PointCloud | None,
+        *,
+        photographs: Photographs | None,
     ) -> list[PosedGroup]:
         """Return all groups of the poses; photographs are in the world of the first."""
         clouds = [] if cloud is None else cloud.groups()
@@ -264,12 +268,12 @@ def write_transforms(
     seed_name = "" if seed is None else group_file("seed.ply", group.number)
     cameras = poses.cameras
 
-    def write(name: str, variant: Variant, frames: list[PosedFrame], about: Mapping[str, Any]) -> None:
+    def write(name: str, variant: Variant, frames: list[PosedFrame], **about: str) -> None:
         document = transforms_document(
             variant,
             frames,
             depth_unit=group.depth_unit,
-            about={**about, "world_frame": poses.frame},
+            about=about | {"world_frame": poses.frame},
             file_from_world=file_from_world,
             seed=seed_name,
         )
@@ -280,7 +284,7 @@ def write_transforms(
     for variant, listed in group.listed().items():
         frames = [(name, cameras[name], frame) for name, frame in listed]
         unit = "metre" if poses.metric else poses.scale
-        write(group_file("transforms.json", group.number), variant, frames, {"scene_unit": unit})
+        write(group_file("transforms.json", group.number), variant, frames, scene_unit=unit)
         if seed is not None:
             files[f"{root}/{variant}/{seed_name}"] = seed
         ctx.metric(variant, ctx.metrics.get(variant, 0) + len(listed))
@@ -290,7 +294,7 @@ def write_transforms(
                 f"{root}/faces/{frame.image}": picture.path
                 for (*_, frame), picture in zip(shown, group.photographs.pictures, strict=True)
             }
-            write("transforms_photographs.json", "faces", frames + shown, {})
+            write("transforms_photographs.json", "faces", frames + shown)
     return files
 
 

@@ -78,7 +78,7 @@ def nerfstudio(
     """
     loaded = frames_with_poses(poses, frames, ctx)
     files: dict[str, Path] = {}
-    groups = PosedGroup.all_of(poses, loaded, cloud, photographs)
+    groups = PosedGroup.all_of(poses, loaded, cloud, photographs=photographs)
     for group in groups:
         if group.frames:
             (turn,) = files_from_world(params, group.poses, groups=1)

@@ -151,7 +151,7 @@ def splat_bundle(
     views: list[BundleView] = []
     shown = photographs if params.photographs else None
     taken = None if shown is None else _taken(shown, loaded, ctx)
-    groups = PosedGroup.all_of(poses, loaded, cloud, taken)
+    groups = PosedGroup.all_of(poses, loaded, cloud, photographs=taken)
     for group, with_points in zip(groups, split_groups(joined), strict=True):
         written: dict[str, Path] = {}
         if group.frames:
