@@ -44,18 +44,23 @@ def people_below(seen: SeenPanorama, min_area_deg2: float) -> Mask:
     probable = [each.on_map(seen.probability(each)) for each in narrow]
     if not _areas_below(np.mean(probable, axis=0), min_area_deg2):
         return nobody
-    outlined = [each.on_map(seen.outline(each)) for each in narrow]
+    middles = [seen.middle(each) for each in narrow]
+    outlined = [each.on_map(outline) for each, (_, outline) in zip(narrow, middles, strict=True)]
     areas = _areas_below(_mean_map([*probable, *outlined], narrow * 2), min_area_deg2)
     if not any(_likely(probable, outlined, area, min_outline=_MIN_NARROW_OUTLINE) for area in areas):
         return nobody
     probable += [each.on_map(seen.probability(each)) for each in wide]
-    outlined += [each.on_map(seen.outline(each)) for each in wide]
+    middles += [seen.middle(each) for each in wide]
+    outlined = [each.on_map(outline) for each, (_, outline) in zip(narrow + wide, middles, strict=True)]
     areas = _areas_below(_mean_map([*probable, *outlined], (narrow + wide) * 2), min_area_deg2)
-    areas = [area for area in areas if _likely(probable, outlined, area, min_outline=_MIN_OUTLINE)]
-    if not areas:
-        return nobody
-    accepted = [area for area in areas if _accepted(seen, probable, outlined, area=area)]
-    return np.logical_or.reduce(accepted) if accepted else nobody
+    present = max(presence for presence, _ in middles)
+    accepted = [
+        area
+        for area in areas
+        if _likely(probable, outlined, area, min_outline=_MIN_OUTLINE)
+        and _accepted(probable, outlined, area, present=present)
+    ]
+    return np.asarray(np.logical_or.reduce([nobody, *accepted]))
 
 
 def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline: float) -> bool:
@@ -70,16 +75,17 @@ def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline
     return bool(np.mean(found) >= 0.75 and min(found) >= 0.5)
 
 
-def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, area: Mask) -> bool:
-    """Return whether an area that is likely is a person, or what is fixed below the camera."""
+def _accepted(probable: list[Map], outlined: list[Map], area: Mask, *, present: float) -> bool:
+    """Return whether an area that is likely is a person, or what is fixed below the camera.
+
+    `present`: how likely the views show a person, at most.
+    """
     at_nadir = off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG
     if at_nadir and np.mean(_means(outlined, area)) >= _CERTAIN_OUTLINE:
         return True
     # The wide views may fail if one of the views shows a person for certain.
     wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= 0.6
-    least = 0.5 if at_nadir or wide_agree else 0.9
-    narrow, wide = _looks()
-    return any(seen.presence(each) >= least for each in narrow + wide)
+    return present >= (0.5 if at_nadir or wide_agree else 0.9)
 
 
 def _areas_below(mean: Map, min_area_deg2: float) -> list[Mask]:
@@ -174,7 +180,7 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
     else:
         looks = [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in (-12.0, 12.0)]
     first = looks[0].on_map(seen.probability(looks[0]))
-    if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= 0.6 for each in looks):
+    if _mean_in(first, reduced) < least / 2 or not any(seen.middle(each)[0] >= 0.6 for each in looks):
         return 0.0, np.zeros_like(area)
     maps = [first, *(each.on_map(seen.probability(each)) for each in looks[1:])]
     maps += [each.on_map(seen.probability(each, mirrored=True)) for each in looks]

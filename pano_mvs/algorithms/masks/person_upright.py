@@ -16,14 +16,14 @@ from pano_mvs.core.arrays import FloatArray, Mask
 
 # The views in which people are looked for.
 _RING, _RING_FOV_DEG, _RING_ELEVATION_DEG = 8, 85.0, -12.0
-# Rolls in degrees, whether mirrored, how much wider, and by which share of its height lower, of the views that have to
-# agree; and of views in which somebody who is seen down to the waist is detected, since that is what they are lower by.
-_AGAIN = ((0.0, False, 1.0, 0.0), (12.0, True, 1.0, 0.0), (-12.0, False, 1.2, 0.0))
-_TO_THE_WAIST = ((0.0, False, 1.33, 0.5), (0.0, True, 1.33, 0.5), (0.0, False, 1.67, 0.5), (0.0, True, 1.67, 0.5))
+# Rolls in degrees, whether mirrored, and how much wider, of the views that have to agree.
+_AGAIN = ((0.0, False, 1.0), (12.0, True, 1.0), (-12.0, False, 1.2))
+# How much wider the views are in which somebody who is seen down to the waist is detected, half a height lower.
+_TO_THE_WAIST = (1.33, 1.67)
 # The probability of a person: in the first view of a candidate, and of a person.
 _MIN_FIRST, _MIN_PROBABILITY = 0.1, 0.65
 # People are taller than wide; tables and benches are not.
-_MIN_FIRST_ASPECT, _MIN_ASPECT = 0.5, 1.15
+_MIN_ASPECT = 1.15
 _BELONGS = 0.5
 
 
@@ -62,8 +62,8 @@ def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, pas
     `passers_by`: whether to find people whose feet are far from the camera.
     """
     found = known.copy()
-    candidates = [_candidate(seen.outline(each), each) for each in _ring()]
-    possible = [each for each in candidates if each is not None and _may_be_person(each, _MIN_FIRST_ASPECT)]
+    candidates = [_candidate(seen.middle(each)[1], each) for each in _ring()]
+    possible = [each for each in candidates if each is not None and _stands(each)]
     tried: list[_Candidate] = []
     # Time is limited: at most this many candidates are looked at.
     for each in sorted(possible, key=lambda candidate: -candidate.score)[:8]:
@@ -104,8 +104,8 @@ def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, t
         view = _look_at(candidate)
         if idx == 0 and _probability_in(candidate, seen.probability(view), view) < _MIN_FIRST:
             return nobody
-        again = _candidate(seen.outline(view), view)
-        if again is None or not _may_be_person(again, _MIN_FIRST_ASPECT):
+        again = _candidate(seen.middle(view)[1], view)
+        if again is None or not _stands(again):
             return nobody
         grows = again.extent_deg > 1.25 * candidate.extent_deg
         candidate = again
@@ -113,7 +113,7 @@ def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, t
             break
     tried.append(candidate)
     # The feet of the operator are at least so far below the horizon.
-    if not _may_be_person(candidate, _MIN_ASPECT) or (not passers_by and candidate.span_deg[0] > -40.0):
+    if candidate.aspect < _MIN_ASPECT or (not passers_by and candidate.span_deg[0] > -40.0):
         return nobody
     mean = _seen_again(seen, candidate)
     if mean is None:
@@ -129,29 +129,21 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
     probability = _probability_in(candidate, seen.probability(first), first)
     if probability < _MIN_PROBABILITY:
         return None
-    if not _is_present(seen, candidate, _AGAIN) and (
-        probability < 0.75 or not _is_present(seen, candidate, _TO_THE_WAIST)
-    ):
-        return None
-    outlines = []
-    for roll_deg, mirrored, wider, _ in _AGAIN:
+    presences, outlines = [], []
+    for roll_deg, mirrored, wider in _AGAIN:
         view = _look_at(candidate, roll_deg, wider)
-        outlines.append(view.on_map(seen.outline(view, mirrored=mirrored)))
+        presence, outline = seen.middle(view, mirrored=mirrored)
+        presences.append(presence)
+        outlines.append(view.on_map(outline))
+    # A person is detected in all views but one, or, as seen down to the waist, in all of those but one.
+    if sum(presence < 0.5 for presence in presences) > 1:
+        lower = [_look_at(candidate, wider=wider, lower=0.5) for wider in _TO_THE_WAIST]
+        missed = [seen.middle(view, mirrored=mirrored)[0] < 0.5 for view in lower for mirrored in (False, True)]
+        if probability < 0.75 or sum(missed) > 1:
+            return None
     mean = np.asarray(np.mean(outlines, axis=0), np.float32)
     overlaps = [_overlap(each > _BELONGS, mean > _BELONGS) for each in outlines]
     return mean if np.mean(overlaps) >= 0.72 else None
-
-
-def _is_present(seen: SeenPanorama, candidate: _Candidate, views: tuple[tuple[float, bool, float, float], ...]) -> bool:
-    """Return whether a person is detected in all views of a candidate but one."""
-    missed = 0
-    for roll_deg, mirrored, wider, lower in views:
-        view = _look_at(candidate, roll_deg, wider, lower=lower)
-        # A person is detected in most of the views.
-        missed += seen.presence(view, mirrored=mirrored) < 0.5
-        if missed > 1:
-            return False
-    return True
 
 
 def _look_at(candidate: _Candidate, roll_deg: float = 0.0, wider: float = 1.0, *, lower: float = 0.0) -> Look:
@@ -172,13 +164,12 @@ def _probability_in(candidate: _Candidate, probability: Map, view: Look) -> floa
     return float(probability[y[inside], x[inside]].mean()) if inside.any() else 0.0
 
 
-def _may_be_person(candidate: _Candidate, min_aspect: float) -> bool:
-    """Return whether a candidate is upright and stands on the ground, and is not furniture or a part of a facade."""
+def _stands(candidate: _Candidate) -> bool:
+    """Return whether a candidate may stand on the ground, and is not a part of a facade."""
     feet_deg, head_deg = candidate.span_deg
     # People stand on the ground: their heads are not much farther above the horizon than their feet are below it. Those
     # beside the camera may be taller than it, and may be seen in part.
-    stands = feet_deg < -30.0 or head_deg < 4.0 - 0.8 * feet_deg
-    return stands and candidate.aspect >= min_aspect
+    return feet_deg < -30.0 or head_deg < 4.0 - 0.8 * feet_deg
 
 
 def _same(first: _Candidate, second: _Candidate) -> bool:
