@@ -21,8 +21,7 @@ Plane = NDArray[np.float32]
 
 # Ranges that agree within this share are of one surface.
 _SAME = 0.06
-# The ground is a plane through points this far below the horizon, as flat as this.
-_GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
+_MIN_GROUND_POINTS = 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +113,8 @@ def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
 
 def _low_points(ranges: Plane) -> FloatArray:
     rays = ray_grid((ranges.shape[0], ranges.shape[1]))
-    low = np.isfinite(ranges) & (rays[..., 1] > np.sin(np.radians(_GROUND_FROM_DEG)))
+    # The ground is a plane through points this far below the horizon, and tilted by no more.
+    low = np.isfinite(ranges) & (rays[..., 1] > np.sin(np.radians(20.0)))
     return np.asarray(rays[low] * ranges[low, None])
 
 
@@ -125,7 +125,7 @@ def _plane_through(three: FloatArray) -> FloatArray | None:
         return None
     normal /= length * np.sign(normal[1] or 1)
     height = float(normal @ three[0])
-    return np.append(normal, height) if normal[1] > np.cos(np.radians(_MAX_TILT_DEG)) and height > 0 else None
+    return np.append(normal, height) if normal[1] > np.cos(np.radians(20.0)) and height > 0 else None
 
 
 def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:
