@@ -19,8 +19,7 @@ from pano_mvs.algorithms.masks.areas import (
     reduced_to_width,
 )
 from pano_mvs.algorithms.masks.sky_coefficients import FIRST, LATER
-from pano_mvs.algorithms.masks.sky_comparison import compare_with_source
-from pano_mvs.algorithms.masks.sky_features import Labels, View, area_features
+from pano_mvs.algorithms.masks.sky_features import Labels, View, area_features, compare_with_source
 from pano_mvs.algorithms.panoramas import box_sum, contrast_around, filtered, largest_channel, nearest_resized
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.errors import UsageError
