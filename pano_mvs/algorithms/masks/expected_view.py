@@ -56,7 +56,7 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
 
     A surface is expected where the ranges of two of them agree, or on the plane of the ground. The colours of those
     that see it, after a factor per channel, and the lightest and the darkest colours within 1.4°, are what can be
-    expected there. Where the panorama's own ranges are confirmed, what the views show at these is expected as well.
+    expected there.
 
     `picture`: (H, W, 3) uint8 RGB, the reference. `range_map`: its ranges, of the same size. `others`: views around it,
     of the same size.
@@ -79,12 +79,6 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     colors, own = [_colors_around(other.picture) for other in others], mean_around(picture)
     difference, expected = _differences(own, ranges, others, around=colors, colors_at=ground)
     ratio = (own + DARK_LEVEL) / (expected + DARK_LEVEL)
-    # Such as a chair beside the camera that others hardly see.
-    nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
-    if nearer.any():
-        measured = np.where(nearer, known, np.float32(np.nan))
-        at_these = _differences(own, measured, others, around=colors, colors_at=np.zeros_like(nearer))[0]
-        difference = np.fmin(difference, at_these)
     height = float("nan") if plane is None else float(plane[3])
     return Expected(ranges, ground, difference, ratio, height)
 

@@ -13,7 +13,6 @@ from pano_mvs.algorithms.masks.areas import (
     area_labels,
     area_sizes,
     border_shares,
-    closed_areas,
     dilated,
     off_nadir_deg,
     opened_areas,
@@ -101,8 +100,6 @@ def moving_pixels(
             found |= area
         else:
             found |= _person_in(seen, area, passers_by=passers_by)
-    if found.any():
-        found = _without_gaps(found)
     cast = nothing
     if shadows:  # those that touch what is found
         labels = area_labels(np.asarray(shadow & ~(found | ~valid)))
@@ -182,11 +179,3 @@ def _has_ceiling(expected: Expected) -> bool:
     known = above[np.isfinite(above)]
     # There are no vehicles in rooms: the ceiling is at most as many heights of the camera away.
     return bool(len(known) > 0.5 * len(above) and np.median(known) < 4 * expected.height)
-
-
-def _without_gaps(found: Mask) -> Mask:
-    """Return areas with gaps of up to two degrees closed, and holes filled."""
-    closed = closed_areas(found, max(1, round(len(found) / 180)))
-    labels, weights = area_labels(~closed), pixel_weights(found.shape)
-    small = area_sizes(labels, weights) < 0.3 * weights[found].sum()
-    return np.asarray(closed | ((labels >= 0) & small[labels]))
