@@ -19,8 +19,6 @@ REDUCED_HW = (128, 256)
 """Size of the panoramas in which motion is measured."""
 
 _PAD = 24  # columns that are repeated on each side of the seam
-_MAX_POINTS, _MIN_DISTANCE, _QUALITY = 160, 6, 0.005
-_WINDOW = (11, 11)
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,12 @@ class ParallaxTracker:
         """Set the frame, (128, 256) uint8, to which others are compared."""
         self._template = _padded(grey)
         found = cv2.goodFeaturesToTrack(
-            self._template, _MAX_POINTS, _QUALITY, _MIN_DISTANCE, mask=self._usable, useHarrisDetector=False
+            self._template,
+            maxCorners=160,
+            qualityLevel=0.005,
+            minDistance=6,
+            mask=self._usable,
+            useHarrisDetector=False,
         )
         self._corners = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
         self._bearings = _bearings(self._corners)
@@ -132,7 +135,7 @@ def _flow(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the positions (N, 2) of points of one image in another one, and which were found."""
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, points, guess, winSize=_WINDOW, maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        first, second, points, guess, winSize=(11, 11), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     return found, status.ravel() > 0
 

@@ -13,8 +13,7 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.settings import check_settings, setting
 from pano_mvs.scene import PointCloud
 
-# The nearest point of each cell and its neighbours hides points that are further away by more than this share.
-_CELLS, _HIDDEN = 200, 0.08
+_CELLS = 200
 _MIN_POINTS = 200
 _CORRELATED = (0.8, 0.95)
 
@@ -103,7 +102,8 @@ def _visible(
     np.minimum.at(nearest, (row, column), distance.astype(np.float32))
     nearest = np.asarray(cv2.erode(nearest, np.ones((3, 3), np.uint8)), np.float32)
     cosine = (cloud.normals_in_world[inside] * view).sum(axis=1) / distance
-    open_to = (distance <= (1 + _HIDDEN) * nearest[row, column]) & (cosine > 0.15)
+    # The nearest point of each cell and its neighbours hides points that are further away by more than this share.
+    open_to = (distance <= (1 + 0.08) * nearest[row, column]) & (cosine > 0.15)
     weights = cosine * (camera.focal_px / distance) ** 2
     return inside[open_to], pixels[open_to], weights[open_to]
 
@@ -164,7 +164,6 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     return offset, slope
 
 
-_ROUNDS = 50
 _ROWS_AT_ONCE = 64
 
 
@@ -203,7 +202,7 @@ def _focal_px(half: NDArray[np.float64], focal_px: float, radial: float) -> floa
     high = max(focal_px * (1 + max(radial, 0) * (diagonal / focal_px) ** 2), low)
     if _is_inside(half / low, half / focal_px, radial):
         return low
-    for _ in range(_ROUNDS):
+    for _ in range(50):
         middle = (low + high) / 2
         low, high = (low, middle) if _is_inside(half / middle, half / focal_px, radial) else (middle, high)
     return high

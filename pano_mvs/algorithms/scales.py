@@ -25,8 +25,7 @@ from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
 
-# Details are compared where the picture has most texture, because elsewhere they are noise.
-_BLOCK_PX, _TEXTURED_SHARE = 16, 0.25
+_BLOCK_PX = 16
 _MAX_HALVINGS = 2
 # Pixels on one surface differ by less than this share of their range.
 _SURFACE_STEP = 0.025
@@ -180,7 +179,8 @@ def _relative_detail(fine: FloatImage, coarse: FloatImage) -> float:
         return 1.0
     shape = np.minimum(finer.shape, coarser.shape)
     finer, coarser = finer[: shape[0], : shape[1]], coarser[: shape[0], : shape[1]]
-    textured = coarser >= np.quantile(coarser, 1 - _TEXTURED_SHARE)
+    # Details are compared where the picture has most texture, because elsewhere they are noise.
+    textured = coarser >= np.quantile(coarser, 1 - 0.25)
     energy = float(coarser[textured].mean())
     # The plainest blocks contain nothing but noise.
     noise = float(np.quantile(finer, 0.1))
@@ -194,10 +194,11 @@ def _energy(detail: FloatImage, side: int) -> FloatImage:
     return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
 
 
-# Detail is measured within this many pixels; less than this multiple of the noise is noise.
-_RADIUS_PX, _DETAIL_OVER_NOISE = 7, 3.0
-# The plainest pixels contain only noise. Those with less, in grey levels, are overexposed or painted.
-_PLAIN_PIXELS_SHARE, _LEAST_NOISE = 0.05, 0.2
+_RADIUS_PX = 7
+"""Detail is measured within this many pixels."""
+
+_LEAST_NOISE = 0.2
+"""Pixels with less noise, in grey levels, are overexposed or painted."""
 
 
 def coarser_levels(size_hw: tuple[int, int]) -> int:
@@ -229,8 +230,9 @@ def detail_energy(picture: Picture) -> FloatImage:
 def least_detail(around_equator: FloatImage) -> float:
     """Return the `detail_energy` that is above the noise, from that of pixels below 45° of elevation."""
     noisy = around_equator[around_equator >= _LEAST_NOISE**2]
-    noise = float(np.quantile(noisy, _PLAIN_PIXELS_SHARE)) if noisy.size else _LEAST_NOISE**2
-    return _DETAIL_OVER_NOISE**2 * noise
+    # The plainest pixels contain only noise; what is less than three times the noise is noise.
+    noise = float(np.quantile(noisy, 0.05)) if noisy.size else _LEAST_NOISE**2
+    return 3.0**2 * noise
 
 
 def with_coarser(fine: RangeMap, coarse: RangeMap, picture: Picture) -> RangeMap:

@@ -14,16 +14,7 @@ import numpy as np
 from pano_mvs.core.kernels import inlined
 
 _F = np.float32
-_HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
-# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
-_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
-_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
-# S. L. Moshier's Cephes library, atan.c: |error| ≤ 2e-16 on [-0.66, 0.66].
-_P0, _P1, _P2 = -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1
-_P3, _P4 = -1.228866684490136173410e2, -6.485021904942025371773e1
-_Q0, _Q1, _Q2 = 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2
-_Q3, _Q4 = 4.853903996359136964868e2, 1.945506571482613964425e2
-_REDUCED_FROM, _TINY_64 = 0.66, 1e-300
+_HALF_PI, _TINY = _F(np.pi / 2), _F(1e-30)
 
 
 @inlined
@@ -109,9 +100,11 @@ def angle_between(ax: float, ay: float, az: float, bx: float, by: float, bz: flo
 @inlined
 def _fast_atan(a: np.float32) -> np.float32:
     """Return atan of a float32 in [0, 1]."""
+    # Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
     s = a * a
-    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
-    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
+    tail = _F(-0.0752896400) + s * (_F(0.0429096138) + s * (_F(-0.0161657367) + s * _F(0.0028662257)))
+    tail = _F(-0.1420889944) + s * (_F(0.1065626393) + s * tail)
+    return a * (_F(1) + s * (_F(-0.3333314528) + s * (_F(0.1999355085) + s * tail)))
 
 
 @inlined
@@ -122,7 +115,7 @@ def fast_azimuth(x: np.float32, z: np.float32) -> np.float32:
     large = az if ax < az else ax
     turn: np.float32 = _fast_atan(small / (large + _TINY))
     turn = _HALF_PI - turn if ax > az else turn
-    turn = _PI - turn if z < _F(0) else turn
+    turn = _F(np.pi) - turn if z < _F(0) else turn
     return -turn if x < _F(0) else turn
 
 
@@ -144,13 +137,16 @@ def even_atan2(y: float, x: float) -> float:
     small = ay if ay < ax else ax
     large = ax if ay < ax else ay
     # atan(a) = π/4 + atan((a − 1) / (a + 1))
-    reduced = small > _REDUCED_FROM * large
+    reduced = small > 0.66 * large
     above = small - large if reduced else small
     below = small + large if reduced else large
-    a = above / (below + _TINY_64)
+    a = above / (below + 1e-300)
     s = a * a
-    p = (((_P0 * s + _P1) * s + _P2) * s + _P3) * s + _P4
-    q = ((((s + _Q0) * s + _Q1) * s + _Q2) * s + _Q3) * s + _Q4
+    # S. L. Moshier's Cephes library, atan.c: |error| ≤ 2e-16 on [-0.66, 0.66].
+    p = (-8.750608600031904122785e-1 * s - 1.615753718733365076637e1) * s - 7.500855792314704667340e1
+    p = (p * s - 1.228866684490136173410e2) * s - 6.485021904942025371773e1
+    q = ((s + 2.485846490142306297962e1) * s + 1.650270098316988542046e2) * s + 4.328810604912902668951e2
+    q = (q * s + 4.853903996359136964868e2) * s + 1.945506571482613964425e2
     angle = a + a * (s * p / q)
     angle = angle + math.pi / 4 if reduced else angle
     angle = math.pi / 2 - angle if ay > ax else angle

@@ -21,9 +21,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry.transforms import Rigid3
 
-_ITERATIONS = 20
-_EXACT = 1e-14
-
 
 @dataclass(frozen=True, slots=True)
 class FisheyeLens:
@@ -79,14 +76,14 @@ class FisheyeLens:
         target = np.where(inside, wanted, 0.0)
         low, high = np.zeros_like(target), np.full_like(target, self.max_angle_rad)
         angles = np.minimum(target / outermost, 1.0) * self.max_angle_rad
-        for _ in range(_ITERATIONS):
+        for _ in range(20):
             excess = self.radius_from_angle(angles) - target
             high, low = np.where(excess > 0, angles, high), np.where(excess > 0, low, angles)
             steps = excess / self.radius_slope(angles)
             # A step that leaves the bracket becomes a bisection.
             newton = angles - steps
             angles = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-            if np.abs(steps).max(initial=0.0) < _EXACT:
+            if np.abs(steps).max(initial=0.0) < 1e-14:
                 break
         return np.where(inside, angles, np.nan)
 

@@ -18,13 +18,13 @@ from pano_mvs.algorithms.masks.people import people
 from pano_mvs.algorithms.masks.person_views import (
     SIDE_PX,
     SeenPanorama,
-    person_presence,
+    person_in_middle,
     person_probability,
     rolled,
     stereographic_look,
 )
 from pano_mvs.core.arrays import Mask, Picture
-from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.testing.room import default_room, render
 from tests.synthetic.persons import Drawn, draw_people, person
@@ -113,8 +113,8 @@ def test_the_networks_know_a_person(portrait: tuple[Picture, Mask]) -> None:
     probability = person_probability(picture)
     assert probability[person].mean() > 0.8
     assert probability[~person].mean() < 0.2
-    assert person_presence(picture) > 0.6
-    assert person_presence(np.full((SIDE_PX, SIDE_PX, 3), 128, np.uint8)) < 0.2
+    assert person_in_middle(picture)[0] > 0.6
+    assert person_in_middle(np.full((SIDE_PX, SIDE_PX, 3), 128, np.uint8))[0] < 0.2
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((8, 16), np.uint8), np.zeros((8, 16, 3), np.float32)])
@@ -125,8 +125,8 @@ def test_wrong_arrays_are_refused(wrong: NDArray[np.uint8]) -> None:
 
 def test_a_damaged_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(person_views, "_POSE", (person_views._POSE[0], "another digest"))
-    with pytest.raises(StoreError, match=r"pose_landmark_lite.*Install pano-mvs again"):
-        person_presence(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+    with pytest.raises(UsageError, match=r"pose_landmark_lite.*Install pano-mvs again"):
+        person_in_middle(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
 
 
 def with_somebody(pose: str, *, reach: float) -> Drawn:
@@ -139,7 +139,7 @@ def with_somebody(pose: str, *, reach: float) -> Drawn:
 def test_a_network_outlines_what_is_in_the_middle() -> None:
     drawn = with_somebody("standing", reach=1.5)
     view = stereographic_look(upright_rotation(np.array([0.2, 0.3, -1.0])), 90.0)
-    outline = view.on_map(SeenPanorama(drawn.picture).outline(view))
+    outline = view.on_map(SeenPanorama(drawn.picture).middle(view)[1])
     assert outline[drawn.people].mean() > 0.8
     assert outline[~drawn.people & (view.weight > 0)].mean() < 0.1
 

@@ -24,8 +24,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, spiral_rays
 from pano_mvs.scene.files import FaceLayout
 
-_MARGIN = 0.17  # in units of the focal length; required by detectors and descriptors beyond the face
-
 
 @cache
 def face_centers() -> FloatArray:
@@ -74,7 +72,8 @@ def _tile(triangle: FloatArray, focal_px: float) -> PinholeView:
     tile_from_cam = np.array([np.cross(y, z), y, z])
     in_tile = triangle @ tile_from_cam.T
     plane = in_tile[:, :2] / in_tile[:, 2:]
-    margin = max(_MARGIN, 24 / focal_px)
+    # In units of the focal length; required by detectors and descriptors beyond the face.
+    margin = max(0.17, 24 / focal_px)
     low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
     width, height = np.ceil((high - low) * focal_px).astype(int)
     return PinholeView(tile_from_cam, focal_px, -low * focal_px, (int(height), int(width)))

@@ -11,8 +11,6 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import kernel
 from pano_mvs.geometry.kernels_sphere import bilinear
 
-ARC = 10  # of the 18 cells of the ring
-
 
 @kernel
 def segment_score(differences: NDArray[np.int64]) -> np.int64:
@@ -20,7 +18,7 @@ def segment_score(differences: NDArray[np.int64]) -> np.int64:
     best = np.int64(0)
     for start in range(18):
         brighter, darker = np.int64(255), np.int64(255)
-        for step in range(ARC):
+        for step in range(10):
             difference = differences[(start + step) % 18]
             brighter = min(brighter, difference)
             darker = min(darker, -difference)

@@ -342,9 +342,6 @@ def _smoothing_kernel() -> FloatArray:
     return kernel
 
 
-_PIXEL_STD = np.sqrt(1 / 12)  # standard deviation of a box one pixel wide
-
-
 def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[NDArray[np.uint8]]:
     """Smooth a panorama by Gaussians, with one result for each width.
 
@@ -367,7 +364,8 @@ def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[
     cosine = np.cos(elevation)[:, None]
     smoothed = []
     for sigma_px in sigmas_px:
-        spread = (sigma_px**2 + (_PIXEL_STD * np.sin(elevation[:, None])) ** 2) / cosine**2
+        pixel_std = np.sqrt(1 / 12)  # of a box one pixel wide
+        spread = (sigma_px**2 + (pixel_std * np.sin(elevation[:, None])) ** 2) / cosine**2
         decay = np.exp(-0.5 * spread * frequency**2).astype(np.float32)
         rows = fft.irfft(spectrum * decay, n=width, axis=1)
         smoothed.append(np.rint(_smooth_columns(rows, float(sigma_px))).clip(0, 255).astype(np.uint8))

@@ -183,7 +183,6 @@ def _common_sides(
 
 # [1 2 1] along two spatial and three colour dimensions: the centre counts twice for each.
 _BLUR_CENTER = 10.0
-_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -304,7 +303,7 @@ def solve_bilateral(
     held = system.mass > 0
     start = np.divide(system.right, pulled, out=np.zeros(count), where=held)
     diagonal[~held] = 1
-    solution, _ = kernels.solve(system.right, start, diagonal, _TOLERANCE, iterations, arguments)
+    solution, _ = kernels.solve(system.right, start, diagonal, 1e-4, iterations, arguments)
     place = cells.gap_of_row, cells.weight_row, cells.weight_upper, cells.weight_lower
     smooth = kernels.slice_pixels(system.elements, system.vertices, solution, *place)
     share = np.divide(pulled, system.mass, out=np.zeros(count), where=held)

@@ -18,13 +18,6 @@ from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
-_NEIGHBOURS = 4
-# Cameras with true poses had at most 0.62, cameras half a metre off 0.63 or more. This is not sufficient alone: it
-# excludes views that agree little because their errors scatter.
-_MIN_ONE_WAY = 0.55
-# If neighbours agree with no view either, or little can be compared, nothing can be concluded.
-_MIN_AGREED, _MIN_COMPARED = 0.1, 0.2
-
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
@@ -57,7 +50,8 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
     `agreements`: view name to agreement. `centers`: (3,) camera centres of the views of one world frame; views without
     one are not judged.
     """
-    names = [name for name in agreements if name in centers and agreements[name].compared >= _MIN_COMPARED]
+    # If little can be compared, or neighbours agree with no view either, nothing can be concluded.
+    names = [name for name in agreements if name in centers and agreements[name].compared >= 0.2]
     if len(names) < 3:
         return {}
     places = np.array([centers[name] for name in names])
@@ -68,8 +62,9 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
         one_way = agreements[name].one_way
         # Relative to the agreement of its neighbours. Cameras with true poses had 0.64 or more (rendered and synthetic
         # rooms, including plain ones; 4 to 9 views, 2 to 8 sources), lowest at the edge of a capture; cameras half a
-        # metre off had at most 0.47.
-        if usual >= _MIN_AGREED and agreed[idx] < 0.55 * usual and one_way >= _MIN_ONE_WAY:
+        # metre off had at most 0.47. Contradictions in one direction are not sufficient alone (cameras with true poses
+        # had at most 0.62, cameras half a metre off 0.63 or more): they exclude views whose errors scatter.
+        if usual >= 0.1 and agreed[idx] < 0.55 * usual and one_way >= 0.55:
             doubts[name] = (
                 f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: {100 * usual:.0f} "
                 f"%) and contradict {100 * one_way:.0f} % in one direction"
@@ -84,7 +79,7 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
     """
     from scipy.spatial import cKDTree
 
-    count = min(_NEIGHBOURS, len(places) - 1)
+    count = min(4, len(places) - 1)
     tree = cKDTree(places)
     # The view itself is among the results, unless more than `count` others coincide with it.
     farthest = np.asarray(tree.query(places, k=count + 1)[0])[:, -1]
@@ -96,7 +91,7 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
 
 
 # Of the sources that can compare a pixel, these must contradict it in one direction for it to count as contradicted.
-_ONE_WAY, _MIN_JUDGES = 0.75, 2
+_ONE_WAY = 0.75
 
 
 def check_consistency(
@@ -244,7 +239,7 @@ def _agreement(comparison: Comparison, seen: NDArray[np.bool_]) -> Agreement:
         return float(np.sum(where.mean(axis=1) * row_weights))
 
     compared = seen & (judges > 0)
-    contradicted = compared & (comparison.agreeing == 0) & (judges >= _MIN_JUDGES)
+    contradicted = compared & (comparison.agreeing == 0) & (judges >= 2)
     total = share(compared)
     parts = (
         compared & (comparison.agreeing > 0),

@@ -24,14 +24,12 @@ System = tuple[
 _EMPTY = -1
 # Colours are numbered within a cube of 128 bins per channel, of which the outermost stay empty.
 COLOR_BINS = 128
-_LUMA, _BLUE, _RED = COLOR_BINS * COLOR_BINS, COLOR_BINS, 1
-_PRIME, _MULTIPLIER = 2147483647, 1640531527
 
 
 @inlined
 def _slot(key: int, bits: int) -> int:
     """Return the first slot to probe for a key in a table of 2^bits slots (multiplicative hashing without overflow)."""
-    return int(((np.int64(key) % _PRIME * _MULTIPLIER) >> 20) & ((1 << bits) - 1))
+    return int(((np.int64(key) % 2147483647 * 1640531527) >> 20) & ((1 << bits) - 1))
 
 
 @kernel
@@ -155,7 +153,7 @@ def blur_graph(
                 if other >= 0:
                     heads[used], tails[used], values[used] = vertex, other, strengths[position]
                     used += 1
-        for step in (_LUMA, _BLUE, _RED):
+        for step in (COLOR_BINS * COLOR_BINS, COLOR_BINS, 1):
             # The outermost bins of the cube are never used, so a step never wraps into the next row.
             other = _find(table, numbers, key + step, bits)
             if other >= 0:

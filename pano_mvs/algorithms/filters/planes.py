@@ -25,12 +25,7 @@ from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
-_HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
-# The plane must be seen on most sides of the surface: extrapolation is unreliable.
-_SECTORS, _MIN_SECTORS = 8, 6
-# Planes with this share of the reliable pixels are clear. A plane parallel to one of them replaces an unclear one if it
-# has this share of the pixels of that one.
-_CLEAR_SHARE, _NEARLY = 0.8, 0.8
+_MIN_POINTS = 30
 
 
 @checks_settings
@@ -94,7 +89,7 @@ def lay_planes(
     clear = [
         fit.plane / np.linalg.norm(fit.plane)
         for fit, is_valid in zip(fits, valid, strict=True)
-        if is_valid and fit.share >= _CLEAR_SHARE
+        if is_valid and fit.share >= 0.8  # of the reliable pixels: a clear plane
     ]
     open_sky = large_holes(range_map.valid, max_hole_deg)
     ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
@@ -104,7 +99,8 @@ def lay_planes(
             # The best plane with a clear normal, unless the free fit holds clearly more pixels.
             found = [_plane_along(fit, normal, max_relative_error=max_relative_error) for normal in clear]
             best = max(found, key=lambda other: other.share, default=fit)
-            chosen = best if best.share >= _NEARLY * fit.share else fit
+            # It replaces an unclear one if it has this share of its pixels.
+            chosen = best if best.share >= 0.8 * fit.share else fit
         if not (is_valid if chosen is fit else chosen.is_valid(rays, min_share)):
             continue
         surface = fit.surface & ~open_sky
@@ -219,7 +215,7 @@ def fit_plane(
     `rays`: (N, 3) unit rays, N ≥ 3. `inverse`: (N,) 1 / range along each. `max_relative_error`: largest |a · ray − 1 /
     r| · r of a point on the plane. `rng`: draws the triples.
     """
-    triples = rng.integers(0, len(rays), (_HYPOTHESES, 3))
+    triples = rng.integers(0, len(rays), (256, 3))
     bases = rays[triples]
     sound = np.abs(np.linalg.det(bases)) > 1e-6
     planes = np.linalg.solve(bases[sound], inverse[triples][sound][..., None])[..., 0]
@@ -241,7 +237,7 @@ def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArr
     weights = weight[support]
     if len(weights) < _MIN_POINTS:
         return np.zeros(0, np.intp)
-    return rng.choice(len(weights), _MAX_POINTS, p=weights / weights.sum())
+    return rng.choice(len(weights), 3000, p=weights / weights.sum())
 
 
 def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, *, inverse: FloatArray) -> bool:
@@ -253,5 +249,6 @@ def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, *, inver
     middle = surface.mean(axis=0)
     across = np.linalg.svd(middle[None])[2][1:]  # two directions perpendicular to the middle
     angle = np.arctan2(*(rays @ across.T).T)
-    sectors = np.floor((angle / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
-    return len(np.unique(sectors)) >= _MIN_SECTORS
+    # The plane must be seen on most of eight sides of the surface: extrapolation is unreliable.
+    sectors = np.floor((angle / (2 * np.pi) + 0.5) * 8).astype(np.int64) % 8
+    return len(np.unique(sectors)) >= 6

@@ -22,7 +22,6 @@ _U = np.uint64
 _RADIX_BITS = 11
 _RADIX = 1 << _RADIX_BITS
 
-_MIN_COSINE = 0.8
 _MAX_DEVIATIONS = 2.5
 _MAX_OFF_CENTER = 0.3
 
@@ -163,7 +162,7 @@ def weigh_block(
         deviation = height * height / (_MAX_DEVIATIONS * _MAX_DEVIATIONS * variance)
         cosine = nx * near[k + _U(3) * block] + ny * near[k + _U(4) * block] + nz * near[k + _U(5) * block]
         weight = (1 - share) * (1 - share) * ((1 - deviation) * (1 - deviation)) / (other * other)
-        used = (share < 1) & (deviation < 1) & (cosine >= _MIN_COSINE)
+        used = (share < 1) & (deviation < 1) & (cosine >= 0.8)
         weighed[i] = weight if used else 0.0
         weighed[i + block] = height
         weighed[i + _U(2) * block] = (x * ux + y * uy + z * uz) / radius

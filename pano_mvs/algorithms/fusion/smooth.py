@@ -20,8 +20,7 @@ _PASSES = 2
 # Neighbours count within this many standard deviations of the point's position.
 _REACH = 2.0
 # Points that are sorted into cells together, and those that are moved together: they bound the memory.
-_POINTS_OF_SLAB, _POINTS_OF_PART = 2_000_000, 1_000_000
-_MAX_LEVELS = 16
+_POINTS_OF_PART = 1_000_000
 
 
 def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1) -> PointCloud:
@@ -65,7 +64,7 @@ def surface_heights(
     *,
     chosen: NDArray[np.bool_] | None = None,
     per_column: int = 12,
-    points_of_slab: int = _POINTS_OF_SLAB,
+    points_of_slab: int = 2_000_000,
     threads: int = 1,
 ) -> FloatArray:
     """Return the heights (N,) along their normals of the planes of their neighbours above points; 0 if undefined.
@@ -150,7 +149,7 @@ def _levels(
         return {}, levels
     radii = _REACH * sigmas[wanted].astype(np.float64)
     extent = float((grid[1] - grid[0]).max())
-    most = float(radii.max()) / 2 ** (_MAX_LEVELS - 1)
+    most = float(radii.max()) / 2**15
     least = max(float(np.quantile(radii, 0.3)), most, extent / (1 << 20))
     del radii
     for part in _parts(len(sigmas)):

@@ -20,9 +20,7 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import UP, PinholeView, pixel_from_ray, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Features
 
-# Of the network: radius of its detector's maxima, rounds of their search, and temperature of their subpixel position.
-_RADIUS_PX, _ROUNDS, _TEMPERATURE = 2, 2, 0.1
-_SHARE = 4  # times the mean number of key points of a view, at most
+_RADIUS_PX = 2  # of the maxima of the network's detector
 
 
 @checks_settings
@@ -93,7 +91,7 @@ def _with_up(
             nearest = np.argmax([bearings @ other.view_from_cam[2] for other in tiles], axis=0)
             own = np.flatnonzero(mask[_pixels_of(bearings, size_hw)] & (nearest == number))
             # A view with more than this is thinned out below, so most of its key points need no descriptor.
-            return own[spread_keypoints(bearings[own], scores[own], max_keypoints=_SHARE * max_keypoints // len(tiles))]
+            return own[spread_keypoints(bearings[own], scores[own], max_keypoints=4 * max_keypoints // len(tiles))]
 
         one = described_tile(
             sample_view(image, tile, interpolation=cv2.INTER_LINEAR), kept, threshold=threshold, networks=networks
@@ -165,7 +163,7 @@ def maxima_of_scores(score: Array, threshold: float) -> tuple[FloatArray, Array]
     around = np.ones((2 * _RADIUS_PX + 1, 2 * _RADIUS_PX + 1), np.uint8)
     peaks = score == cv2.dilate(score, around)
     # A maximum may also be lower than a neighbour that another maximum suppresses.
-    for _ in range(_ROUNDS):
+    for _ in range(2):
         suppressed = cv2.dilate(peaks.astype(np.uint8), around) > 0
         rest = np.where(suppressed, np.float32(0), score)
         peaks |= (rest == cv2.dilate(rest, around)) & ~suppressed
@@ -175,7 +173,7 @@ def maxima_of_scores(score: Array, threshold: float) -> tuple[FloatArray, Array]
     y, x = np.nonzero(peaks)
     offsets = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
     patches = score[(y[:, None] + offsets)[:, :, None], (x[:, None] + offsets)[:, None, :]].astype(np.float64)
-    weights = np.exp((patches - patches.max(axis=(1, 2), keepdims=True)) / _TEMPERATURE)
+    weights = np.exp((patches - patches.max(axis=(1, 2), keepdims=True)) / 0.1)  # the network's temperature
     weights /= weights.sum(axis=(1, 2), keepdims=True)
     shift = np.stack([(weights * offsets).sum(axis=(1, 2)), (weights * offsets[:, None]).sum(axis=(1, 2))], axis=1)
     return np.stack([x, y], axis=1) + shift, score[y, x]

@@ -21,8 +21,6 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
 
 LAYERS = 9
-# Of the network, as published: shares of confident key points at which it stops, and of hopeless ones that it drops.
-_DEPTH_CONFIDENCE, _WIDTH_CONFIDENCE = 0.95, 0.99
 
 
 @checks_settings
@@ -111,10 +109,11 @@ class LightGlue:
             sure = 0.8 + 0.1 * float(np.exp(-4.0 * number / LAYERS))
             confident = [judged[:, 0] >= sure, judged_too[:, 0] >= sure]
             dropped = sum(counts) - sum(len(one) for one in kept)
-            if dropped + sum(int(one.sum()) for one in confident) > _DEPTH_CONFIDENCE * sum(counts):
+            # As published: at this share of confident key points it stops, and it drops those as hopeless as this.
+            if dropped + sum(int(one.sum()) for one in confident) > 0.95 * sum(counts):
                 break
             for side in (0, 1):
-                keep = np.flatnonzero((matchable[side] > 1 - _WIDTH_CONFIDENCE) | ~confident[side])
+                keep = np.flatnonzero((matchable[side] > 1 - 0.99) | ~confident[side])
                 kept[side] = kept[side][keep]
                 states[side] = [states[side][0][keep], states[side][1][:, keep]]
         chance = np.exp(self._end(layer=np.array(number), first=states[0][0], second=states[1][0])[0])

@@ -66,8 +66,7 @@ class Networks:
         Raises:
             UsageError: if the file is missing or damaged, or the provider is not installed.
         """
-        path = self._path(file)
-        return open_network(path, self.provider)
+        return open_network(self._path(file), self.provider)
 
     def of_colmap(self, part: Literal["extractor", "matcher"]) -> Network | None:
         """Return COLMAP's network for ALIKED or for LightGlue; None if the folder has none of COLMAP's files.
@@ -139,9 +138,7 @@ class Networks:
             own = [name for name in DIGESTS if self.models is not None and is_file(self.models / name)]
             remedy += f", in a folder without {' and '.join(own)}" if own else ""
             raise UsageError(f"{path}: this network is missing. {remedy}")
-        if self.models is None and _digest(path, path.stat().st_mtime_ns) != DIGESTS[file]:
-            raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
-        return path
+        return path if self.models is not None else _checked(path, DIGESTS[file])
 
 
 PACKAGED = Networks()
@@ -156,6 +153,15 @@ def open_network(path: Path, provider: Provider = "cpu") -> Network:
     if not is_file(path):
         raise UsageError(f"{path}: there is no such file. Give the path of a network in the ONNX format")
     return Network(_session(path, path.stat().st_mtime_ns, provider))
+
+
+def packaged_network(path: Path, digest: str) -> Network:
+    """Return the network of a file of the package, loaded once per process, after a check of its SHA-256 digest.
+
+    Raises:
+        UsageError: if the file is missing or damaged.
+    """
+    return open_network(_checked(path, digest))
 
 
 class Network:
@@ -196,6 +202,12 @@ class Network:
         """Return the outputs in their order."""
         outputs: list[Array] = self._session.run(None, inputs)
         return outputs
+
+
+def _checked(path: Path, digest: str) -> Path:
+    if is_file(path) and _digest(path, path.stat().st_mtime_ns) != digest:
+        raise UsageError(f"{path}: this file of the package is damaged. Install pano-mvs again")
+    return path
 
 
 @lru_cache

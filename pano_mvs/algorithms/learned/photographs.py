@@ -14,8 +14,6 @@ from pano_mvs.algorithms.learned.networks import DESCRIPTOR_NORM, PACKAGED, TILE
 from pano_mvs.algorithms.matching.brute_force import match_l2
 from pano_mvs.scene import Features
 
-_THRESHOLD, _MIN_SCORE = 0.01, 0.1  # of key points and matches, as in `extract_aliked` and `match_learned`
-
 
 @dataclass(frozen=True, eq=False)
 class PhotographView:
@@ -45,7 +43,7 @@ def view_of_photograph(picture: NDArray[np.uint8], *, networks: Networks = PACKA
         x, y = pixels[order].astype(int).T
         return np.asarray(order[inside[y, x]][:1500])
 
-    tile = described_tile(square, strongest, threshold=_THRESHOLD, networks=networks)
+    tile = described_tile(square, strongest, threshold=0.01, networks=networks)
     pixels = tile.pixels_px
     back = np.array(picture.shape[1::-1]) / np.array(size_xy)
     places = (pixels / (TILE_PX / 2) - 1).astype(np.float32)
@@ -75,6 +73,6 @@ def match_photograph(
     found = [np.zeros((0, 2), np.int64)]
     for view in np.argsort(-counts, kind="stable")[:4].tolist():
         idx, *shown = side.inside(view)
-        matches, _ = glue.match(seen, shown, min_score=_MIN_SCORE)
+        matches, _ = glue.match(seen, shown, min_score=0.1)  # as in `match_learned`
         found.append(np.stack([matches[:, 0], idx[matches[:, 1]] + len(panorama) - panorama.learned], axis=1))
     return np.unique(np.concatenate(found), axis=0).astype(np.int32)

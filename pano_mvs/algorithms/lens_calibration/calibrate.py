@@ -44,15 +44,8 @@ from pano_mvs.scene.pose_groups import split_groups
 View = tuple[int, int]
 """Number of a capture, and of a lens: 0 or 1."""
 
-# All key points are matched between the rims, some of them between captures, and some of the tracks are adjusted.
-_KEYPOINTS, _BETWEEN_CAPTURES, _MAX_POINTS = 6000, 2500, 2500
 # The edge of the circle is blurred: key points and the field of view end at this share of its radius.
 USED_RADIUS = 0.985
-
-# Start values. Lenses differ from equidistant ones, and circles from their axes, by about this much.
-_SIGMA_FOCAL, _SIGMA_CENTER = 0.2, 0.05
-_SIGMA_DISTORTION = (0.1, 0.05, 0.02, 0.005)
-_SIGMA_TURN_RAD = float(np.radians(10))
 
 _RIM_MIN, _RIM_THRESHOLD_DEG = 12, 1.5
 
@@ -193,12 +186,12 @@ def _observed(
             progress(f"finding key points, capture {capture + 1} of {count}")
         lens = lenses[lens_idx]
         panorama, valid = lens_panorama(load((capture, lens_idx)), lens, size_hw=(width // 2, width))
-        found = extract_sift(panorama, valid, max_keypoints=_KEYPOINTS)
+        found = extract_sift(panorama, valid, max_keypoints=6000)
         features[capture, lens_idx] = found
         pixels[capture, lens_idx] = lens.pixel_from_ray(found.bearings)
+    # All key points are matched between the rims, some of them between captures.
     some = {
-        view: spread_keypoints(found.bearings, found.scores, max_keypoints=_BETWEEN_CAPTURES)
-        for view, found in features.items()
+        view: spread_keypoints(found.bearings, found.scores, max_keypoints=2500) for view, found in features.items()
     }
     progress("matching key points")
     for first, second in combinations(features, 2):
@@ -442,10 +435,10 @@ def _bundle(seen: _Seen, state: _State, tracks: Tracks, *, views: Sequence[View]
 
 
 def _some_points(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return points at equal steps of their numbers, at most `_MAX_POINTS` of the valid ones."""
+    """Return points at equal steps of their numbers, at most 2500 of the valid ones."""
     chosen = np.flatnonzero(valid)
-    if len(chosen) > _MAX_POINTS:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, _MAX_POINTS).astype(np.intp)]
+    if len(chosen) > 2500:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, 2500).astype(np.intp)]
     some = np.zeros(len(valid), np.bool_)
     some[chosen] = True
     return some
@@ -456,9 +449,11 @@ def _freedom(state: _State, centers: Sequence[tuple[float, float]], *, with_offs
     for lens, center in zip(state.lenses, centers, strict=True):
         focal = lens.focal_xy[0]
         start += [focal, *center, 0.0, 0.0, 0.0, 0.0]
-        sigmas += [_SIGMA_FOCAL * focal, *(_SIGMA_CENTER * focal,) * 2, *_SIGMA_DISTORTION]
+        # Lenses differ from equidistant ones, and circles from their axes, by about this much.
+        sigmas += [0.2 * focal, *(0.05 * focal,) * 2, 0.1, 0.05, 0.02, 0.005]
     offset_sigma = np.inf if with_offset else 0.0
-    return Freedom(np.array([*sigmas, *(_SIGMA_TURN_RAD,) * 3, *(offset_sigma,) * 3]), np.array([*start, *np.zeros(6)]))
+    turn_sigma = float(np.radians(10))
+    return Freedom(np.array([*sigmas, *(turn_sigma,) * 3, *(offset_sigma,) * 3]), np.array([*start, *np.zeros(6)]))
 
 
 def _state(bundle: RigBundle, state: _State, radii: Sequence[float]) -> _State:

@@ -53,11 +53,6 @@ def opened_areas(pixels: Mask, radius_px: int) -> Mask:
     return dilated(~dilated(~pixels, radius_px), radius_px) & pixels
 
 
-def closed_areas(pixels: Mask, radius_px: int) -> Mask:
-    """Return areas with gaps closed that are narrower than twice a radius."""
-    return ~dilated(~dilated(pixels, radius_px), radius_px) | pixels
-
-
 @cache
 def off_nadir_deg(size_hw: tuple[int, int]) -> NDArray[np.float64]:
     """Return the angle of each pixel from straight down, (H, W)."""

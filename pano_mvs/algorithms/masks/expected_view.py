@@ -21,8 +21,7 @@ Plane = NDArray[np.float32]
 
 # Ranges that agree within this share are of one surface.
 _SAME = 0.06
-# The ground is a plane through points this far below the horizon, as flat as this.
-_GROUND_FROM_DEG, _MAX_TILT_DEG, _MIN_GROUND_POINTS = 20.0, 20.0, 150
+_MIN_GROUND_POINTS = 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +56,7 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
 
     A surface is expected where the ranges of two of them agree, or on the plane of the ground. The colours of those
     that see it, after a factor per channel, and the lightest and the darkest colours within 1.4°, are what can be
-    expected there. Where the panorama's own ranges are confirmed, what the views show at these is expected as well.
+    expected there.
 
     `picture`: (H, W, 3) uint8 RGB, the reference. `range_map`: its ranges, of the same size. `others`: views around it,
     of the same size.
@@ -80,12 +79,6 @@ def expected_view(picture: Picture, range_map: RangeMap, others: Sequence[OtherV
     colors, own = [_colors_around(other.picture) for other in others], mean_around(picture)
     difference, expected = _differences(own, ranges, others, around=colors, colors_at=ground)
     ratio = (own + DARK_LEVEL) / (expected + DARK_LEVEL)
-    # Such as a chair beside the camera that others hardly see.
-    nearer = np.isfinite(known) & ~(np.abs(known - ranges) < _SAME * known)
-    if nearer.any():
-        measured = np.where(nearer, known, np.float32(np.nan))
-        at_these = _differences(own, measured, others, around=colors, colors_at=np.zeros_like(nearer))[0]
-        difference = np.fmin(difference, at_these)
     height = float("nan") if plane is None else float(plane[3])
     return Expected(ranges, ground, difference, ratio, height)
 
@@ -114,7 +107,8 @@ def ground_plane(known: Plane, seen: Plane) -> FloatArray | None:
 
 def _low_points(ranges: Plane) -> FloatArray:
     rays = ray_grid((ranges.shape[0], ranges.shape[1]))
-    low = np.isfinite(ranges) & (rays[..., 1] > np.sin(np.radians(_GROUND_FROM_DEG)))
+    # The ground is a plane through points this far below the horizon, and tilted by no more.
+    low = np.isfinite(ranges) & (rays[..., 1] > np.sin(np.radians(20.0)))
     return np.asarray(rays[low] * ranges[low, None])
 
 
@@ -125,7 +119,7 @@ def _plane_through(three: FloatArray) -> FloatArray | None:
         return None
     normal /= length * np.sign(normal[1] or 1)
     height = float(normal @ three[0])
-    return np.append(normal, height) if normal[1] > np.cos(np.radians(_MAX_TILT_DEG)) and height > 0 else None
+    return np.append(normal, height) if normal[1] > np.cos(np.radians(20.0)) and height > 0 else None
 
 
 def _projected_ranges(other: OtherView, grid_hw: tuple[int, int]) -> Plane:

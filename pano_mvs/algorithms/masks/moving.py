@@ -13,7 +13,6 @@ from pano_mvs.algorithms.masks.areas import (
     area_labels,
     area_sizes,
     border_shares,
-    closed_areas,
     dilated,
     off_nadir_deg,
     opened_areas,
@@ -31,20 +30,9 @@ from pano_mvs.scene import RangeMap
 MAX_OTHERS = 6
 """More views around a panorama add nothing."""
 
-# Differences of colour, in grey levels, from which an area is changed, and at least somewhere in it.
-_CHANGED, _CERTAIN = 10.0, 24.0
-# The operator reaches to within this angle of straight down. What touches the operator's mask is within the other.
-_NADIR_DEG, _REACH_DEG = 30.0, 75.0
 # The mean probability of a person, by the network: of an area below the camera, where an operator is expected, and of
 # others. Furniture that the other views hide can have 0.77, and has 0.00 below the camera.
 _OPERATOR, _PERSON = 0.04, 0.85
-# A vehicle's length, height and distance, in heights of the camera; it fills much of its outline.
-_VEHICLE_LENGTH, _VEHICLE_HEIGHT = (0.8, 4.5), (0.35, 1.5)
-# There are no vehicles in rooms: below a surface that other views see over this share of what is within an angle of
-# straight up, in the median at most this many heights of the camera away.
-_CEILING_DEG, _MIN_CEILING_SHARE, _MAX_CEILING = 45.0, 0.5, 4.0
-# A shadow is at least this bright, at most that bright, and changes the channels alike.
-_SHADOW, _MAX_TINT = (0.28, 0.88), 0.13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,12 +85,13 @@ def moving_pixels(
     if len(others) < 2 or size_hw[0] < 16:
         return Moving(nothing, nothing)
     expected = expected_view(picture, range_map, others)
-    changed = np.nan_to_num(expected.difference, nan=0.0) > _CHANGED
+    # Differences of colour, in grey levels, from which an area is changed; somewhere in it, they are larger.
+    changed = np.nan_to_num(expected.difference, nan=0.0) > 10.0
     # A shadow makes the ground darker than expected, by the same factor in all channels.
     ratio = np.nan_to_num(expected.ratio, nan=1.0)
     mean = ratio.mean(axis=-1)
     tint = (ratio.max(axis=-1) - ratio.min(axis=-1)) / np.maximum(mean, 1e-6)
-    shadow = expected.ground & (mean > _SHADOW[0]) & (mean < _SHADOW[1]) & (tint < _MAX_TINT) & valid
+    shadow = expected.ground & (mean > 0.28) & (mean < 0.88) & (tint < 0.13) & valid
     found = nothing.copy()
     seen = SeenPanorama(picture)
     vehicles = vehicles and not _has_ceiling(expected)
@@ -111,8 +100,6 @@ def moving_pixels(
             found |= area
         else:
             found |= _person_in(seen, area, passers_by=passers_by)
-    if found.any():
-        found = _without_gaps(found)
     cast = nothing
     if shadows:  # those that touch what is found
         labels = area_labels(np.asarray(shadow & ~(found | ~valid)))
@@ -128,7 +115,7 @@ def _areas(changed: Mask, expected: Expected, min_area_deg2: float) -> list[Mask
     opened = opened_areas(changed, 1)
     labels, weights = area_labels(opened), pixel_weights(changed.shape)
     sizes = area_sizes(labels, weights)
-    certain = opened & (np.nan_to_num(expected.difference) > _CERTAIN)
+    certain = opened & (np.nan_to_num(expected.difference) > 24.0)
     share = np.bincount(labels[certain], weights[certain], labels.size) / np.maximum(sizes, 1e-9)
     least = min_area_deg2 / SQUARE_DEG_OF_SPHERE * weights.sum()
     return [labels == label for label in np.flatnonzero((sizes >= least) & (share >= 0.15))]
@@ -139,7 +126,7 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
     if not masked.any():
         return False
     weights = pixel_weights(area.shape)
-    within = area & (off_nadir_deg((area.shape[0], area.shape[1])) < _REACH_DEG)
+    within = area & (off_nadir_deg((area.shape[0], area.shape[1])) < 75.0)
     if weights[within].sum() < 0.9 * weights[area].sum():
         return False
     labels = np.where(area, 0, -1).astype(np.int64)
@@ -148,7 +135,8 @@ def _extends_mask(area: Mask, masked: Mask) -> bool:
 
 def _person_in(seen: SeenPanorama, area: Mask, *, passers_by: bool) -> Mask:
     """Return an area if it is the operator, or with the pixels of the person in it; nothing if neither."""
-    below = bool(off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < _NADIR_DEG)
+    # The operator reaches to within this angle of straight down.
+    below = bool(off_nadir_deg((area.shape[0], area.shape[1]))[area].min() < 30.0)
     nobody = np.zeros_like(area)
     if not below and not passers_by:
         return nobody
@@ -180,21 +168,14 @@ def _is_vehicle(area: Mask, expected: Expected) -> bool:
     width = float(np.quantile(azimuth, 0.98) - np.quantile(azimuth, 0.02))
     length = 2 * distance * np.tan(min(width / 2, 1.3))
     filled = area.sum() / max((top - bottom) * width * (area.shape[0] / np.pi) ** 2, 1)
-    inside = _VEHICLE_LENGTH[0] < length < _VEHICLE_LENGTH[1] and _VEHICLE_HEIGHT[0] < height < _VEHICLE_HEIGHT[1]
-    return bool(inside and filled > 0.55)
+    # A vehicle fills much of its outline.
+    return bool(0.8 < length < 4.5 and 0.35 < height < 1.5 and filled > 0.55)
 
 
 def _has_ceiling(expected: Expected) -> bool:
     """Return whether other views see a surface not far above the camera."""
     size_hw = (expected.ranges.shape[0], expected.ranges.shape[1])
-    above = expected.ranges[off_nadir_deg(size_hw) > 180 - _CEILING_DEG]
+    above = expected.ranges[off_nadir_deg(size_hw) > 180 - 45]
     known = above[np.isfinite(above)]
-    return bool(len(known) > _MIN_CEILING_SHARE * len(above) and np.median(known) < _MAX_CEILING * expected.height)
-
-
-def _without_gaps(found: Mask) -> Mask:
-    """Return areas with gaps of up to two degrees closed, and holes filled."""
-    closed = closed_areas(found, max(1, round(len(found) / 180)))
-    labels, weights = area_labels(~closed), pixel_weights(found.shape)
-    small = area_sizes(labels, weights) < 0.3 * weights[found].sum()
-    return np.asarray(closed | ((labels >= 0) & small[labels]))
+    # There are no vehicles in rooms: the ceiling is at most as many heights of the camera away.
+    return bool(len(known) > 0.5 * len(above) and np.median(known) < 4 * expected.height)

@@ -25,12 +25,8 @@ from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import ray_grid
 
 _DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-# Fields of view, and the rotations of each.
-_NARROW_DEG, _NARROW_ROLLS_DEG = 90.0, (0.0, 90.0, 180.0, 270.0)
-_WIDE_DEG, _WIDE_ROLLS_DEG = 120.0, (0.0, 90.0)
+_NARROW_ROLLS_DEG = (0.0, 90.0, 180.0, 270.0)
 _AT_NADIR_DEG = 2.0
-# How much of a person all views outline: the narrow ones, all, all without anybody detected.
-_MIN_NARROW_OUTLINE, _MIN_OUTLINE, _CERTAIN_OUTLINE = 0.65, 0.75, 0.85
 
 
 def people_below(seen: SeenPanorama, min_area_deg2: float) -> Mask:
@@ -44,24 +40,23 @@ def people_below(seen: SeenPanorama, min_area_deg2: float) -> Mask:
     probable = [each.on_map(seen.probability(each)) for each in narrow]
     if not _areas_below(np.mean(probable, axis=0), min_area_deg2):
         return nobody
-    outlined = [each.on_map(seen.outline(each)) for each in narrow]
-    areas = _areas_below(_mean_map([*probable, *outlined], narrow * 2), min_area_deg2)
-    if not any(_likely(probable, outlined, area, min_outline=_MIN_NARROW_OUTLINE) for area in areas):
-        return nobody
     probable += [each.on_map(seen.probability(each)) for each in wide]
-    outlined += [each.on_map(seen.outline(each)) for each in wide]
+    middles = [seen.middle(each) for each in narrow + wide]
+    outlined = [each.on_map(outline) for each, (_, outline) in zip(narrow + wide, middles, strict=True)]
     areas = _areas_below(_mean_map([*probable, *outlined], (narrow + wide) * 2), min_area_deg2)
-    areas = [area for area in areas if _likely(probable, outlined, area, min_outline=_MIN_OUTLINE)]
-    if not areas:
-        return nobody
-    accepted = [area for area in areas if _accepted(seen, probable, outlined, area=area)]
-    return np.logical_or.reduce(accepted) if accepted else nobody
+    present = max(presence for presence, _ in middles)
+    accepted = [
+        area
+        for area in areas
+        if _likely(probable, outlined, area) and _accepted(probable, outlined, area, present=present)
+    ]
+    return np.asarray(np.logical_or.reduce([nobody, *accepted]))
 
 
-def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline: float) -> bool:
-    """Return whether the networks find a person in an area, in the narrow views and in all views."""
+def _likely(probable: list[Map], outlined: list[Map], area: Mask) -> bool:
+    """Return whether the networks find a person in an area: one in the narrow views, the other in all views."""
     found = _means(probable[: len(_NARROW_ROLLS_DEG)], area)
-    if np.mean(_means(outlined, area)) < min_outline:
+    if np.mean(_means(outlined, area)) < 0.75:
         return False
     if off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG and np.mean(found) >= 0.6:
         return True
@@ -70,16 +65,17 @@ def _likely(probable: list[Map], outlined: list[Map], area: Mask, *, min_outline
     return bool(np.mean(found) >= 0.75 and min(found) >= 0.5)
 
 
-def _accepted(seen: SeenPanorama, probable: list[Map], outlined: list[Map], *, area: Mask) -> bool:
-    """Return whether an area that is likely is a person, or what is fixed below the camera."""
+def _accepted(probable: list[Map], outlined: list[Map], area: Mask, *, present: float) -> bool:
+    """Return whether an area that is likely is a person, or what is fixed below the camera.
+
+    `present`: how likely the views show a person, at most.
+    """
     at_nadir = off_nadir_deg(MAP_HW)[area].min() < _AT_NADIR_DEG
-    if at_nadir and np.mean(_means(outlined, area)) >= _CERTAIN_OUTLINE:
+    if at_nadir and np.mean(_means(outlined, area)) >= 0.85:
         return True
     # The wide views may fail if one of the views shows a person for certain.
     wide_agree = np.mean(_means(probable[len(_NARROW_ROLLS_DEG) :], area)) >= 0.6
-    least = 0.5 if at_nadir or wide_agree else 0.9
-    narrow, wide = _looks()
-    return any(seen.presence(each) >= least for each in narrow + wide)
+    return present >= (0.5 if at_nadir or wide_agree else 0.9)
 
 
 def _areas_below(mean: Map, min_area_deg2: float) -> list[Mask]:
@@ -109,7 +105,7 @@ def _mean_map(maps: list[Map], looks: tuple[Look, ...]) -> Map:
 def _looks() -> tuple[tuple[Look, ...], tuple[Look, ...]]:
     narrow, wide = (
         tuple(look(rolled(_DOWN, float(np.radians(roll))), fov_deg) for roll in rolls)
-        for fov_deg, rolls in ((_NARROW_DEG, _NARROW_ROLLS_DEG), (_WIDE_DEG, _WIDE_ROLLS_DEG))
+        for fov_deg, rolls in ((90.0, _NARROW_ROLLS_DEG), (120.0, (0.0, 90.0)))
     )
     return narrow, wide
 
@@ -174,7 +170,7 @@ def person_at(seen: SeenPanorama, area: Mask, *, least: float) -> tuple[float, M
     else:
         looks = [look(rolled(upright_rotation(center), np.radians(roll)), fov_deg) for roll in (-12.0, 12.0)]
     first = looks[0].on_map(seen.probability(looks[0]))
-    if _mean_in(first, reduced) < least / 2 or not any(seen.presence(each) >= 0.6 for each in looks):
+    if _mean_in(first, reduced) < least / 2 or not any(seen.middle(each)[0] >= 0.6 for each in looks):
         return 0.0, np.zeros_like(area)
     maps = [first, *(each.on_map(seen.probability(each)) for each in looks[1:])]
     maps += [each.on_map(seen.probability(each, mirrored=True)) for each in looks]

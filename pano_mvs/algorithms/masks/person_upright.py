@@ -9,21 +9,11 @@ import cv2
 import numpy as np
 
 from pano_mvs.algorithms.faces.layout import upright_rotation
-from pano_mvs.algorithms.masks.areas import area_labels, pixel_weights
+from pano_mvs.algorithms.masks.areas import area_labels
 from pano_mvs.algorithms.masks.person_views import MAP_HW, SIDE_PX, Look, Map, SeenPanorama, rolled, stereographic_look
 from pano_mvs.algorithms.ranges.agreement import pixels_containing
 from pano_mvs.core.arrays import FloatArray, Mask
 
-# The views in which people are looked for.
-_RING, _RING_FOV_DEG, _RING_ELEVATION_DEG = 8, 85.0, -12.0
-# Rolls in degrees, whether mirrored, how much wider, and by which share of its height lower, of the views that have to
-# agree; and of views in which somebody who is seen down to the waist is detected, since that is what they are lower by.
-_AGAIN = ((0.0, False, 1.0, 0.0), (12.0, True, 1.0, 0.0), (-12.0, False, 1.2, 0.0))
-_TO_THE_WAIST = ((0.0, False, 1.33, 0.5), (0.0, True, 1.33, 0.5), (0.0, False, 1.67, 0.5), (0.0, True, 1.67, 0.5))
-# The probability of a person: in the first view of a candidate, and of a person.
-_MIN_FIRST, _MIN_PROBABILITY = 0.1, 0.65
-# People are taller than wide; tables and benches are not.
-_MIN_FIRST_ASPECT, _MIN_ASPECT = 0.5, 1.15
 _BELONGS = 0.5
 
 
@@ -55,15 +45,15 @@ def upright_people(seen: SeenPanorama, known: Mask, *, min_area_deg2: float, pas
     """Return the pixels, `MAP_HW`, of people around the camera.
 
     A network that outlines what is in the middle of a view looks along the horizon. Each outline is seen again in the
-    middle of views of its own, rolled and mirrored: these have to agree on it, to detect a person, and a second network
-    has to find a person there.
+    middle of views of its own, rolled and mirrored: these have to detect a person, and a second network has to find a
+    person there.
 
     `seen`: the panorama. `known`: (H, W) people who are found already, `MAP_HW`. `min_area_deg2`: the smallest person.
     `passers_by`: whether to find people whose feet are far from the camera.
     """
     found = known.copy()
-    candidates = [_candidate(seen.outline(each), each) for each in _ring()]
-    possible = [each for each in candidates if each is not None and _may_be_person(each, _MIN_FIRST_ASPECT)]
+    candidates = [_candidate(seen.middle(each)[1], each) for each in _ring()]
+    possible = [each for each in candidates if each is not None and _stands(each)]
     tried: list[_Candidate] = []
     # Time is limited: at most this many candidates are looked at.
     for each in sorted(possible, key=lambda candidate: -candidate.score)[:8]:
@@ -102,18 +92,19 @@ def _confirmed(seen: SeenPanorama, candidate: _Candidate, *, passers_by: bool, t
     nobody = np.zeros(MAP_HW, np.bool_)
     for idx in range(3):
         view = _look_at(candidate)
-        if idx == 0 and _probability_in(candidate, seen.probability(view), view) < _MIN_FIRST:
+        if idx == 0 and _probability_in(candidate, seen.probability(view), view) < 0.1:
             return nobody
-        again = _candidate(seen.outline(view), view)
-        if again is None or not _may_be_person(again, _MIN_FIRST_ASPECT):
+        again = _candidate(seen.middle(view)[1], view)
+        if again is None or not _stands(again):
             return nobody
         grows = again.extent_deg > 1.25 * candidate.extent_deg
         candidate = again
         if not grows:
             break
     tried.append(candidate)
-    # The feet of the operator are at least so far below the horizon.
-    if not _may_be_person(candidate, _MIN_ASPECT) or (not passers_by and candidate.span_deg[0] > -40.0):
+    # People are taller than wide; tables and benches are not. The feet of the operator are at least so far below the
+    # horizon.
+    if candidate.aspect < 1.15 or (not passers_by and candidate.span_deg[0] > -40.0):
         return nobody
     mean = _seen_again(seen, candidate)
     if mean is None:
@@ -127,31 +118,22 @@ def _seen_again(seen: SeenPanorama, candidate: _Candidate) -> Map | None:
     """Return the mean outline, `MAP_HW`, in several views of a candidate; None if they do not show a person."""
     first = _look_at(candidate)
     probability = _probability_in(candidate, seen.probability(first), first)
-    if probability < _MIN_PROBABILITY:
+    if probability < 0.65:
         return None
-    if not _is_present(seen, candidate, _AGAIN) and (
-        probability < 0.75 or not _is_present(seen, candidate, _TO_THE_WAIST)
-    ):
-        return None
-    outlines = []
-    for roll_deg, mirrored, wider, _ in _AGAIN:
+    presences, outlines = [], []
+    for roll_deg, mirrored, wider in ((0.0, False, 1.0), (12.0, True, 1.0), (-12.0, False, 1.2)):
         view = _look_at(candidate, roll_deg, wider)
-        outlines.append(view.on_map(seen.outline(view, mirrored=mirrored)))
-    mean = np.asarray(np.mean(outlines, axis=0), np.float32)
-    overlaps = [_overlap(each > _BELONGS, mean > _BELONGS) for each in outlines]
-    return mean if np.mean(overlaps) >= 0.72 else None
-
-
-def _is_present(seen: SeenPanorama, candidate: _Candidate, views: tuple[tuple[float, bool, float, float], ...]) -> bool:
-    """Return whether a person is detected in all views of a candidate but one."""
-    missed = 0
-    for roll_deg, mirrored, wider, lower in views:
-        view = _look_at(candidate, roll_deg, wider, lower=lower)
-        # A person is detected in most of the views.
-        missed += seen.presence(view, mirrored=mirrored) < 0.5
-        if missed > 1:
-            return False
-    return True
+        presence, outline = seen.middle(view, mirrored=mirrored)
+        presences.append(presence)
+        outlines.append(view.on_map(outline))
+    # A person is detected in all views but one, or in all but one of those half a height lower, which show somebody who
+    # is seen down to the waist.
+    if sum(presence < 0.5 for presence in presences) > 1:
+        lower = [_look_at(candidate, wider=wider, lower=0.5) for wider in (1.33, 1.67)]
+        missed = [seen.middle(view, mirrored=mirrored)[0] < 0.5 for view in lower for mirrored in (False, True)]
+        if probability < 0.75 or sum(missed) > 1:
+            return None
+    return np.asarray(np.mean(outlines, axis=0), np.float32)
 
 
 def _look_at(candidate: _Candidate, roll_deg: float = 0.0, wider: float = 1.0, *, lower: float = 0.0) -> Look:
@@ -172,13 +154,12 @@ def _probability_in(candidate: _Candidate, probability: Map, view: Look) -> floa
     return float(probability[y[inside], x[inside]].mean()) if inside.any() else 0.0
 
 
-def _may_be_person(candidate: _Candidate, min_aspect: float) -> bool:
-    """Return whether a candidate is upright and stands on the ground, and is not furniture or a part of a facade."""
+def _stands(candidate: _Candidate) -> bool:
+    """Return whether a candidate may stand on the ground, and is not a part of a facade."""
     feet_deg, head_deg = candidate.span_deg
     # People stand on the ground: their heads are not much farther above the horizon than their feet are below it. Those
     # beside the camera may be taller than it, and may be seen in part.
-    stands = feet_deg < -30.0 or head_deg < 4.0 - 0.8 * feet_deg
-    return stands and candidate.aspect >= min_aspect
+    return feet_deg < -30.0 or head_deg < 4.0 - 0.8 * feet_deg
 
 
 def _same(first: _Candidate, second: _Candidate) -> bool:
@@ -186,11 +167,6 @@ def _same(first: _Candidate, second: _Candidate) -> bool:
     apart_deg = np.degrees(np.arccos(np.clip(first.center @ second.center, -1, 1)))
     smaller, larger = sorted((first.extent_deg, second.extent_deg))
     return bool(apart_deg < 0.15 * smaller and larger < 1.2 * smaller)
-
-
-def _overlap(first: Mask, second: Mask) -> float:
-    weights = pixel_weights(MAP_HW)
-    return float(weights[first & second].sum() / max(weights[first | second].sum(), 1e-9))
 
 
 def _geometry(view: Look) -> tuple[FloatArray, FloatArray]:
@@ -210,9 +186,9 @@ def _middle() -> Map:
 
 @cache
 def _ring() -> tuple[Look, ...]:
-    elevation = np.radians(_RING_ELEVATION_DEG)
+    elevation = np.radians(-12.0)
     looks = []
-    for azimuth in np.radians(np.arange(_RING) * 360 / _RING):
+    for azimuth in np.radians(np.arange(0, 360, 45)):
         x, z = np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth)
-        looks.append(stereographic_look(upright_rotation(np.array([x, -np.sin(elevation), z])), _RING_FOV_DEG))
+        looks.append(stereographic_look(upright_rotation(np.array([x, -np.sin(elevation), z])), 85.0))
     return tuple(looks)

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import cache, cached_property
-from importlib import resources
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.learned.networks import packaged_network
 from pano_mvs.algorithms.panoramas import reduced_panorama
 from pano_mvs.core.arrays import FloatArray, Picture
-from pano_mvs.core.errors import StoreError
 from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec
 
 SIDE_PX = 256
 """Width and height of the pictures that the networks read."""
 
+Map = NDArray[np.float32]
+
 # By the digest, another file means another code, so that no result of the old one is taken from a cache.
-_SEGMENTATION = ("selfie_segmentation.tflite", "8d13b7fae74af625c641226813616a2117bd6bca19eb3b75574621fc08557f27")
-_POSE = ("pose_landmark_lite.tflite", "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61")
+_SEGMENTATION = ("selfie_segmentation.onnx", "b5c610678298bd36b88394d5521cf7cc41125de25bfb19cebedd016cc70ebb63")
+_POSE = ("pose_landmark_lite.onnx", "7b3f914a1c2bd0ec93cd75542d364320b0ab39b92800adcb7c0b74e327d35c05")
+_MODELS = Path(__file__).parent / "models"
 
 
-def person_probability(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+def person_probability(picture: Picture) -> Map:
     """Return how likely each pixel shows a person, (256, 256) in [0, 1], of an upright picture of one person or none.
 
     The network was trained on people who fill a large part of an upright picture. On its own it also finds floors,
@@ -32,37 +34,23 @@ def person_probability(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
     `picture`: (256, 256, 3) uint8 RGB.
     """
-    output = _output(_SEGMENTATION, picture, None)
-    return np.clip(output.reshape(SIDE_PX, SIDE_PX), 0, 1)
+    return packaged_network(_MODELS / _SEGMENTATION[0], _SEGMENTATION[1])(picture=picture)[0]
 
 
-def person_presence(picture: NDArray[np.uint8]) -> float:
-    """Return how likely an upright picture shows a person in its middle, in [0, 1].
+def person_in_middle(picture: Picture) -> tuple[float, Map]:
+    """Return how likely an upright picture shows a person in its middle, and how likely each pixel is of what is there.
 
-    It is the flag by which the network for poses says whether its landmarks mean anything.
+    The network for poses outlines a person there more exactly than `person_probability`; otherwise some object. The
+    first number is the flag by which it says whether its landmarks mean anything.
 
     `picture`: (256, 256, 3) uint8 RGB.
+
+    Returns:
+        Both in [0, 1]; the second one is (256, 256).
     """
-    return float(_output(_POSE, picture, "Identity_1").reshape(-1)[0])
+    presence, outline = packaged_network(_MODELS / _POSE[0], _POSE[1])(picture=picture)
+    return float(presence[0]), outline
 
-
-def _output(model: tuple[str, str], picture: NDArray[np.uint8], name: str | None) -> NDArray[np.float32]:
-    """Return an output of a network, its only one without a name."""
-    network = _network(*model)
-    network.setInput(cv2.dnn.blobFromImage(picture, 1 / 255))
-    return np.asarray(network.forward() if name is None else network.forward(name), np.float32)
-
-
-@cache
-def _network(file: str, digest: str) -> cv2.dnn.Net:
-    """Return a network, loaded once per process."""
-    content = (resources.files("pano_mvs.algorithms.masks") / "models" / file).read_bytes()
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise StoreError(f"{file}: this file of the package is damaged. Install pano-mvs again")
-    return cv2.dnn.readNetFromTFLite(np.frombuffer(content, np.uint8))
-
-
-Map = NDArray[np.float32]
 
 MAP_HW = (256, 512)
 """Size of maps of directions."""
@@ -159,18 +147,10 @@ class SeenPanorama:
         found = person_probability(self.image(look, mirrored=mirrored))
         return found[:, ::-1] if mirrored else found
 
-    def outline(self, look: Look, *, mirrored: bool = False) -> Map:
-        """Return how likely each pixel of a view, (256, 256), is of what is in its middle.
-
-        The network for poses outlines a person there more exactly than `person_probability`; otherwise some object.
-        """
-        logits = _output(_POSE, self.image(look, mirrored=mirrored), "Identity_2").reshape(SIDE_PX, SIDE_PX)
-        found = np.asarray(1 / (1 + np.exp(-np.clip(logits, -30, 30))), np.float32)
-        return found[:, ::-1] if mirrored else found
-
-    def presence(self, look: Look, *, mirrored: bool = False) -> float:
-        """Return how likely a view shows a person in its middle."""
-        return person_presence(self.image(look, mirrored=mirrored))
+    def middle(self, look: Look, *, mirrored: bool = False) -> tuple[float, Map]:
+        """Return how likely a view shows a person in its middle, and its outline, as by `person_in_middle`."""
+        presence, outline = person_in_middle(self.image(look, mirrored=mirrored))
+        return presence, outline[:, ::-1] if mirrored else outline
 
 
 def look(view_from_cam: FloatArray, fov_deg: float) -> Look:

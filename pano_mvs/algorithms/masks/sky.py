@@ -19,15 +19,14 @@ from pano_mvs.algorithms.masks.areas import (
     reduced_to_width,
 )
 from pano_mvs.algorithms.masks.sky_coefficients import FIRST, LATER
-from pano_mvs.algorithms.masks.sky_comparison import compare_with_source
-from pano_mvs.algorithms.masks.sky_features import Labels, View, area_features
+from pano_mvs.algorithms.masks.sky_features import Labels, View, area_features, compare_with_source
 from pano_mvs.algorithms.panoramas import box_sum, contrast_around, filtered, largest_channel, nearest_resized
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
 
-_TOLERANCE, _SPREAD, _MAX_TOLERANCE = 7.0, 3.0, 40.0
+_TOLERANCE = 7.0
 _BAND_PX, _BAND_BESIDE_PX = 2, 3
 
 
@@ -69,7 +68,7 @@ def sky_colors(picture: Picture, seeds: Mask) -> SkyColors:
         mean = share[..., None] * local + (1 - share)[..., None] * mean
         squares = box_sum(largest_channel((levels - mean) ** 2) * seeds, radius) / np.maximum(count, 1)
         spread = share * np.sqrt(squares) + (1 - share) * spread
-    tolerance = np.minimum(_TOLERANCE + _SPREAD * spread, _MAX_TOLERANCE)
+    tolerance = np.minimum(_TOLERANCE + 3.0 * spread, 40.0)
     return SkyColors(mean.astype(np.float32), tolerance.astype(np.float32))
 
 
@@ -117,17 +116,8 @@ def _box(values: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
 MAX_SOURCES = 4
 """More sources than this add little."""
 
-_MIN_WIDTH = 64
-# Grey levels between the darkest and the brightest pixel of a 3×3 window of a smooth area.
-_SMOOTH = 16
-# Smaller areas of the sphere are not judged without known sky; farther from it, its colours are not known.
-_MIN_SHARE, _REACH_PX = 1e-4, 40
-_ROUNDS = 3
 MIN_PROBABILITY = 5 / 6
 """An area is sky above this: five missed ones cost as much as a surface that is lost, as in the verdict on cameras."""
-
-# Larger parts within the sky are something else.
-_SPECK_SHARE = 1e-3
 
 
 def sky_pixels(
@@ -162,7 +152,7 @@ def sky_pixels(
         raise UsageError(f"the picture is {picture.shape[:2]}, its ranges are {range_map.range.shape}")
     if not sources or not len(sources) == len(source_from_reference) == len(source_valid):
         raise UsageError("the sky needs one or more sources, each with its pose and mask")
-    if picture.shape[1] < _MIN_WIDTH:
+    if picture.shape[1] < 64:
         return np.zeros_like(valid)
     used = list(zip(sources, source_valid, source_from_reference, strict=True))[:MAX_SOURCES]
     view = view_of(range_map, picture, valid, sources=used, up=up)
@@ -198,12 +188,14 @@ def view_of(
 def judged_areas(view: View, models: tuple[Model, Model]) -> tuple[Mask, list[tuple[Labels, dict[str, FloatArray]]]]:
     """Return the sky, (H, W), and the areas of each round, with what was measured on them."""
     far = opened_areas(view.far, 1)  # clouds
-    smooth = view.valid & (far | (contrast_around(view.picture, 1) < _SMOOTH))
-    areas = _numbered(area_labels(smooth), view, min_share=_MIN_SHARE)
+    # Grey levels between the darkest and the brightest pixel of a 3×3 window of a smooth area.
+    smooth = view.valid & (far | (contrast_around(view.picture, 1) < 16))
+    # Smaller areas of the sphere are not judged without known sky.
+    areas = _numbered(area_labels(smooth), view, min_share=1e-4)
     sky: Mask = np.zeros_like(view.valid)
     away = np.zeros(view.valid.shape, np.float32)  # from the colours of the sky, once these are known
     done: list[tuple[Labels, dict[str, FloatArray]]] = []
-    while (areas >= 0).any() and len(done) < _ROUNDS:
+    while (areas >= 0).any() and len(done) < 3:
         features = area_features(view, areas)
         if done:
             features |= {
@@ -218,7 +210,8 @@ def judged_areas(view: View, models: tuple[Model, Model]) -> tuple[Mask, list[tu
         sky = sky | taken
         colors = sky_colors(view.picture, sky)
         away = np.asarray(largest_channel(np.abs(view.picture - colors.mean)) / colors.tolerance)
-        reached = view.valid & ~sky & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        # Farther from known sky, its colours are not known.
+        reached = view.valid & ~sky & dilated(sky, min(40, len(sky) // 2 - 1))
         areas = _numbered(area_labels(reached & (far | (away <= 1))), view)
     return _without_specks(sky, view), done
 
@@ -233,7 +226,8 @@ def _without_specks(sky: Mask, view: View) -> Mask:
     """Return the sky with the specks in it that are too small to be judged and that other views do not confirm."""
     labels = area_labels(view.valid & ~sky)
     sizes, known = (area_sizes(labels, view.weights * part) for part in (1.0, view.confirmed))
-    small = (sizes < _SPECK_SHARE * view.weights.sum()) & (2 * known < sizes) & (border_shares(labels, sky) > 0.99)
+    # Larger parts within the sky are something else.
+    small = (sizes < 1e-3 * view.weights.sum()) & (2 * known < sizes) & (border_shares(labels, sky) > 0.99)
     return np.asarray(sky | ((labels >= 0) & small[labels]), np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""What is measured on each area of a panorama that shows whether it is the sky."""
+"""What is measured on each area of a panorama that shows whether it is the sky, compared with its sources."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.masks.areas import DARK_LEVEL, dilated, pixel_weights
-from pano_mvs.algorithms.masks.sky_comparison import Colors, Comparison, source_errors
 from pano_mvs.algorithms.panoramas import box_sum, largest_channel, mean_around
 from pano_mvs.algorithms.sweep.preparation import is_bare
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
-from pano_mvs.geometry import pad_panorama, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, sample_panorama
 
 # Below this parallax, infinity and the range look the same.
 _MIN_PARALLAX_PX = 1.0
@@ -25,6 +24,54 @@ _CLEARLY = 3.0
 _BESIDE_PX, _MIN_PIXELS = 4, 8
 
 Labels = NDArray[np.int64]
+Colors = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A source as seen from the reference."""
+
+    # (H, W, 3) colours of the source where each pixel would be if it were infinitely far away; NaN where the source is
+    # masked
+    at_infinity: Colors
+    at_range: Colors  # the same at the pixel's range; NaN where it has none
+    parallax_px: NDArray[np.float32]  # (H, W) pixels of the reference between the two; 0 without a range
+
+
+def compare_with_source(
+    reference: NDArray[np.uint8],
+    ranges: NDArray[np.float32],
+    source: NDArray[np.uint8],
+    *,
+    source_valid: Mask,
+    source_from_reference: Rigid3,
+) -> Comparison:
+    """Look a source up from a reference.
+
+    `reference`: (H, W, 3) uint8. `ranges`: (H, W) of the reference, NaN without. `source`: (Hs, Ws, 3) uint8.
+    `source_valid`: (Hs, Ws), False is ignored. `source_from_reference`: the pose of the source.
+    """
+    size_hw = (reference.shape[0], reference.shape[1])
+    colors = mean_around(source)
+    colors[~source_valid] = np.nan
+    far = ray_grid(size_hw) @ source_from_reference.rotation.T
+    known = np.isfinite(ranges)
+    points = far * np.where(known, ranges, 1.0)[..., None] + source_from_reference.translation
+    near = points / np.maximum(np.sqrt(_sum(points * points)), 1e-12)[..., None]
+    angle = np.arccos(np.clip(_sum(far * near), -1, 1))
+    source_hw = (source.shape[0], source.shape[1])
+    at_range = sample_panorama(colors, pixel_from_ray(near, source_hw))
+    at_range[~known] = np.nan
+    return Comparison(
+        sample_panorama(colors, pixel_from_ray(far, source_hw)).astype(np.float32),
+        at_range.astype(np.float32),
+        np.where(known, angle * size_hw[1] / (2 * np.pi), 0).astype(np.float32),
+    )
+
+
+def _sum(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x + y + z of vectors (..., 3); `sum` over a short last axis takes several times as long."""
+    return np.asarray(vectors[..., 0] + vectors[..., 1] + vectors[..., 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +110,20 @@ class View:
 
     @cached_property
     def errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The colour differences to each source, (S, H, W), at infinity and at the ranges; NaN without."""
-        return source_errors(self.picture, self.confirmed, self.comparisons)
+        """The colour differences to each source, (S, H, W) in grey levels, at infinity and at the ranges; NaN without.
+
+        Confirmed pixels, at their ranges, give the factor of each channel.
+        """
+        own, errors = self.colors, []
+        for source in self.comparisons:
+            seen = self.confirmed & np.isfinite(source.at_range[..., 0])
+            gain = np.ones(3, np.float32)
+            if seen.any():
+                ratios = (source.at_range[seen] + DARK_LEVEL) / (own[seen] + DARK_LEVEL)
+                gain = np.asarray(np.median(ratios, axis=0), np.float32)
+            errors.append([largest_channel(np.abs(at / gain - own)) for at in (source.at_infinity, source.at_range)])
+        found = np.array(errors, np.float32)
+        return found[:, 0], found[:, 1]
 
     @cached_property
     def least_errors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import Annotated, TypeAlias
 
 import cv2
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.masks.areas import (
     DARK_LEVEL,
     area_labels,
-    closed_areas,
     dilated,
     large_areas,
     opened_areas,
@@ -29,14 +29,12 @@ from pano_mvs.geometry import pad_panorama, ray_grid, rotate_panorama
 Plane = NDArray[np.float32]
 _Compared: TypeAlias = "tuple[Plane, Plane, Plane]"
 
-_RADIUS = 3
 _PAD = 8
 # At most this many pairs are compared, spread over all of them.
 _MAX_PAIRS = 24
 # The share of pairs that may disagree, such as those of a view in which a hand was elsewhere.
 _DISAGREEING = 0.2
 _TILT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_AROUND = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +115,7 @@ def _windows(picture: Picture) -> _Compared:
 
 
 def _mean(values: Plane) -> Plane:
-    side = 2 * _RADIUS + 1
-    return np.asarray(cv2.blur(values, (side, side)), np.float32)
+    return np.asarray(cv2.blur(values, (7, 7)), np.float32)
 
 
 def _zncc(first: _Compared, second: _Compared) -> Plane:
@@ -129,7 +126,9 @@ def _zncc(first: _Compared, second: _Compared) -> Plane:
 def _best_around(first: _Compared, second: _Compared, *, step: int) -> Plane:
     """Return the best ZNCC with windows `step` pixels away in eight directions."""
     best = np.full_like(first[0], -1)
-    for y, x in _AROUND:
+    for y, x in product((-1, 0, 1), repeat=2):
+        if not (y or x):
+            continue
         grey, mean, variance = (np.roll(plane, (step * y, step * x), (0, 1)) for plane in second)
         np.maximum(best, _zncc(first, (grey, mean, variance)), out=best)
     return best
@@ -142,7 +141,7 @@ MAX_VIEWS = 12
 """More views than this add nothing; give an evenly spread choice."""
 
 _MIN_WIDTH = 128
-_CLOSING_PX, _OVERHANG_PX = 2, 3
+_CLOSING_PX = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,7 +233,7 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     brightness = np.median([largest_channel(picture) for picture in pictures], axis=0)
     # How much colours may differ: in grey levels, and as a share of the brightness.
     alike = color_difference(pictures, _gains(pictures, core)) <= 8.0 + 0.05 * brightness
-    closed = closed_areas(core, _CLOSING_PX)
+    closed = ~dilated(~dilated(core, _CLOSING_PX), _CLOSING_PX) | core
     # Beside which three fifths of the views have an edge.
     edges = np.quantile([contrast_around(picture, 1) for picture in pictures], 0.4, axis=0) >= 12
     outline = closed | edges
@@ -252,7 +251,7 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     sizes = np.bincount(labels[~result], weights[~result], labels.size)
     result[~result] = sizes[labels[~result]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
     # Windows that agree reach over the outline by most of their radius.
-    return np.asarray((result & alike) | ~dilated(~result, _OVERHANG_PX))
+    return np.asarray((result & alike) | ~dilated(~result, 3))
 
 
 def _gains(pictures: Sequence[Picture], pixels: Mask) -> NDArray[np.float64]:

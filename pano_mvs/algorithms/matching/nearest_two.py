@@ -52,10 +52,8 @@ def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> Near
     return NearestTwo(nearest, -2 * best, -2 * runner_up, -2 * best_back)
 
 
-# Sums of products stay below 3 × 2^27; padding of the last block is farther away, and the initial value even farther.
-_MAX_SQUARE = 1 << 27
-_FAR = 1 << 29
 _START = -(1 << 30)
+"""Farther away than the padding of the last block, which is farther than sums of products, below 3 × 2^27."""
 
 
 def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
@@ -66,7 +64,7 @@ def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
         return False
     # The comparison is also false for NaN.
     greatest = float(np.abs(descriptors).max(initial=0))
-    return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
+    return greatest**2 * descriptors.shape[1] <= 1 << 27 and np.array_equal(descriptors, np.rint(descriptors))
 
 
 class Comparable:
@@ -132,7 +130,7 @@ def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.in
 
 def _squares(descriptors: NDArray[np.int16], count: int) -> NDArray[np.int32]:
     """Return the squared lengths; those after the first `count` are larger than any distance."""
-    squares = np.full(len(descriptors), _FAR, np.int32)
+    squares = np.full(len(descriptors), 1 << 29, np.int32)
     squares[:count] = np.einsum("nd,nd->n", descriptors[:count], descriptors[:count], dtype=np.int32)
     return squares
 

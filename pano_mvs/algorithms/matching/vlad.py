@@ -14,7 +14,6 @@ from pano_mvs.scene import Features, GlobalDescriptor
 
 _CELL_BITS = 4
 _RESIDUAL_SIZE = 128
-_LENGTH = 1024.0
 
 
 @checks_settings
@@ -56,7 +55,7 @@ def vlad_descriptor(
     sums = np.stack([np.bincount(cell, column, 1 << _CELL_BITS) for column in residuals.T], axis=1)
     sums = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     vector = (np.sign(sums) * np.sqrt(np.abs(sums))).ravel()
-    vector *= _LENGTH / max(float(np.linalg.norm(vector)), 1e-12)
+    vector *= 1024.0 / max(float(np.linalg.norm(vector)), 1e-12)
     return GlobalDescriptor(np.rint(vector).astype(np.float32), largest)
 
 

@@ -31,10 +31,11 @@ from pano_mvs.geometry import Rigid3, sines_of_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
-# Samples along each side of a window, two pixels apart; their weights and the noise as in `refine_range`.
-_WINDOW, _SIGMA_COLOR, _NOISE = 5, 25.0, 0.4
-# The sources that match best decide; of those that agree, more than this many say no more.
-_BEST, _MOST_AGREEING = 2, 3
+_WINDOW = 5
+"""Samples along each side of a window, two pixels apart."""
+
+_MOST_AGREEING = 3
+"""Of the sources that agree, more than this many say no more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +242,7 @@ class _Matcher:
         planes = surface_planes(offers.ranges, offers.normals, _rays_of(offers.pixels, (height, width)))
         starts = np.searchsorted(rows, np.arange(height + 1))
         found = np.empty((self.count, len(order)), np.float32)
-        numbers = np.float32(1 / _SIGMA_COLOR), np.float32(_NOISE**2)
+        numbers = np.float32(1 / 25.0), np.float32(0.4**2)  # as in `refine_range`
 
         def match(first: int, rows: int) -> None:
             correlate_pixels(
@@ -249,7 +250,7 @@ class _Matcher:
             )
 
         for_bands(match, height, threads=numba.get_num_threads())
-        best = min(_BEST, self.count)
+        best = min(2, self.count)  # these decide
         some = np.partition(found, self.count - best, axis=0)[-best:]
         correlations = np.empty(len(order), np.float32)
         correlations[order] = np.maximum(some, 0).mean(axis=0)

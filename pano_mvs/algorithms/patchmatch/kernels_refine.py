@@ -27,8 +27,6 @@ _F = np.float32
 _U = np.uint64
 # Number of pixels of a row whose planes are fitted together, so that their windows fit the cache.
 _FIT_STRETCH = 128
-# Minimum weight of the pixels of a plane, and minimum determinant of their covariance in u and v.
-_MIN_WEIGHT, _MIN_SPREAD = 5.0, 0.25
 
 
 @kernel
@@ -98,7 +96,8 @@ def _solve_slopes(sums: FloatArray, slopes: FloatArray) -> None:
         suu, suv, svv = sums[3, i] / n - mu * mu, sums[4, i] / n - mu * mv, sums[5, i] / n - mv * mv
         squ, sqv = sums[7, i] / n - mq * mu, sums[8, i] / n - mq * mv
         determinant = suu * svv - suv * suv
-        if n >= _MIN_WEIGHT and determinant >= _MIN_SPREAD:
+        # Minimum weight of the pixels of a plane, and minimum determinant of their covariance in u and v.
+        if n >= 5.0 and determinant >= 0.25:
             beta, gamma = (svv * squ - suv * sqv) / determinant, (suu * sqv - suv * squ) / determinant
             slopes[0, i] = mq - beta * mu - gamma * mv
             slopes[1, i] = beta
@@ -215,9 +214,6 @@ def fit_planes(
 Reference = tuple[NDArray[np.float32], NDArray[np.float32], int, FloatArray, NDArray[np.int64], NDArray[np.int64]]
 Numbers = tuple[np.float32, np.float32, float, float, float, np.float32]
 
-# Windows with a lower correlation show different surfaces.
-_MIN_CORRELATION = 0.2
-
 
 @kernel
 def correlate_sources(
@@ -322,7 +318,7 @@ def most_likely_steps(
         normal[:] = 0.0
         right[:] = 0.0
         normal[0], normal[3], normal[5] = prior[0], prior[1], prior[1]
-        least = _F(_MIN_CORRELATION)
+        least = _F(0.2)  # windows with a lower correlation show different surfaces
         if not weighted:
             least = max(least_of_best(correlations, i, held), least)
         for s in range(correlations.shape[0]):

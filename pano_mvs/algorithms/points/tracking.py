@@ -290,9 +290,6 @@ def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, *, ke
     )
 
 
-# Ratio of points after voxel selection, and number of a point's neighbours to examine for discs: points are on
-# surfaces, where no more fit around one.
-_CHOICE, _NEIGHBOURS = 2.5, 16
 _LEVELS_PER_OCTAVE = 3
 # Odd numbers without structure, to hash the positions of voxels to 64-bit numbers.
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64)
@@ -320,7 +317,7 @@ def spread_points(
     """
     if points.ndim != 2 or spacing.shape != (len(points),) or not (spacing > 0).all() or count < 1:
         raise UsageError("spread_points needs points (M, 3), as many positive spacings, and a positive count")
-    kept = _one_per_voxel(points, spacing, int(np.ceil(_CHOICE * count)))
+    kept = _one_per_voxel(points, spacing, int(np.ceil(2.5 * count)))
     if len(kept) > count:
         kept = kept[_discs(points[kept], spacing[kept], count, rng=rng)]
     dropped = rng.permutation(len(kept))[count:]
@@ -356,7 +353,7 @@ def _discs(
 ) -> NDArray[np.intp]:
     """Return points of which no two are closer than the smaller of their discs' radii."""
     order = rng.permutation(len(points))
-    ranks = list(range(2, min(_NEIGHBOURS, len(points)) + 1))
+    ranks = list(range(2, min(16, len(points)) + 1))  # points are on surfaces, where no more fit around one
     distance, neighbour = (np.asarray(found) for found in cKDTree(points).query(points, k=ranks))
     first = np.repeat(np.arange(len(points)), distance.shape[1])
     second = neighbour.ravel()

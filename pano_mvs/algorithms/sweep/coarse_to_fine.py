@@ -51,11 +51,8 @@ _ROW_LINES = 32
 _TABLE_PER_PLANE = 8
 # Guides closer than this are one surface.
 _MIN_GAP = 0.5
-# Shares of the worst cost: a match this dear is a poor one; it is odd if it is dearer than its tile by this; and
-# another is better if it is cheaper by this.
-_NO_MATCH, _UNUSUAL, _BETTER = 0.2, 0.15, 0.03
 _SEARCH_STEP = 2
-_ADOPT_RADIUS, _ADOPT_GAP = 2, 3.0
+_ADOPT_RADIUS = 2
 
 
 class GuidedSweep:
@@ -111,7 +108,9 @@ class GuidedSweep:
         settings, unit = self.work.settings, 255.0 if self._by_paths else self.work.settings.worst_cost
         least = self.volume.min(axis=1).astype(np.float32)
         usual = spread_tiles(tile_means(least), least.shape)
-        odd = (least > _NO_MATCH * unit) & (least > usual + _UNUSUAL * unit) & ~is_bare(self.work.reference)
+        # Shares of the worst cost: a match this dear is a poor one; it is odd if it is dearer than its tile by this;
+        # and another is better if it is cheaper by this.
+        odd = (least > 0.2 * unit) & (least > usual + 0.15 * unit) & ~is_bare(self.work.reference)
         tiles = tile_means(odd) > 0.03
         runs = runs_of(tiles, least.shape, self._shared.windows)
         if not runs:
@@ -120,10 +119,10 @@ class GuidedSweep:
         costs = np.full(least.shape, np.inf, np.float32)
         run_jobs(self._pool, partial(self._search_run, plane, costs), runs)
         costs *= unit / settings.worst_cost
-        costs[~(costs + _BETTER * unit < least)] = np.inf
+        costs[~(costs + 0.03 * unit < least)] = np.inf
         adopted = np.full(least.shape, np.nan, np.float32)
         padded = [pad_panorama(picture, _ADOPT_RADIUS) for picture in (plane, costs)]
-        adopt_candidates(*padded, _ADOPT_RADIUS, np.float32(_ADOPT_GAP), adopted)
+        adopt_candidates(*padded, _ADOPT_RADIUS, np.float32(3), adopted)
         self._adopt(np.where(spread_tiles(tiles, least.shape), adopted, np.nan))
 
     def _search_run(self, plane: NDArray[np.float32], costs: NDArray[np.float32], run: TileRun) -> None:
@@ -188,8 +187,7 @@ class GuidedSweep:
         return Winners(plane, costs[0], costs[1], costs[2], costs[3], position - plane)
 
 
-# Two surfaces meet where positions within this many coarse pixels differ by more planes.
-_SPLIT_RADIUS, _SPLIT_GAP = 2, 6.0
+_SPLIT_RADIUS = 2
 
 
 def find_winners_coarse_to_fine(work: SweepInput, *, find_coarsest: Callable[[SweepInput], Winners]) -> Winners:
@@ -206,7 +204,8 @@ def find_winners_coarse_to_fine(work: SweepInput, *, find_coarsest: Callable[[Sw
     position *= (work.settings.planes - 1) / (coarse.settings.planes - 1)
     layers = np.empty((2, *position.shape), np.float32)
     padded = pad_panorama(position.astype(np.float32), _SPLIT_RADIUS)
-    split_layers(padded, _SPLIT_RADIUS, np.float32(_SPLIT_GAP), layers)
+    # Two surfaces meet where positions within this many coarse pixels differ by more planes.
+    split_layers(padded, _SPLIT_RADIUS, np.float32(6), layers)
     guides = np.stack([_doubled(layer) for layer in layers])
     with workers() as pool:
         winners = GuidedSweep(work, guides, pool).find_winners()

@@ -89,7 +89,7 @@ def _points_at(work: SweepInput, row: int, column: int) -> NDArray[np.float64]:
     return work.ranges[:, None] * ray
 
 
-_PATHS, _WORST = 8, 255
+_WORST = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
         ranges=work.ranges,
         by_source=np.stack([_of_source(work, idx, row=row, column=column) for idx in range(len(work.sources))]) / worst,
         raw=raw / worst,
-        aggregated=None if sums is None else sums / (_PATHS * _WORST),
+        aggregated=None if sums is None else sums / (8 * _WORST),
         winner=winner,
         runner_up=int(valleys[np.argmin(decisive[valleys])]) if len(valleys) else None,
         uniqueness=_uniqueness(float(winners.cost[0, 0]), float(winners.rival[0, 0])),

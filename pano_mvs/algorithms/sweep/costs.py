@@ -85,10 +85,6 @@ def checked_cost(cost: NDArray[np.floating[Any]], size_hw: tuple[int, int], name
     return checked
 
 
-# In grey levels, summed over R, G and B: a pixel that differs by more is simply wrong.
-_MAX_SAD = 96.0
-
-
 def absolute_differences(
     reference: NDArray[np.uint8], warped: NDArray[np.floating[Any]], _: CostWindow
 ) -> NDArray[np.float64]:
@@ -103,7 +99,7 @@ SAD = SweepCost(
     colors=True,
     minds_exposure=True,
     radius=0,
-    worst=lambda _: _MAX_SAD,
+    worst=lambda _: 96.0,  # in grey levels, summed over R, G and B: a pixel that differs by more is simply wrong
     kernel=kernels_constants.SAD,
 )
 
@@ -155,14 +151,13 @@ def max_census(radius: int) -> int:
 CENSUS = SweepCost("census", census_cost, min_window=3, worst=max_census, kernel=kernels_constants.CENSUS)
 
 
-_CENSUS_SHARE = 4
 # Of one colour instead of three, every difference is a third.
 _MAX_GREY = GREY_WEIGHT * (MAX_COLOR_COST + MAX_GRADIENT_COST) // 3
 
 
 def census_weight(radius: int) -> int:
     """Return what a disagreement counts beside grey levels: at worst, all of them four times as much."""
-    return _CENSUS_SHARE * max(1, round(_MAX_GREY / max(1, max_census(radius))))
+    return 4 * max(1, round(_MAX_GREY / max(1, max_census(radius))))
 
 
 def census_gradient_cost(

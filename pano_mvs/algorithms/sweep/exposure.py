@@ -12,13 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.panoramas import filtered
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
 
-# No camera's exposures differ by more; a fit that says so has met moved things or bare walls.
-_GAIN_LIMITS = 0.4, 2.5
 # A source is looked up between its pixels, which takes contrast away; so far from pixel centres along both axes the
 # reference loses as much on average (w (1 − w) is 1/6, its mean), and smoothing leaves little of either.
 _BETWEEN_PIXELS, _SMOOTHING_PX = 0.2113, 0.8
-# Colours beyond these are cut off, and what of it (255 is all) smoothing may bring into a pixel.
-_ENDS, _MAX_CUT_OFF = (3, 252), 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ def match_exposure(
     pixels = pixel_from_ray(source_from_reference.apply(known.points), source.shape[:2])
     seen = sample_panorama(_smooth(source), pixels)
     cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + known.cut_off
-    usable = cut_off[..., 0] < _MAX_CUT_OFF
+    usable = cut_off[..., 0] < 10.0  # 255 is all
     if source_mask is not None:
         usable &= sample_panorama(source_mask, pixels) > 0.999
     lines = [_robust_line(seen[usable, c], known.colors[usable, c]) for c in range(seen.shape[-1])]
@@ -101,8 +97,9 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
         offset = float(mean_y - gain * mean_x)
     darkest, brightest = np.quantile(x, [0.05, 0.95])
     change = max(abs(gain * level + offset - level) for level in (darkest, brightest))
-    # A smaller change of all grey levels is ignored: wrong ranges and noise cause as much.
-    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < 2.0:
+    # No camera's exposures differ by more; a fit that says so has met moved things or bare walls. A smaller change of
+    # all grey levels is ignored: wrong ranges and noise cause as much.
+    if not 0.4 < gain < 2.5 or change < 2.0:
         return 1.0, 0.0
     return gain, offset
 
@@ -111,7 +108,7 @@ def _at_an_end(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return 255 where a colour is so dark or so bright that it may have been cut off, (H, W, 1)."""
     at_an_end = np.zeros(picture.shape[:2], np.bool_)
     for c in range(picture.shape[-1]):  # many times as fast as `any` over a short last axis
-        at_an_end |= (picture[..., c] <= _ENDS[0]) | (picture[..., c] >= _ENDS[1])
+        at_an_end |= (picture[..., c] <= 3) | (picture[..., c] >= 252)
     return np.where(at_an_end[..., None], np.uint8(255), np.uint8(0))
 
 

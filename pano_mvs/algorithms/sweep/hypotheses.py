@@ -13,10 +13,8 @@ from pano_mvs.geometry import Rigid3
 
 Spacing = Literal["parallax", "inverse", "log", "uniform"]
 
-# A surface this near, as a share of the mean baseline, is expected anywhere …
+# A surface this near, as a share of the mean baseline, is expected anywhere.
 _NEAREST_BASELINES = 0.5
-# … and a point this much parallax away from infinity looks the same as one at infinity.
-_MIN_PARALLAX_PX = 0.5
 
 
 def virtual_ranges(
@@ -75,7 +73,7 @@ def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, floa
     longest = max(baselines, default=0.0)
     if not (longest > 0 and np.isfinite(longest)):
         raise UsageError("a sweep needs a source at some distance from the reference: all baselines are zero")
-    return _NEAREST_BASELINES * mean_baseline(baselines), longest / (_MIN_PARALLAX_PX * 2 * np.pi / width)
+    return _NEAREST_BASELINES * mean_baseline(baselines), longest / (0.5 * 2 * np.pi / width)
 
 
 def mean_baseline_of(source_from_reference: Sequence[Rigid3]) -> float:

@@ -34,7 +34,7 @@ _MAX_PICTURES = 5
 _NEAREST_BASELINES = 0.05
 # A plain surface nearer than any textured one ends in the nearest planes, in an area of at least this share of the
 # sphere. The near limit is then lowered in steps of half an octave. Where four do not help, chance decides.
-_NEAREST_PLANES, _MIN_ENDED_SHARE, _MAX_STEPS = 3, 0.003, 4
+_MIN_ENDED_SHARE = 0.003
 
 
 def limits_by_sweeping(
@@ -141,10 +141,10 @@ def _lowered(near: float, far: float, sweeps: _SmallSweeps) -> float:
     bare = is_bare(sweeps.pictures[0])
     most_px = _MIN_ENDED_SHARE * 2 / np.pi * bare.size
     baseline = mean_baseline(_baselines(0, sweeps.poses))
-    for step in range(_MAX_STEPS + 1):
+    for step in range(4 + 1):
         lower = near / 2 ** (step / 2)
         found = sweeps.range_map(0, near=lower, far=far)
-        first = range_at(_NEAREST_PLANES, lower, far, planes=_PLANES, spacing=_SETTINGS.spacing, baseline=baseline)
+        first = range_at(3, lower, far, planes=_PLANES, spacing=_SETTINGS.spacing, baseline=baseline)
         ended = np.where(bare & (found.range < first), np.float32(lower), np.float32(np.nan))
         if not remove_speckles(with_ranges(found, ended), max_size_px=most_px).valid.any():
             return float(lower)

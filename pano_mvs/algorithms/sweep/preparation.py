@@ -22,8 +22,6 @@ from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_from_pixel, ray_grid, rotate_panorama
 
-# Rec. 709 luma in 1/256.
-_LUMA = np.array([54, 183, 19])
 _ROWS_AT_ONCE = 256
 
 
@@ -82,7 +80,8 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
     grey = np.empty((*picture.shape[:2], 1), np.uint8)
     for first in range(0, len(picture), _ROWS_AT_ONCE):  # 16 bits of all colours at once would be a picture six times
         some = picture[first : first + _ROWS_AT_ONCE].astype(np.uint16)
-        grey[first : first + _ROWS_AT_ONCE, :, 0] = (some @ _LUMA.astype(np.uint16) + 128) >> 8
+        luma = np.array([54, 183, 19], np.uint16)  # Rec. 709, in 1/256
+        grey[first : first + _ROWS_AT_ONCE, :, 0] = (some @ luma + 128) >> 8
     return grey
 
 

@@ -36,8 +36,8 @@ from pano_mvs.scene.range_map import RangeMap
 __all__ = ["SweepSettings", "sweep_range"]
 
 
-# The rough sweep behind the match of exposures.
-_ROUGH_ROWS, _ROUGH_PLANES = 128, 48
+_ROUGH_ROWS = 128
+"""Rows of the rough sweep behind the match of exposures."""
 
 
 def sweep_range(
@@ -155,7 +155,7 @@ def _rough_range(
 
     `masks` are those of the reference and of the sources.
     """
-    settings = SURFACE_SETTINGS.replace(planes=_ROUGH_PLANES, spacing="inverse", window=5, aggregation="box")
+    settings = SURFACE_SETTINGS.replace(planes=48, spacing="inverse", window=5, aggregation="box")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     small_reference = shrink(reference, _ROUGH_ROWS)
     sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]

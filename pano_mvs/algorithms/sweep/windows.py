@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,21 +69,13 @@ class CostWindow:
 
     def neighbours(self, picture: NDArray[Scalar]) -> Iterator[NDArray[Scalar]]:
         """Yield, for each place in the window row by row, the picture's pixel there for every centre, (H, W) each."""
-        for row in range(-self.radius, self.radius + 1):
-            for place in range(2 * self.radius + 1):
-                yield neighbours(picture, row, self.columns[:, place])
-
-
-def box_mean(picture: NDArray[np.float64], window: CostWindow) -> NDArray[np.float64]:
-    """Return the mean over the box that each window spans, all of its columns, (H, W)."""
-    radius, reach = window.radius, window.columns[:, -1]
-    rows = np.sum([neighbours(picture, row, np.zeros_like(reach)) for row in range(-radius, radius + 1)], axis=0)
-    result = np.zeros_like(picture)
-    for columns in np.unique(reach):
-        here = reach == columns
-        shifted = [np.roll(rows[here], shift, axis=1) for shift in range(-columns, columns + 1)]
-        result[here] = np.sum(shifted, axis=0) / ((2 * radius + 1) * (2 * columns + 1))
-    return result
+        bands = WindowBands(self.radius, self.columns, picture.shape[1])
+        padded, places = bands.pad(picture), list(bands.places())
+        for place in range((2 * self.radius + 1) ** 2):
+            found = np.empty_like(picture)
+            for rows, of_band in places:
+                found[rows] = padded[of_band[place]]
+            yield found
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +120,16 @@ class WindowBands:
                     for column in columns
                 ],
             )
+
+
+def box_mean(picture: NDArray[np.float64], window: CostWindow) -> NDArray[np.float64]:
+    """Return the mean over the box that each window spans, all of its columns, (H, W)."""
+    width, radius = picture.shape[1], window.radius
+    if radius == 0:
+        return picture
+    bands = WindowBands(radius, window.columns, width)
+    padded, result = bands.pad(picture), np.empty_like(picture)
+    for rows, reach in bands.reaches():
+        mean = cv2.blur(padded[rows.start : rows.stop + 2 * radius], (2 * reach + 1, 2 * radius + 1))
+        result[rows] = mean[radius:-radius, bands.margin : bands.margin + width]
+    return result

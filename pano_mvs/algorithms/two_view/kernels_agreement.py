@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.core.kernels import inlined, kernel
 
-_CHECKS = (16, 32, 64, 128)  # number of matches after which a hypothesis that lags too far behind is dropped
-
 
 @kernel
 def _squared_error(e: FloatArray, p: FloatArray, q: FloatArray) -> tuple[float, float]:
@@ -47,7 +45,8 @@ def _essential_cost(
         if total >= limit:
             return np.inf
         seen = idx + 1
-        if mean < 1.0 and seen in _CHECKS:
+        # After these numbers of matches, a hypothesis that lags too far behind is dropped.
+        if mean < 1.0 and seen in (16, 32, 64, 128):
             if total > seen * mean + sigmas * math.sqrt(seen * mean * (1.0 - mean)):
                 return np.inf
     return total

@@ -20,11 +20,8 @@ from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import Features
 
-_UNIT, _MOST_DECADES = 100.0, 400.0  # of false alarms: what counts one, and beyond which no more counts
 CERTAIN = -250.0
 """Enough whatever the marks: in ten places, no false pair has as few false alarms (10⁻²³³); equal offices have some."""
-_MOST_TILT_DEG = 4.0  # verticals may be unknown
-_LEAST_PARALLAX_DEG, _LEAST_STD_DEG = 0.5, 0.05
 _BELOW = 0.25  # sine of how far below the horizon a match may lie on a floor
 
 
@@ -58,7 +55,7 @@ WEAKEST, PRIOR_ODDS = -3.0, -0.3
 
 def terms_of(log10_false_alarms: float, marks: Marks) -> FloatArray:
     """Return what counts for and against a pose: one, the exponent of its false alarms, and its marks, (7,)."""
-    return np.array([1.0, min(-log10_false_alarms, _MOST_DECADES) / _UNIT, *marks], np.float64)
+    return np.array([1.0, min(-log10_false_alarms, 400.0) / 100.0, *marks], np.float64)
 
 
 def log_odds_of(log10_false_alarms: float, marks: Marks) -> float:
@@ -94,11 +91,11 @@ def marks_of(
         floor = floor_below(points, np.stack([np.zeros(3), pose.center]), up)
         below = min(int((p @ one < -_BELOW).sum()), int((q @ pose.rotation @ other < -_BELOW).sum()))
         marks = Marks(
-            tilt=min(float(np.rad2deg(angle_between(one, other))), _MOST_TILT_DEG),
+            tilt=min(float(np.rad2deg(angle_between(one, other))), 4.0),  # verticals may be unknown
             floor=min(1.0, floor.points / below) if floor and below else 0.0,
             near=float(np.log2(np.clip(floor.depth, 1.0, 2.0))),
-            parallax=float(np.log2(max(parallax_deg, _LEAST_PARALLAX_DEG))),
-            open=float(np.log2(max(direction_std_deg, _LEAST_STD_DEG))),
+            parallax=float(np.log2(max(parallax_deg, 0.5))),
+            open=float(np.log2(max(direction_std_deg, 0.05))),
         )
         found.append(marks)
     # Of the likely zeniths of turned cameras, those that speak most for the pose.

@@ -22,7 +22,7 @@ from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
+from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets, neighbours
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import ContractError, PluginError, UsageError
 from pano_mvs.geometry import Rigid3
@@ -45,7 +45,8 @@ def test_bands_find_every_place_of_the_window() -> None:
     picture = rng.integers(0, 255, (24, 48), dtype=np.uint8)
     bands = WindowBands.of((24, 48), 3, spherical=True)
     padded = bands.pad(picture)
-    window = list(CostWindow(3, column_offsets((24, 48), 3, spherical=True)).neighbours(picture))
+    columns = column_offsets((24, 48), 3, spherical=True)
+    window = [neighbours(picture, row, columns[:, place]) for row in range(-3, 4) for place in range(7)]
     covered = np.zeros(24, int)
     for rows, places in bands.places():
         covered[rows] += 1

@@ -18,7 +18,7 @@ from pano_mvs.algorithms.two_view.minimal_solvers import (
     samples_needed,
 )
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
+from pano_mvs.geometry import Rigid3, skew
 from tests.algorithms.poses.synthetic_capture import (
     features_from_bearings,
     noisy_bearings,
@@ -26,7 +26,7 @@ from tests.algorithms.poses.synthetic_capture import (
     synthetic_matches,
 )
 from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_of
-from tests.oracles.two_view import MONOMIALS, cubic_equations, in_front, sampson_angles
+from tests.oracles.two_view import sampson_angles
 
 
 def samples_of_five(
@@ -85,18 +85,6 @@ def test_turning_the_cameras_turns_the_solutions() -> None:
     assert len(turned) == len(plain)
     for matrix in expected:
         assert min(np.linalg.norm(turned - s * matrix, axis=(1, 2)).min() for s in (1, -1)) < 1e-6
-
-
-def testcubic_equations_are_the_constraints_of_an_essential_matrix() -> None:
-    rng = rng_of("cubic")
-    basis = rng.normal(size=(3, 4, 3, 3))
-    x, y, z = unknowns = rng.normal(size=3)
-    matrices = np.einsum("a,naij->nij", [*unknowns, 1.0], basis)
-    monomials = np.array([x**i * y**j * z**k for i, j, k in MONOMIALS])
-    squares = matrices @ np.swapaxes(matrices, 1, 2)
-    trace = 2 * squares @ matrices - np.trace(squares, axis1=1, axis2=2)[:, None, None] * matrices
-    expected = np.concatenate([trace.reshape(3, 9), np.linalg.det(matrices)[:, None]], axis=1)
-    np.testing.assert_allclose(cubic_equations(basis) @ monomials, expected, atol=1e-9)
 
 
 def test_samples_without_a_solution_give_none() -> None:
@@ -184,23 +172,6 @@ def test_a_pair_tells_how_well_it_is_determined() -> None:
     assert np.all(ratio > 0.4)
     assert np.all(ratio < 2.0)
     assert np.mean(foretold[0.1], axis=0)[1] > 3 * np.mean(foretold[0.5], axis=0)[1]
-
-
-def test_no_geometry_claims_no_precision() -> None:
-    p, _, _, _ = draw(rng_of("claims"), (0, 0, 0), (0, 0, 0))
-    features = features_from_bearings(p)
-    matches = np.stack([np.arange(len(p))] * 2, axis=1).astype(np.int32)
-    view = verify_pair(features, features, matches, rng=np.random.default_rng(0))
-    assert (view.rotation_std_deg, view.direction_std_deg) == (0, 0)
-
-
-def test_sides_are_the_signs_of_the_ranges() -> None:
-    rng = rng_of("sides")
-    p, q = rng.normal(size=(2, 5000, 3))
-    p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
-    pose = Rigid3(random_rotation(rng), rng.normal(size=3))
-    ranges = ranges_from_bearings(p, q, pose)
-    np.testing.assert_array_equal(in_front(p, q, pose), (ranges[0] > 0) & (ranges[1] > 0))
 
 
 def test_samples_hold_distinct_matches() -> None:

@@ -1,15 +1,12 @@
-"""The sweep by OpenCV: whole images warped by cv2.remap, windows by cv2.blur, one plane at a time.
+"""The sweep by OpenCV: whole images warped by cv2.remap, one plane at a time.
 
-cv2.remap rounds positions to 1/32 pixel. Everything else is as in the numpy backend, which also computes the costs for
-which OpenCV has no function. Semi-global matching is the numba backend's, since OpenCV has it for flat pairs alone.
+cv2.remap rounds positions to 1/32 pixel. Costs are those of the numpy backend. Semi-global matching is the numba
+backend's, since OpenCV has it for flat pairs alone.
 Memory beyond the pictures and the result: about 40 bytes a pixel and source, and for "sgm" 3 bytes for each pixel and
 plane.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from math import ceil
 
 import cv2
 import numpy as np
@@ -17,9 +14,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixel_cost
 from pano_mvs.algorithms.sweep.edge_support import average_volume
-from pano_mvs.algorithms.sweep.kernels_constants import ZNCC_NOISE_VARIANCE
-from pano_mvs.algorithms.sweep.preparation import SweepInput, source_weights
-from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import CostWindow, box_mean
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
@@ -58,8 +54,6 @@ class RunningWinner:
 # cv2.remap holds positions in 16 bits.
 _MAX_COLUMNS = 32_000
 
-Cost = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
-
 
 def find_winners(work: SweepInput) -> Winners:
     """Return the winning plane of every pixel and the costs around it; equals the numpy backend's except for rounding.
@@ -73,15 +67,12 @@ def find_winners(work: SweepInput) -> Winners:
     settings = work.settings
     size_hw = work.reference.shape[0], work.reference.shape[1]
     lookups = [_Lookup(work, idx, size_hw) for idx in range(len(work.sources))]
-    cost = _source_cost(work)
-    equal = work.source_valid is None and not len(source_weights(size_hw, work.source_from_reference, settings))
-    used = min(ceil(settings.weight_share * len(lookups)), settings.max_sources(len(lookups)))
     with_volume = settings.aggregation == "sgm"
     volume = np.empty((size_hw[0], len(work.ranges) if with_volume else 0, size_hw[1]), np.uint8)
     winner = RunningWinner(size_hw)
     for plane, virtual_range in enumerate(work.ranges):
-        costs = np.stack([_seen(cost, lookup, virtual_range) for lookup in lookups])
-        combined = _mean_of_least(costs, used) if equal else combine_costs(costs, work).astype(np.float32)
+        costs = np.stack([_costs_of(work, lookup, virtual_range) for lookup in lookups])
+        combined = combine_costs(costs, work).astype(np.float32)
         if with_volume:
             volume[:, plane] = np.minimum(combined * np.float32(settings.cost_scale) + np.float32(0.5), 255)
         else:
@@ -125,96 +116,12 @@ class _Lookup:
         return warped, np.asarray(cv2.remap(self.valid, columns, rows, cv2.INTER_LINEAR)) == 255
 
 
-def _seen(cost: Cost, lookup: _Lookup, virtual_range: float) -> NDArray[np.float32]:
+def _costs_of(work: SweepInput, lookup: _Lookup, virtual_range: float) -> NDArray[np.float64]:
     """Return the costs of one plane in one source, (H, W), infinite where it is not valid."""
+    settings = work.settings
     warped, votes = lookup.at(virtual_range)
-    result = cost(warped)
-    return result if votes is None else np.where(votes, result, np.float32(np.inf))
-
-
-def _source_cost(work: SweepInput) -> Cost:
-    """Return the function from a warped source to its costs."""
-    settings = work.settings
-    size_hw = work.reference.shape[0], work.reference.shape[1]
-    box = WindowBands.of(size_hw, settings.box_radius, spherical=settings.spherical_window)
-    if settings.cost == "zncc":
-        return _zncc_cost(work, box)
-    if settings.cost == "census":
-        compare = _census_cost(work)
-    elif settings.cost == "sad":
-        compare = _difference_cost(work)
-    else:
-
-        def compare(warped: NDArray[np.uint8]) -> NDArray[np.float32]:
-            return pixel_cost(work.reference, warped.astype(np.float64), settings).astype(np.float32)
-
-    return lambda warped: np.asarray(_box_mean(compare(warped), box), dtype=np.float32)
-
-
-def _difference_cost(work: SweepInput) -> Cost:
-    def compare(warped: NDArray[np.uint8]) -> NDArray[np.float32]:
-        difference = np.asarray(cv2.absdiff(work.reference, warped))
-        return np.asarray(difference.sum(axis=-1), dtype=np.float32)
-
-    return compare
-
-
-def _census_cost(work: SweepInput) -> Cost:
-    """Return the census cost: the reference's signs are found once."""
-    settings = work.settings
-    reference = work.reference[..., 0]
-    size_hw = reference.shape[0], reference.shape[1]
-    bands = WindowBands.of(size_hw, settings.compare_radius, spherical=settings.spherical_window)
-    window = CostWindow(settings.compare_radius, bands.columns)
-    signs = [neighbour > reference for neighbour in window.neighbours(reference)]
-
-    def compare(warped: NDArray[np.uint8]) -> NDArray[np.float32]:
-        picture = warped[..., 0]
-        padded = bands.pad(picture)
-        differs = np.zeros(picture.shape, np.uint8)
-        for rows, places in bands.places():
-            for sign, place in zip(signs, places, strict=True):
-                differs[rows] += sign[rows] != (padded[place] > picture[rows])
-        return differs.astype(np.float32)
-
-    return compare
-
-
-def _zncc_cost(work: SweepInput, box: WindowBands) -> Cost:
-    """Return 1 − ρ, as in the readable backend; the reference's moments are found once."""
-    ours = work.reference[..., 0].astype(np.float64)
-    mean_r = _box_mean(ours, box)
-    variance_r = np.maximum(_box_mean(ours**2, box) - mean_r**2, 0) + ZNCC_NOISE_VARIANCE
-
-    def compare(warped: NDArray[np.uint8]) -> NDArray[np.float32]:
-        theirs = warped[..., 0].astype(np.float64)
-        mean_w = _box_mean(theirs, box)
-        variance_w = np.maximum(_box_mean(theirs**2, box) - mean_w**2, 0) + ZNCC_NOISE_VARIANCE
-        rho = (_box_mean(ours * theirs, box) - mean_r * mean_w) / np.sqrt(variance_r * variance_w)
-        return np.asarray(1 - np.clip(rho, -1, 1), dtype=np.float32)
-
-    return compare
-
-
-def _box_mean(cost: NDArray[np.floating], box: WindowBands) -> NDArray[np.floating]:
-    """Return the mean over the box around every pixel, (H, W), of the same type."""
-    if box.radius == 0:
-        return cost
-    padded = box.pad(cost)
-    result = np.empty_like(cost)
-    width = cost.shape[1]
-    for rows, reach in box.reaches():
-        around = padded[rows.start : rows.stop + 2 * box.radius]
-        mean = cv2.blur(around, (2 * reach + 1, 2 * box.radius + 1))
-        result[rows] = mean[box.radius : -box.radius, box.margin : box.margin + width]
-    return result
-
-
-def _mean_of_least(costs: NDArray[np.float32], used: int) -> NDArray[np.float32]:
-    """Return the mean of the least `used` of the sources' costs, (S, H, W) to (H, W); they are sorted in place."""
-    for first in range(used if used < len(costs) else 0):
-        for other in range(first + 1, len(costs)):
-            larger = np.maximum(costs[first], costs[other])
-            np.minimum(costs[first], costs[other], out=costs[first])
-            costs[other] = larger
-    return np.asarray(costs[:used].sum(axis=0) / np.float32(used), dtype=np.float32)
+    result = pixel_cost(work.reference, warped.astype(np.float64), settings)
+    if not settings.matching_cost.averages_itself:
+        size_hw = work.reference.shape[0], work.reference.shape[1]
+        result = box_mean(result, CostWindow.of(size_hw, settings.box_radius, spherical=settings.spherical_window))
+    return result if votes is None else np.where(votes, result, np.inf)

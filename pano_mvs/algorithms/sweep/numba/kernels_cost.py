@@ -277,9 +277,6 @@ def _multiply(one: U8, other: U8, products: U16) -> None:
             products[j, i] = np.uint16(np.uint16(one[j, i]) * np.uint16(other[j, i]))
 
 
-_MAX_DIFFERENCE = 3 * 255
-
-
 @inlined
 def one_box_serves(sources: int, combination: Combination, box_radius: int, pad: int) -> bool:
     """Return whether the mean of all sources counts, whose differences can then be added before they are averaged.
@@ -287,7 +284,7 @@ def one_box_serves(sources: int, combination: Combination, box_radius: int, pad:
     All sources must be valid everywhere. The sums have to fit uint16, and int32 in the widest box.
     """
     used = min(combination.max_count, int(np.ceil(combination.share * ENOUGH * sources)))
-    largest = _MAX_DIFFERENCE * sources
+    largest = 3 * 255 * sources
     fits = largest < 1 << 16 and largest * (2 * box_radius + 1) * (2 * pad + 1) < 1 << 31
     return len(combination.weights) == 0 and used == sources and fits
 
