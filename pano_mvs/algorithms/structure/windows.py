@@ -70,7 +70,7 @@ def window_labels(view: PlaneView, label: NDArray[np.int16], planes: Sequence[Sc
     return found
 
 
-def _light(colors: FloatArray) -> FloatArray:
+def _light(colors: NDArray[np.generic]) -> FloatArray:
     """Return the light (...) of colours (..., 3) with the usual gamma, never 0."""
     return np.asarray((np.maximum(colors.mean(axis=-1), 2.0) / 255) ** 2.2)
 
