@@ -86,5 +86,6 @@ def test_a_window_has_the_range_of_its_wall_and_opens_the_plan() -> None:
     assert overlap(window, PANE) > 0.9
     np.testing.assert_allclose(laid.range[window], RANGES[0][window], rtol=1e-5)
     view = range_view(laid, POSE)
-    assert np.isinf(view.seen[window]).all()
+    assert (view.panes == window).all()
+    assert np.isfinite(view.seen[window]).all()
     assert np.isnan(view.free[window]).all()
