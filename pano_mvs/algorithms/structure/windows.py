@@ -2,7 +2,7 @@
 
 What lies behind a pane is lit by the sky, and a surface in the room sends back no more light than it gets. So a window
 is brighter than nearly all that is known to be a surface, and than the wall just beside it on all sides: lamps make
-walls bright without an edge. What is confirmed on the wall, such as a poster, is no window.
+walls bright without an edge. What is confirmed on the wall, such as a poster, is a surface.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _LEVELS = np.geomspace(0.6, 3.0, 10)  # of light, relative to the median on the 
 # Of a window: the solid angle; the share of its rectangle that is bright; the logarithm of its light relative to what
 # is beside it, on the worst of at least three sides; the share of the surfaces that are darker; the share of the cells
 # around it that show the wall, and of its own that are confirmed on it. The 25 windows that were measured in two houses
-# have .26–.93, .95–1, .32–1 and 0–.55 of the last four. Of what is none, in these, a classroom and a hall, white
-# radiators and cabinets have .5–.92 of the second of these, and the light of lamps on walls has below .1 of the first.
+# have .26–.93, .95–1, .32–1 and 0–.55 of the last four. In these, a classroom and a hall, white radiators and cabinets
+# have .5–.92 of the second of these, and the light of lamps on walls has less than .1 of the first.
 _LEAST_AREA, _LEAST_FILL, _LEAST_STEP, _LEAST_RANK, _LEAST_AROUND, _MOST_CONFIRMED = 0.02, 0.7, 0.2, 0.95, 0.3, 0.5
 _BARS, _EDGE, _GAP = 5, 3, 1  # cells of bars between panes, of each side of an edge, and between these
 
