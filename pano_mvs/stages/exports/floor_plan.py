@@ -226,7 +226,7 @@ class _GroupPlan:
         plan = plan_storey(
             evidence,
             self.known,
-            views=lambda: map(self.view, storey.cameras),
+            views=map(self.view, storey.cameras),
             cameras=cameras,
             min_share=self.params.min_wall_share,
         )
