@@ -77,7 +77,7 @@ def planned(views: Sequence[PlanView], xy: FloatArray, cameras: FloatArray) -> S
     evidence = evidence_around(xy)
     for view in views:
         evidence.add(view)
-    return plan_storey(evidence, [], views=views, cameras=cameras, min_share=0.4)
+    return plan_storey(evidence, [], views=lambda: views, cameras=cameras, min_share=0.4)
 
 
 def plan_of_flat(
@@ -185,6 +185,20 @@ def test_furniture_is_not_a_wall() -> None:
     )
     plan = plan_of_cloud(furnished, np.array([2, 1]), np.array([5, 1]), np.array([1, 4]))
     assert len(plan.walls) == 6
+
+
+def test_one_view_does_not_see_through_a_wall_that_two_see() -> None:
+    cams = [camera(np.array([*place, 1.5])) for place in ((1.0, 1.5), (3.0, 2.2), (2.0, 1.0))]
+    maps = [flat_ranges(cam, turn=np.eye(2)) for cam in cams]
+    maps[2] = replace(maps[2], range=3 * maps[2].range)
+    views = [range_view(one, cam) for one, cam in zip(maps, cams, strict=True)]
+    evidence = evidence_around(np.array([(-2.0, -1), (7.2, 3)]))
+    for view in views:
+        evidence.add(view)
+    (inside, outside), _ = evidence.extent.cells(np.array([(0.5, 1.5), (-1.0, 1.5)]))
+    assert evidence.free[[inside, outside]].tolist() == [6, 2]
+    evidence.recount(views)
+    assert evidence.free[[inside, outside]].tolist() == [6, 0]
 
 
 def test_what_no_camera_stands_in_is_no_room() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 
 _CLOUD_SIZE = 90, 180
+_TURNS = 720
 
 SURE = UNCONFIRMED_UNCERTAINTY / 3
 """Relative standard deviation up to which ranges count that no view confirms."""
@@ -167,12 +168,27 @@ class Evidence:
         values = np.column_stack([view.points[inside, :2], view.normals[inside, :2], np.ones(len(chosen))])
         for column in range(5):
             self._sums[:, column] += np.bincount(chosen, values[:, column], len(self._sums))
-        self._add_free(view)
+        self._add_free(view, None)
 
-    def _add_free(self, view: PlanView) -> None:
-        """Count the cells of top layers that a view sees through."""
+    def recount(self, views: Iterable[PlanView]) -> None:
+        """Count again what the views see through, but not beyond walls that more of them see than see through."""
+        walls = np.flatnonzero(self.hits[:, TOP].sum(axis=1) >= np.maximum(self.free, 1))
+        self.free[:] = 0
+        for view in views:
+            self._add_free(view, walls)
+
+    def _add_free(self, view: PlanView, walls: NDArray[np.intp] | None) -> None:
+        """Count the cells of top layers that a view sees through, before walls."""
+        if not len(view.points):
+            return
         centers, (low, high) = self.extent.centers(), view.box()
         near = np.flatnonzero(((centers >= low) & (centers <= high)).all(axis=1))
+        if walls is not None:
+            until, (turn, away) = np.full(_TURNS, np.inf), _polar(centers[walls] - view.center[:2])
+            np.minimum.at(until, turn, away)
+            until = np.min([np.roll(until, step) for step in (-1, 0, 1)], axis=0)  # gaps between near cells
+            turn, away = _polar(centers[near] - view.center[:2])
+            near = near[away < until[turn]]
         for top in range(LAYERS)[TOP]:
             height = self.storey.floor + (top + 0.5) * self._layer
             away, pixels = view.pixels_of(np.column_stack([centers[near], np.full(len(near), height)]))
@@ -191,3 +207,9 @@ class Evidence:
         return WallCells(
             sums[:, :2] / sums[:, 4:], sums[:, 2:4] / lengths[:, None], self.hits[used] > 0, self.extent.pixel
         )
+
+
+def _polar(way: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the directions of ways (N, 2), in parts of a turn, and their lengths."""
+    turn = np.arctan2(way[:, 1], way[:, 0]) / (2 * np.pi)
+    return np.floor(turn * _TURNS).astype(np.int64) % _TURNS, np.hypot(way[:, 0], way[:, 1])

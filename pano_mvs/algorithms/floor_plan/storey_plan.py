@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -49,22 +49,23 @@ def plan_storey(
     evidence: Evidence,
     known: Sequence[Line],
     *,
-    views: Iterable[PlanView],
+    views: Callable[[], Iterable[PlanView]],
     cameras: FloatArray,
     min_share: float,
 ) -> StoreyPlan:
     """Return the plan of a storey.
 
-    `evidence`: what the views show. `known`: lines of known planes. `views`: those of the evidence. `cameras`: (N, 2)
-    their positions. `min_share`: share of the height at which a wall must be seen.
+    `evidence`: what the views show. `known`: lines of known planes. `views`: gives the views of the evidence, and is
+    called twice. `cameras`: (N, 2) their positions. `min_share`: share of the height at which a wall must be seen.
     """
+    evidence.recount(views())
     cells = evidence.wall_cells()
     least = 0.15 * evidence.storey.height / cells.cell * min_share * LAYERS
     lines = wall_lines(cells, known, min_area=least)
     rooms, sides = find_rooms(evidence, lines, cells=cells, cameras=cameras)
     frames = [_Frame(side, evidence) for side in sides]
     thickest, least = 0.2 * evidence.storey.height, evidence.extent.pixel
-    for view in views:
+    for view in views():
         for frame in frames:
             frame.add(view)
     hidden = [

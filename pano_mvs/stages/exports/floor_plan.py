@@ -227,7 +227,7 @@ class _GroupPlan:
         plan = plan_storey(
             evidence,
             self.known,
-            views=map(self.view, storey.cameras),
+            views=lambda: map(self.view, storey.cameras),
             cameras=cameras,
             min_share=self.params.min_wall_share,
         )
