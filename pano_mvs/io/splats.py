@@ -254,7 +254,7 @@ def manifest_document(
             },
             "confidence": {
                 "format": "8-bit PNG",
-                "value": "1 the pane of a mirror, 2-63 filled in, 64-127 seen but not confirmed, "
+                "value": "1 the pane of a mirror, 2 of a window, 3-63 filled in, 64-127 seen but not confirmed, "
                 "128-255 consistent with other views",
                 "unknown": 0,
             },

@@ -20,7 +20,13 @@ from pano_mvs.results.pictures import Picture, evenly_spaced, picture, preview_p
 from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import (
+    CONSISTENT_CONFIDENCE,
+    FILLED_CONFIDENCE,
+    MIRROR_CONFIDENCE,
+    WEAK_CONFIDENCE,
+    WINDOW_CONFIDENCE,
+)
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Shares:
 
     consistent: float  # other views agree (confidence 128–255)
     weak: float  # seen, but not confirmed (64–127)
-    filled: float  # interpolated, not seen (2–63), or at the pane of a mirror (1)
+    filled: float  # interpolated, not seen (3–63), or at the pane of a mirror or window (1, 2)
     invalid: float  # no range
     masked: float  # excluded by a mask, or sky
 
@@ -63,7 +69,7 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
 UNCERTAINTY_LIMITS = 0.001, 0.2
 # Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
-    ((MIRROR_CONFIDENCE, MIRROR_CONFIDENCE), (60, 60, 160), (60, 60, 160)),
+    ((MIRROR_CONFIDENCE, WINDOW_CONFIDENCE), (60, 60, 160), (60, 60, 160)),
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
     (WEAK_CONFIDENCE, (200, 130, 20), (245, 180, 60)),
     (CONSISTENT_CONFIDENCE, (10, 90, 110), (60, 190, 190)),

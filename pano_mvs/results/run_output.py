@@ -184,7 +184,7 @@ class RunView:
 
     @cached_property
     def confidence(self) -> NDArray[np.uint8] | None:
-        """Confidence of the ranges, (H, W) uint8: 0 invalid, 1 mirror, 2–63 filled, 64–127 weak, 128–255 confirmed."""
+        """Confidence of ranges, (H, W) uint8: 0 invalid, 1 mirror, 2 window, 3–63 filled, 64–127 weak, 128–255 sure."""
         if self._record is not None:
             return self._record.confidence
         path = self._exported("confidence", ".png")

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
 
 MIRROR_CONFIDENCE = 1
-FILLED_CONFIDENCE = 2, 63
+WINDOW_CONFIDENCE = 2
+FILLED_CONFIDENCE = 3, 63
 WEAK_CONFIDENCE = 64, 127
 CONSISTENT_CONFIDENCE = 128, 255
 
@@ -22,8 +23,8 @@ class RangeMap(Record):
 
     Attributes:
         range: (H, W) float32 distance along the ray in scene units; NaN is invalid.
-        confidence: (H, W) uint8: 0 invalid, 1 the pane of a mirror, 2–63 filled (interpolated, not seen), 64–127 seen
-            but weak, 128–255 consistent with other views.
+        confidence: (H, W) uint8: 0 invalid, 1 the pane of a mirror, 2 that of a window, 3–63 filled (interpolated, not
+            seen), 64–127 seen but weak, 128–255 consistent with other views.
         normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
             where unknown. None if they were not computed.
         uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where unknown, ignored where the
@@ -80,10 +81,11 @@ class RangeMap(Record):
 
 
 def confidence_name(confidence: int) -> str:
-    """Return what a confidence means: "no range", "mirror", "filled", "seen but weak" or "consistent"."""
+    """Return what a confidence means: "no range", "mirror", "window", "filled", "seen but weak" or "consistent"."""
     limits = (
         (0, "no range"),
         (MIRROR_CONFIDENCE, "mirror"),
+        (WINDOW_CONFIDENCE, "window"),
         (FILLED_CONFIDENCE[1], "filled"),
         (WEAK_CONFIDENCE[1], "seen but weak"),
     )

@@ -148,7 +148,7 @@ def structure(
     """Move pixels to the planes of depth.scene_planes that they show, unless other views contradict.
 
     Confirmed pixels with texture move only a little, those without texture farther. Masked pixels get no range. Mirrors
-    get the range of their pane, and confidence 1.
+    get the range of their pane, and confidence 1; windows that of their wall, and confidence 2.
     """
     require_one_group(pose, source_poses)
     result, share = range_map, 0.0
@@ -197,7 +197,7 @@ def _prior_memory(params: Params, inputs: Mapping[str, Any]) -> int:
 def prior(range_map: Each[RangeMap], image: Each[Panorama], params: PriorParams, ctx: Context) -> RangeMap:
     """Fill what no view saw with the ranges of a neural network of your own, aligned to the ranges that views measured.
 
-    Such networks see one panorama. Their ranges are filled ones (confidence 2-63), never confirmed. Use it last, after
+    Such networks see one panorama. Their ranges are filled ones (confidence 3-63), never confirmed. Use it last, after
     depth.structure. Where the network agrees with the measured ranges no better than a constant range would, the map
     stays as it is.
     """
@@ -350,7 +350,7 @@ def bilateral_solver(range_map: Each[RangeMap], image: Each[Panorama], params: P
 
 @stage("filters.fill", settings=fill_from_neighbours, memory=bytes_per_pixel(96))
 def fill(range_map: Each[RangeMap], image: Each[Panorama], params: Params, ctx: Context) -> RangeMap:
-    """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 2–63).
+    """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 3–63).
 
     Masked pixels get no range.
     """

@@ -140,7 +140,7 @@ _WIDTH = 2048
 def range_panorama(camera: ShownCamera, unit: str) -> tuple[NDArray[np.uint8] | None, str]:
     """Return the ranges of a camera as colours, (H, W, 3) RGB, and their legend.
 
-    Weak ranges are pale, filled ones striped and mirrors chequered (`mark_unconfirmed`); pixels without a range are
+    Weak ranges are pale, filled ones striped and panes chequered (`mark_unconfirmed`); pixels without a range are
     grey. Without readable ranges, the picture is None and the legend is the reason.
     """
     if camera.range_file is None:

@@ -217,7 +217,7 @@ def fast_bilateral_solver(
     smoothness: Annotated[float, Setting("λ: weight of smoothness relative to a pixel of full confidence", ge=0)] = 1.0,
     iterations: int = 60,
     domain: Domain = "inverse",
-    fill: Annotated[bool, Setting("fill pixels without a range (confidence 2–63)")] = True,
+    fill: Annotated[bool, Setting("fill pixels without a range (confidence 3–63)")] = True,
     max_hole_deg: MaxHoleDeg = 20.0,
     keep_confidence: Annotated[
         int, Setting("pixels with at least this confidence keep their range; 256: smooth all", ge=1, le=256)
@@ -230,7 +230,7 @@ def fast_bilateral_solver(
 
     The weight of a pixel in the data term is `confidence_weight` relative to the largest weight of the map: if other
     views have confirmed some pixels, the others have little influence, and an unchecked map is solved as it is. Pixels
-    keep their confidence; filled ones get 2–63 by the share of weight among pixels with similar position and colour.
+    keep their confidence; filled ones get 3–63 by the share of weight among pixels with similar position and colour.
 
     Args:
         range_map: (H, W) with even W, the full sphere.

@@ -25,7 +25,7 @@ def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the weight of the data term, in [0, 1], for each confidence c.
 
     c / 255 for consistent pixels (128–255), 0.01 c / 127 for weak ones (64–127), and a twentieth of that, with c / 63,
-    for filled ones (2–63). Weak pixels that no view confirms are wrong so often that a larger weight does more harm
+    for filled ones (3–63). Weak pixels that no view confirms are wrong so often that a larger weight does more harm
     than good.
     """
     filled, weak = FILLED_CONFIDENCE[1], WEAK_CONFIDENCE[1]

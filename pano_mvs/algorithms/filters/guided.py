@@ -33,7 +33,7 @@ def guided_range(
     radius: Annotated[int, Setting("radius of the windows, in pixels at the equator", ge=1)] = 4,
     epsilon: Annotated[float, Setting("contrast in grey levels above which edges are preserved", gt=0)] = 4.0,
     domain: Domain = "inverse",
-    fill: Annotated[bool, Setting("fill pixels near valid ones (confidence 2–63)")] = False,
+    fill: Annotated[bool, Setting("fill pixels near valid ones (confidence 3–63)")] = False,
 ) -> RangeMap:
     """Smooth a range map within the surfaces of the panorama by the guided filter.
 

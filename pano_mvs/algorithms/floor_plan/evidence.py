@@ -17,7 +17,7 @@ from pano_mvs.algorithms.structure.view import grid_rows, on_grid
 from pano_mvs.core.arrays import FloatArray
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 
 _CLOUD_SIZE = 90, 180
 _TURNS = 720
@@ -37,9 +37,9 @@ class PlanView:
     """The ranges of a view with z up.
 
     `center`: (3,). `cam_from_plan`: (3, 3). `free`: (h, w) ranges up to which nothing is in the way, NaN where unknown.
-    `seen`: (h, w) ranges that were seen, not filled, infinite in the sky, NaN elsewhere. `errors`: (h, w) their
-    relative standard deviations. `points`: (N, 3) places on surfaces. `normals`: (N, 3) of the surfaces, NaN where
-    unknown.
+    `seen`: (h, w) ranges that were seen, not filled, or of panes, infinite in the sky, NaN elsewhere. `errors`: (h, w)
+    their relative standard deviations. `panes`: (h, w) whether they are those of windows. `points`: (N, 3) places on
+    surfaces. `normals`: (N, 3) of the surfaces, NaN where unknown.
     """
 
     center: FloatArray
@@ -47,6 +47,7 @@ class PlanView:
     free: FloatArray
     seen: FloatArray
     errors: FloatArray
+    panes: NDArray[np.bool_]
     points: FloatArray
     normals: FloatArray
 
@@ -71,19 +72,22 @@ def range_view(range_map: RangeMap, cam_from_plan: Rigid3) -> PlanView:
     if range_map.uncertainty is not None:
         given_error = on_grid(range_map.uncertainty, rows).astype(np.float64)
         error = np.where(np.isnan(given_error), UNCONFIRMED_UNCERTAINTY, given_error)
+    panes = confidence == WINDOW_CONFIDENCE
     # Confirmed neither by views nor by planes.
     uncertain = (error > SURE) & (confidence < CONSISTENT_CONFIDENCE[0])
-    ranges = np.where(uncertain, np.nan, every)
+    ranges = np.where(uncertain | panes, np.nan, every)
     normals = on_grid(normals_from_range(range_map, given=given), rows)
     known = np.isfinite(ranges)
     rays = on_grid(ray_grid((height, width)), rows)
     sky = np.zeros_like(known) if range_map.sky is None else on_grid(range_map.sky, rows)
+    seen = np.where((confidence < WEAK_CONFIDENCE[0]) & ~panes, np.nan, every)
     return PlanView(
         cam_from_plan.center,
         cam_from_plan.rotation,
         ranges * (1 - 2 * error),
-        np.where(sky, np.inf, np.where(confidence < WEAK_CONFIDENCE[0], np.nan, every)),
+        np.where(sky, np.inf, seen),
         np.where(sky, 0.0, error),
+        panes,
         cam_from_plan.inverse().apply(rays[known] * ranges[known][:, None]),
         normals[known] @ cam_from_plan.rotation,
     )
@@ -120,7 +124,8 @@ class CloudViews:
         ranges = np.where(np.isinf(seen[..., 6]), np.nan, seen[..., 6])
         known = seen[np.isfinite(ranges)]
         cam, exact = self._cams[number], np.zeros_like(ranges)
-        return PlanView(cam.center, cam.rotation, ranges, ranges, exact, known[:, :3], known[:, 3:6])
+        panes = np.zeros(ranges.shape, np.bool_)
+        return PlanView(cam.center, cam.rotation, ranges, ranges, exact, panes, known[:, :3], known[:, 3:6])
 
 
 @dataclass(frozen=True, eq=False)

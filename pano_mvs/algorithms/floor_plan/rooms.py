@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -20,9 +19,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 from pano_mvs.algorithms.floor_plan.evidence import TOP, Evidence, WallCells
 from pano_mvs.algorithms.floor_plan.wall_lines import Line
 from pano_mvs.core.arrays import FloatArray
-
-# The width of the narrowest passage between two parts of a room, in heights of the storey.
-_PASSAGE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +63,7 @@ def find_rooms(
         return [], []
     edges = _edges(evidence, lines)
     owner = _owners(evidence, edges, lines)
-    inside = _without_slots(_labels(evidence, edges, lines, cells=cells, owner=owner), owner, evidence)
+    inside = _labels(evidence, edges, lines, cells=cells, owner=owner)
     room = _components(edges, inside)
     borders = [
         (room[one], ends[:: 1 if one == front else -1], int(line))
@@ -132,7 +128,7 @@ def _labels(
     count, height = len(edges.signs), evidence.storey.height
     unit = 1e5 / height**2  # capacities are whole numbers
     length = np.linalg.norm(edges.ends[:, 1] - edges.ends[:, 0], axis=1)
-    gap = _PASSAGE * height
+    gap = 0.2 * height  # the narrowest passage between two parts of a room
     seen = np.zeros(len(length))
     for number, line in enumerate(lines):
         own = edges.line == number
@@ -172,18 +168,6 @@ def _owners(evidence: Evidence, edges: Edges, lines: Sequence[Line]) -> NDArray[
     order = {one.tobytes(): number for number, one in enumerate(edges.signs)}
     shapes, inverse = np.unique(signs, axis=0, return_inverse=True)
     return np.array([order.get(one.tobytes(), len(order)) for one in shapes])[inverse.reshape(-1)]
-
-
-def _without_slots(inside: NDArray[np.bool_], owner: NDArray[np.int64], evidence: Evidence) -> NDArray[np.bool_]:
-    """Return the cells inside without those that are narrower than any passage."""
-    rows, columns = evidence.extent.size_hw
-    mask = np.append(inside, False)[owner].reshape(rows, columns)
-    radius = _PASSAGE / 2 * evidence.storey.height / evidence.extent.pixel
-    wide = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > radius
-    away = cv2.distanceTransform((~wide).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    kept = mask & (away <= radius + 1.5)
-    share = [np.bincount(owner, one.reshape(-1), len(inside) + 1)[:-1] for one in (kept, mask)]
-    return inside & (share[0] >= share[1] / 2)
 
 
 def _seen_lengths(line: Line, ends: FloatArray, cells: WallCells, *, gap: float) -> FloatArray:

@@ -151,8 +151,9 @@ class _Frame:
         with np.errstate(invalid="ignore"):
             behind = (view.seen[pixels] - away) * before / away
             near = 1.5 * self.cell + 2 * errors * before
-            self.scores += worth * (behind > np.maximum(near, 0.06 * self.height))
-            self.scores -= 0.2 * (worth == 1) * (np.abs(behind) <= near)
+            on_it, panes = np.abs(behind) <= near, view.panes[pixels]
+            self.scores += worth * ((behind > np.maximum(near, 0.06 * self.height)) | on_it & panes)
+            self.scores -= 0.2 * (worth == 1) * (on_it & ~panes)
 
     def xy_of(self, start: float, end: float) -> FloatArray:
         """Return the positions (2, 2) of two places along the side."""

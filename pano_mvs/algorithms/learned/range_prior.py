@@ -24,7 +24,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE, WINDOW_CONFIDENCE
 
 Output: TypeAlias = Literal["range", "inverse_range"]
 
@@ -93,7 +93,7 @@ def fill_from_prior(
         The range map and the relative standard deviation of the network's ranges: their deviation from confirmed ranges
         in areas that were left out of the alignment. It is infinite, and the range map is unchanged, where that is
         not less than the deviation of a constant range. Pixels that other views saw, or that lie on the planes or in
-        the mirrors of depth.structure, keep their ranges. Others get the network's, with confidence 2–63; none where
+        the mirrors of depth.structure, keep their ranges. Others get the network's, with confidence 3–63; none where
         the network's are nearer or farther than all measured ones, where the fit was not tested.
     """
     require_guide(guide, range_map)
@@ -114,7 +114,8 @@ def fill_from_prior(
     if not sigma < constant:
         return range_map, float("inf")
     laid = _aligned(range_map, guide, prior, weight=np.where(known, weight, 0), output=output)
-    seen = (range_map.confidence >= FILLED_CONFIDENCE[1]) | (range_map.confidence == MIRROR_CONFIDENCE)
+    panes = MIRROR_CONFIDENCE, WINDOW_CONFIDENCE
+    seen = (range_map.confidence >= FILLED_CONFIDENCE[1]) | np.isin(range_map.confidence, panes)
     filled = laid.valid & ~seen & (True if valid is None else valid)
     result = with_ranges(
         range_map,

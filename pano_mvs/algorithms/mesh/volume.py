@@ -27,7 +27,7 @@ from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, MIRROR_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 
 Surface = tuple[NDArray[np.float32], NDArray[np.int32]]
 """Vertices (V, 3) and triangles (F, 3), counter-clockwise as seen from the side that was seen."""
@@ -112,6 +112,7 @@ class Volume:
             weights[range_map.sky & valid] = 1.0
         confirmed, best = CONSISTENT_CONFIDENCE
         support = np.maximum((range_map.confidence.astype(np.float32) - confirmed) / (best - confirmed), _LEAST_SUPPORT)
+        support[range_map.confidence == WINDOW_CONFIDENCE] = 1.0  # others look through it, but the pane is there
         # Beside an edge, a ray may pass the nearer surface or not.
         nearest = filtered(ranges, 1, lambda padded: cv2.erode(padded, square_window(1)))
         planes = np.empty((*ranges.shape, 4), np.float32)

@@ -129,7 +129,7 @@ def refine_range(
 
     Args:
         range_map: (H, W) of the reference, full sphere, accurate to about a pixel of parallax; filled pixels
-            (confidence 2–63) do not change, and invalid ones stay invalid.
+            (confidence 3–63) do not change, and invalid ones stay invalid.
         reference: (H, W, 3) uint8 RGB.
         sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
         source_from_reference: pose of each source relative to the reference.

@@ -22,12 +22,13 @@ from pano_mvs.algorithms.structure.laid import OtherView, laid_evidence, seen_by
 from pano_mvs.algorithms.structure.laid_coefficients import FITTED
 from pano_mvs.algorithms.structure.mirrors import with_mirrors
 from pano_mvs.algorithms.structure.outline import OUTLINE_UNCERTAINTY, room_labels, room_of
-from pano_mvs.algorithms.structure.view import ScenePlane, grid_rows, on_grid, plane_ranges, plane_view
+from pano_mvs.algorithms.structure.view import PlaneView, ScenePlane, grid_rows, on_grid, plane_ranges, plane_view
+from pano_mvs.algorithms.structure.windows import window_labels
 from pano_mvs.core.arrays import FloatArray, Mask, Picture
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE, WINDOW_CONFIDENCE
 from pano_mvs.scene.surfaces import Structure
 
 # Weights of the own ranges of precise and other confirmed pixels, of weak ones with texture, and of all others: without
@@ -93,7 +94,9 @@ def lay_structure(
     other = found.off.copy()
     evidence = {name: values[found.off] for name, values in found.evidence.items()}
     other[found.off] = FITTED.probabilities(evidence) < MIN_PROBABILITY
-    label = _enlarged(np.where(other, -1, found.label), size)
+    coarse = np.where(other, np.int16(-1), found.label)
+    window = window_labels(found.view, coarse, found.known)
+    label = _enlarged(np.where(window >= 0, window, coarse), size)
     agree = _enlarged(found.agree, size) > 0
     laid = _chosen(found.ranges_on, label)
     with np.errstate(invalid="ignore"):
@@ -102,12 +105,18 @@ def lay_structure(
     # Creases of single views confirm nothing, and correct nothing that is confirmed.
     alone = np.isin(label, np.flatnonzero(structure.uncertainties[planes] >= OUTLINE_UNCERTAINTY))
     near, agree = (error <= tolerance) & ~(alone & confirmed), agree & ~alone
+    in_window = (_enlarged(window, size) >= 0) & ~(confirmed & (error > tolerance))
     unsure = np.where(textured, ~matched, ~confirmed) | (error <= found.explained) & ~(alone & confirmed) | found.sunk
-    moved = np.isfinite(laid) & (near | unsure) & (True if valid is None else valid)
+    moved = np.isfinite(laid) & (near | unsure | in_window) & (True if valid is None else valid)
     kept = np.where(textured, range_map.confidence, np.minimum(range_map.confidence, np.uint8(WEAK_CONFIDENCE[1])))
     confidence = np.select(
-        [near & matched & agree, near & matched, agree],
-        [np.maximum(range_map.confidence, np.uint8(CONSISTENT_CONFIDENCE[0])), kept, np.uint8(WEAK_CONFIDENCE[1])],
+        [in_window, near & matched & agree, near & matched, agree],
+        [
+            np.uint8(WINDOW_CONFIDENCE),
+            np.maximum(range_map.confidence, np.uint8(CONSISTENT_CONFIDENCE[0])),
+            kept,
+            np.uint8(WEAK_CONFIDENCE[1]),
+        ],
         np.uint8(FILLED_CONFIDENCE[1]),
     )
     result = with_ranges(
@@ -127,7 +136,9 @@ class Proposal:
     """The planes that the pixels of a view may show: (H, W), and (h, w) on the grid (`on_grid`).
 
     Attributes:
+        view: what the search for planes reads of the view.
         planes: positions in the structure.
+        known: the planes at these.
         ranges_on: returns the ranges (H, W) on one of them.
         textured: (H, W) whether the picture has texture.
         explained: (H, W) relative error of the own range that its uncertainty explains.
@@ -140,7 +151,9 @@ class Proposal:
         evidence: what was measured of each pixel (`laid_evidence`), (h, w) each.
     """
 
+    view: PlaneView
     planes: NDArray[np.intp]
+    known: list[ScenePlane]
     ranges_on: Callable[[int], FloatArray]
     textured: Mask
     explained: FloatArray
@@ -188,7 +201,8 @@ def proposed_planes(
         ScenePlane(normal, float(structure.offsets[idx]), 1.0, uncertainty=1.0, is_level=abs(normal[1]) > 0.5)
         for idx, normal in zip(planes, structure.normals_in_world[planes], strict=True)
     ]
-    room = room_of(plane_view(range_map, lambda: guide, cam_from_world), known)
+    view = plane_view(range_map, lambda: guide, cam_from_world)
+    room = room_of(view, known)
     label = _labels(
         coarse_planes,
         on_grid(range_map.range, rows),
@@ -217,7 +231,9 @@ def proposed_planes(
     with np.errstate(invalid="ignore"):
         off = np.isfinite(laid) & ~(np.abs(own / laid - 1) <= on_grid(tolerance, rows)) & ~on_grid(sunk, rows)
     evidence = laid_evidence(own, laid, picture=colors, views=views, error=plain_error)
-    return Proposal(planes, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, off, evidence)
+    return Proposal(
+        view, planes, known, ranges_on, textured, explained, tolerance, sunk, label, laid, agree, off, evidence
+    )
 
 
 def _floor(structure: Structure, planes: NDArray[np.intp]) -> int | None:

@@ -29,7 +29,7 @@ Image = NDArray[np.float32]
 _VIEWS, _POINTS, _CELLS = 6, 250_000, 60_000
 # Cells of the blur of colours and predictions, and of the window of the correlation.
 _BLUR, _WINDOW = 2, 6
-_ON_PLANE, _BEFORE_PLANE = 0.03, 0.07
+ON_PLANE, BEFORE_PLANE = 0.03, 0.07
 # Of the cells of a mirror: the least correlation of each and of all; the area over the squared distance of the cameras;
 # the share of the cells around it that lie on the plane; the explained contrast, in grey levels; and the share of views
 # in which a cell is confirmed on the plane. Mirrors that were measured have .85–.94, .15–.35, .88–1, 13–15, .03–.26.
@@ -46,7 +46,7 @@ def find_mirrors(views: Sequence[PlaneView], planes: Sequence[ScenePlane], *, th
 
     `views`: of one group; at least two must see a mirror. `planes`: of the place.
     """
-    seen = [_Seen.of(view) for view in views]
+    seen = [PicturedView.of(view) for view in views]
     walls = [plane for plane in planes if not plane.is_level]
     found = [one for of_wall in mapped(lambda wall: _mirrors_on(wall, seen), walls, threads=threads) for one in of_wall]
     kept: list[FloatArray] = []
@@ -96,7 +96,7 @@ def with_mirrors(
     rays = ray_grid(range_map.range.shape) @ cam_from_world.rotation
     pane = np.fmin.reduce([pane_ranges(rays, cam_from_world.center, one) for one in corners])
     known = (range_map.confidence >= WEAK_CONFIDENCE[0]) | (False if laid is None else laid)
-    shown = np.isfinite(pane) & ~(known & (range_map.range < pane * (1 - _BEFORE_PLANE)))
+    shown = np.isfinite(pane) & ~(known & (range_map.range < pane * (1 - BEFORE_PLANE)))
     for ignored in (None if valid is None else ~valid, range_map.sky):
         shown = shown if ignored is None else shown & ~ignored
     uncertainty, normals = range_map.uncertainty, range_map.normals_in_cam
@@ -110,18 +110,20 @@ def with_mirrors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class PicturedView:
     """A view with its picture (h, w, 3) at the size of the grid."""
 
     view: PlaneView
     picture: Picture
 
     @classmethod
-    def of(cls, view: PlaneView) -> _Seen:
+    def of(cls, view: PlaneView) -> PicturedView:
+        """Load the picture of a view."""
         return cls(view, cv2.resize(view.load(), view.ranges.shape[::-1], interpolation=cv2.INTER_AREA))
 
     @property
     def center(self) -> FloatArray:
+        """The position of the camera, (3,)."""
         return self.view.cam_from_world.center
 
     def on(self, plane: ScenePlane) -> FloatArray:
@@ -130,7 +132,7 @@ class _Seen:
         rays, own = self.view.rays[some], self.view.ranges[some]
         ranges = plane_ranges(rays, self.center, normal=plane.normal, offset=plane.offset)
         with np.errstate(invalid="ignore"):
-            near = (np.abs(own / ranges - 1) < _ON_PLANE) & (self.view.confidence[some] >= WEAK_CONFIDENCE[0])
+            near = (np.abs(own / ranges - 1) < ON_PLANE) & (self.view.confidence[some] >= WEAK_CONFIDENCE[0])
         return np.asarray(self.center + rays[near] * ranges[near][:, None])
 
     def before(self, plane: ScenePlane, *, height: float, most: int) -> tuple[FloatArray, Image]:
@@ -154,7 +156,7 @@ class _Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
+class Grid:
     """Square cells of a rectangle of an upright plane: `low` (2,) are the level and the y coordinate of its corner."""
 
     plane: ScenePlane
@@ -164,6 +166,7 @@ class _Grid:
 
     @property
     def along(self) -> FloatArray:
+        """The direction of the rows, (3,)."""
         return np.cross(self.plane.normal, _DOWN)
 
     def at(self, column: FloatArray, row: FloatArray) -> FloatArray:
@@ -182,7 +185,7 @@ class _Grid:
         return np.floor((level - self.low) / self.cell).astype(np.int64)
 
 
-def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, FloatArray, FloatArray]]:
+def _mirrors_on(plane: ScenePlane, seen: Sequence[PicturedView]) -> list[tuple[float, FloatArray, FloatArray]]:
     """Return the strength and the corners of each mirror on a plane, and the centre of a camera before it."""
     shares = [one.on(plane) for one in seen]
     least = 0.005 * seen[0].view.ranges.size / 16
@@ -195,7 +198,7 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
         return []
     used = [seen[idx] for idx in chosen]
     distance = float(np.median([one.center @ plane.normal - plane.offset for one in used]))
-    grid = _grid_of(plane, [shares[idx] for idx in chosen], distance / seen[0].view.ranges.shape[0])
+    grid = grid_of(plane, [shares[idx] for idx in chosen], distance / seen[0].view.ranges.shape[0])
     parts = [one.before(plane, height=0.05 * distance, most=_POINTS // len(used)) for one in used]
     points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     pictures, predicted, weights, on_plane = [], [], [], np.zeros(grid.size_hw, np.bool_)
@@ -204,8 +207,8 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
         picture, ratio, confidence = one.colors_at(grid.centers())
         reflected, known = _reflected(one.center, grid, points=points, colors=colors)
         with np.errstate(invalid="ignore"):
-            known &= ~(ratio < 1 - _BEFORE_PLANE)
-            near = known & (np.abs(ratio - 1) < _ON_PLANE)
+            known &= ~(ratio < 1 - BEFORE_PLANE)
+            near = known & (np.abs(ratio - 1) < ON_PLANE)
         on_plane |= near & (confidence >= WEAK_CONFIDENCE[0])
         confirmed += near & (confidence >= CONSISTENT_CONFIDENCE[0])
         weights.append(known.astype(np.float32))
@@ -236,17 +239,17 @@ def _mirrors_on(plane: ScenePlane, seen: Sequence[_Seen]) -> list[tuple[float, F
     return found
 
 
-def _grid_of(plane: ScenePlane, on_plane: Sequence[FloatArray], pixel: float) -> _Grid:
+def grid_of(plane: ScenePlane, on_plane: Sequence[FloatArray], pixel: float) -> Grid:
     """Return cells over the points (N, 3) that views have on a plane, about as wide as a pixel."""
     axes = np.stack([np.cross(plane.normal, _DOWN), _DOWN], axis=1)
     limits = [np.percentile(points @ axes, (1, 99), axis=0) for points in on_plane]
     low, high = np.min([one[0] for one in limits], axis=0), np.max([one[1] for one in limits], axis=0)
     cell = max(2.0 * pixel, float(np.sqrt(np.prod(high - low) / _CELLS)))
     width, height = np.maximum(np.ceil((high - low) / cell), 1).astype(int)
-    return _Grid(plane, low, cell, (int(height), int(width)))
+    return Grid(plane, low, cell, (int(height), int(width)))
 
 
-def _reflected(center: FloatArray, grid: _Grid, *, points: FloatArray, colors: Image) -> tuple[Image, Mask]:
+def _reflected(center: FloatArray, grid: Grid, *, points: FloatArray, colors: Image) -> tuple[Image, Mask]:
     """Return what a mirror would show a camera in each cell, (h, w, 3), and where that is known.
 
     `points`: (N, 3) before the plane, with `colors` (N, 3).

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, MIRROR_CONFIDENCE, WINDOW_CONFIDENCE
 
-Mark = Literal["weak", "filled", "mirror"]
+Mark = Literal["weak", "filled", "pane"]
 MARKS: dict[Mark, str] = {
     "weak": "pale: not confirmed by other views",
     "filled": "striped: filled in, not seen",
-    "mirror": "chequered: a mirror, at its pane",
+    "pane": "chequered: a mirror or window, at its pane",
 }
 """What the marks of `mark_unconfirmed` mean."""
 
@@ -37,7 +37,7 @@ def write_preview(
 ) -> None:
     """Write a JPEG of a panorama above its range map, with a scale bar that carries numbers.
 
-    Weak ranges are pale, filled ones striped and mirrors chequered, with a legend; see `mark_unconfirmed`.
+    Weak ranges are pale, filled ones striped and panes chequered, with a legend; see `mark_unconfirmed`.
 
     Args:
         image: (H, W, 3) uint8 RGB.
@@ -104,13 +104,13 @@ def unconfirmed_classes(confidence: NDArray[np.uint8]) -> list[Mark]:
 
 
 def mark_unconfirmed(colors: NDArray[np.uint8], confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours of a range map with weak ranges pale, filled ones striped and mirrors chequered."""
+    """Return the colours of a range map with weak ranges pale, filled ones striped and panes chequered."""
     marked = _unconfirmed(confidence)
     row, column = np.arange(confidence.shape[0])[:, None], np.arange(confidence.shape[1])
     period, thickness = 10, 4  # px
     paper = np.where(np.logical_or.reduce(list(marked.values())), 0.55, 0.0)  # the share of white in the colours
     paper[marked["filled"] & ((row + column) % period < thickness)] = 1.0
-    paper[marked["mirror"] & ((row // thickness + column // thickness) % 2 == 0)] = 1.0
+    paper[marked["pane"] & ((row // thickness + column // thickness) % 2 == 0)] = 1.0
     mixed = (1 - paper[..., None]) * colors + 255 * paper[..., None]
     return np.asarray(np.rint(mixed), np.uint8)
 
@@ -122,7 +122,7 @@ def _unconfirmed(confidence: NDArray[np.uint8]) -> dict[Mark, NDArray[np.bool_]]
     return {
         "weak": (confidence > high) & ~confirmed & confirmed.any(),
         "filled": (confidence >= low) & (confidence <= high),
-        "mirror": confidence == MIRROR_CONFIDENCE,
+        "pane": np.isin(confidence, (MIRROR_CONFIDENCE, WINDOW_CONFIDENCE)),
     }
 
 
@@ -130,7 +130,7 @@ def _legend(classes: Sequence[Mark]) -> NDArray[np.uint8]:
     """Return a strip (h, W, 3) that explains the marks, two in a row."""
     height = _BAR_HEIGHT + _MARGIN
     strip = np.full((-(-len(classes) // 2) * height, _WIDTH, 3), _PAPER, np.uint8)
-    codes = {"weak": FILLED_CONFIDENCE[1] + 1, "filled": FILLED_CONFIDENCE[0], "mirror": MIRROR_CONFIDENCE}
+    codes = {"weak": FILLED_CONFIDENCE[1] + 1, "filled": FILLED_CONFIDENCE[0], "pane": MIRROR_CONFIDENCE}
     for idx, name in enumerate(classes):
         left, top = 2 * _MARGIN + idx % 2 * _WIDTH // 2, idx // 2 * height
         colors = color_mapped(np.full((_BAR_HEIGHT, 3 * _BAR_HEIGHT + 1), 2, np.float32), 1.0, 8.0)

@@ -180,7 +180,9 @@ class _GroupPlan:
         plan_from_world = Rigid3(self.turn, np.zeros(3))
         cams = [self.poses.cam_from_world(idx) @ plan_from_world.inverse() for idx in range(len(self.poses.names))]
         if ranges:
-            empty = PlanView(np.zeros(3), np.eye(3), *np.full((3, 1, 2), np.nan), *np.zeros((2, 0, 3)))
+            nothing, nowhere = np.full((1, 2), np.nan), np.zeros((0, 3))
+            unseen = np.zeros((1, 2), np.bool_)
+            empty = PlanView(np.zeros(3), np.eye(3), nothing, nothing, nothing, unseen, nowhere, nowhere)
             names = self.poses.names
             return lambda idx: range_view(ranges[names[idx]], cams[idx]) if names[idx] in ranges else empty
         views = CloudViews(cams)
