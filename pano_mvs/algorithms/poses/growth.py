@@ -108,7 +108,8 @@ def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Co
     Args:
         model: the model, changed in place.
         left: images to add; those that were added are removed.
-        adjust: whether all cameras are adjusted each time their number has grown by a quarter.
+        adjust: whether all cameras are adjusted each time their number has grown by a quarter. If False, only points
+            are triangulated again.
         confirmation: decides between rival placements by the images; None if the pairs alone decide.
 
     Returns:
@@ -126,7 +127,7 @@ def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Co
         count_pairs(image)
     if not adjust:
         model.adjust(cameras=False)
-    adjusted = 2
+    adjusted = len(model.cameras)
     reasons: dict[int, str] = {}
     while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
         image, pose = step
@@ -134,7 +135,7 @@ def extend(model: PlacedModel, left: set[int], *, adjust: bool, confirmation: Co
         left.discard(image)
         del weights[image]
         count_pairs(image)
-        if not adjust or len(model.cameras) > 1.25 * adjusted:
+        if len(model.cameras) > 1.25 * adjusted:
             model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     return reasons
